@@ -1,0 +1,1 @@
+"""Turns a scene into an artifact: mesh, full model, training, validation."""

@@ -1,0 +1,125 @@
+"""How long queries take, beside the full model: all kinds in turns, so that they share the weather.
+
+A query's time is that of ``Atlas.solve`` as a caller sees it, from a position in space to an answer
+with its error estimate; fields are recovered after a cold query of their own.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offline.sampling import tangents
+from offline.validate import unseen_loads
+from offline.workshop import Load, Workshop
+from shared.artifact import read_artifact
+from shared.atlas import Atlas, Region
+from shared.endoscope import pressure_limit
+
+Array = NDArray[np.float64]
+
+ROUNDS = 20
+QUERIES = 100
+"""Of each kind in a round, beside one full solution."""
+
+STEP = 0.05  # mm
+
+
+def bench(artifact: Path) -> dict[str, Any]:
+    """Time queries of every kind on random loads over the whole range.
+
+    Parameters
+    ----------
+    artifact : Path
+
+    Returns
+    -------
+    dict
+        Medians in µs: ``cold_us``, each query independent of the last; ``warm_us``, along paths of
+        0.05 mm steps over the surface; ``surface_us`` and ``fields_us``, a cold query with
+        displacement and von Mises stress at the surface's or all nodes; ``full_us``, the full model
+        in a single jump from rest. ``p95``: their 95th percentiles. ``ratio``: full over cold.
+    """
+    atlas = Atlas.load(artifact)
+    workshop = Workshop.of_artifact(read_artifact(artifact))
+    state, walker = atlas.new_state(), atlas.new_state()
+    rng = np.random.default_rng(atlas.scene.seed)
+
+    def cold(load: Load) -> None:
+        state.forget()
+        atlas.solve(load.position, load.pressure, load.direction, state=state)
+
+    def warm(load: Load) -> None:
+        atlas.solve(load.position, load.pressure, load.direction, state=walker)
+
+    def with_fields(load: Load, region: Region) -> None:
+        state.forget()
+        solution = atlas.solve(load.position, load.pressure, load.direction, state=state)
+        displacement = atlas.displacement(solution, region)
+        atlas.von_mises(solution, region, displacement if region == "all" else None)
+
+    times: dict[str, list[float]] = {}
+
+    def take(kind: str, query: Callable[[Load], object], loads: list[Load]) -> None:
+        times.setdefault(kind, []).extend(_time(query, load) for load in loads)
+
+    for round_ in range(ROUNDS + 1):
+        loads = unseen_loads(atlas, QUERIES, round_)
+        first, *steps = walk(atlas, loads[0], QUERIES + 1, rng)
+        take("cold_us", cold, loads)
+        warm(first)
+        take("warm_us", warm, steps)
+        take("surface_us", lambda load: with_fields(load, "surface"), loads)
+        take("fields_us", lambda load: with_fields(load, "all"), loads)
+        take("full_us", workshop.sample, loads[:1])
+        if round_ == 0:
+            # compiled code came in from disk
+            times.clear()
+    medians = {kind: float(np.median(found)) for kind, found in times.items()}
+    return medians | {
+        "p95": {kind: float(np.percentile(found, 95)) for kind, found in times.items()},
+        "ratio": medians["full_us"] / medians["cold_us"],
+    }
+
+
+def walk(atlas: Atlas, start: Load, count: int, rng: np.random.Generator) -> list[Load]:
+    """Loads that glide over the surface in steps of ``STEP``, turning where it ends.
+
+    Tilt and share of the local pressure limit are those of ``start``.
+    """
+    surface = atlas.surface
+    x, normal, _, fields = surface.locate(start.position, atlas.limits)
+    share = start.pressure / pressure_limit(fields, normal, start.direction)
+    cosine = min(1.0, -float(start.direction @ normal))
+    heading = _random_tangent(normal, rng)
+    loads: list[Load] = []
+    while len(loads) < count:
+        reached, normal, _, fields = surface.locate(x + STEP * heading, atlas.limits)
+        if np.linalg.norm(reached - x) < 0.9 * STEP:
+            heading = _random_tangent(normal, rng)
+            continue
+        x = reached
+        heading = heading - (heading @ normal) * normal
+        heading /= np.linalg.norm(heading)
+        direction = math.sqrt(1 - cosine**2) * heading - cosine * normal
+        loads.append(Load(x, direction, share * pressure_limit(fields, normal, direction)))
+    return loads
+
+
+def _random_tangent(normal: Array, rng: np.random.Generator) -> Array:
+    turn = 2 * math.pi * rng.random()
+    t, b = tangents(normal)
+    return math.cos(turn) * t + math.sin(turn) * b
+
+
+def _time(query: Callable[[Load], object], load: Load) -> float:
+    """Time of one query, µs."""
+    started = time.perf_counter()
+    query(load)
+    return 1e6 * (time.perf_counter() - started)

@@ -1,0 +1,286 @@
+"""The offline commands of ``palpate``.
+
+Each imports what it runs when it runs, so that ``--help`` is instant.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import click
+
+ARTIFACT = click.Path(exists=True, dir_okay=False, path_type=Path)
+OUTPUT = click.Path(dir_okay=False, writable=True, path_type=Path)
+VECTOR = (float, float, float)
+
+artifact_argument = click.argument("artifact", metavar="F", type=ARTIFACT)
+json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+
+LOAD_OPTIONS = (
+    click.option(
+        "--at", "position", type=VECTOR, required=True, metavar="X Y Z", help="Contact, mm."
+    ),
+    click.option("--pressure", type=float, required=True, help="Pressure at the contact, kPa."),
+    click.option(
+        "--direction",
+        type=VECTOR,
+        metavar="X Y Z",
+        help="Where the load pushes; any length  [default: the inward normal]",
+    ),
+)
+
+
+def load_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Options of a command that presses the tissue once."""
+    for option in reversed(LOAD_OPTIONS):
+        command = option(command)
+    return command
+
+
+@click.command()
+@click.argument("scene")
+@click.option("--out", type=OUTPUT, help="The artifact to write  [default: artifacts/NAME.h5]")
+@click.option(
+    "--workers", type=click.IntRange(min=1), help="Worker processes  [default: one per core]"
+)
+def train(scene: str, out: Path | None, workers: int | None) -> None:
+    """Train the artifact of a scene.
+
+    SCENE is one that comes along, such as turbinate, or a TOML file. A run that was killed goes on
+    where it stopped.
+    """
+    from offline.train import train
+
+    train(scene, out, workers)
+
+
+@click.command()
+@artifact_argument
+@json_option
+def info(artifact: Path, as_json: bool) -> None:
+    """Show what the artifact F holds.
+
+    How it was made, how accurate it is, its range of loads (kPa, degrees, mm) and the quality of
+    its mesh.
+    """
+    from shared.atlas import Atlas
+
+    atlas = Atlas.load(artifact)
+    endoscope = atlas.scene.endoscope
+    loads = {
+        "largest_pressure": atlas.pressure_max,
+        "largest_tilt": endoscope.max_tilt,
+        "radius": endoscope.radius,
+    }
+    head = {"scene": atlas.name, "description": atlas.scene.description, "loads": loads}
+    _show(head | atlas.info, as_json)
+
+
+@click.command()
+@artifact_argument
+@load_options
+@click.option("--full-model", is_flag=True, help="Solve the full model too and compare.")
+@click.option("--vtu", type=OUTPUT, metavar="OUT.vtu", help="Write mesh and fields.")
+@json_option
+def solve(
+    artifact: Path,
+    position: tuple[float, float, float],
+    pressure: float,
+    direction: tuple[float, float, float] | None,
+    full_model: bool,
+    vtu: Path | None,
+    as_json: bool,
+) -> None:
+    """Press the tissue of the artifact F once.
+
+    The file OUT.vtu holds the mesh at rest with point data displacement (mm), von_mises (kPa),
+    load (mN) and clamped (0 or 1). With --full-model they are the full model's, beside them stand
+    displacement_error and von_mises_error of the reduced one, and its relative errors are printed.
+    """
+    from offline.solve import solve
+
+    _show(solve(artifact, position, pressure, direction, full_model, vtu), as_json)
+
+
+@click.command()
+@artifact_argument
+@load_options
+@click.option("--out", type=OUTPUT, required=True, metavar="PNG", help="Where to draw.")
+def picture(
+    artifact: Path,
+    position: tuple[float, float, float],
+    pressure: float,
+    direction: tuple[float, float, float] | None,
+    out: Path,
+) -> None:
+    """Draw the pressed tissue of the artifact F, coloured by von Mises stress.
+
+    Needs PyVista: pip install -e '.[pictures]'.
+    """
+    from offline.pictures import picture
+
+    picture(artifact, position, pressure, direction, out)
+
+
+@click.command()
+@artifact_argument
+@click.option(
+    "--queries",
+    type=click.IntRange(min=1),
+    default=300,
+    show_default=True,
+    help="How many loads.",
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="Of the random loads.",
+)
+@click.option("--csv", type=OUTPUT, metavar="OUT", help="Write one row per query.")
+@json_option
+def validate(artifact: Path, queries: int, seed: int, csv: Path | None, as_json: bool) -> None:
+    """Compare the artifact F with the full model.
+
+    Both solve new random loads over the artifact's whole range. Errors are relative L2 norms, as
+    fractions.
+    """
+    from offline.validate import validate
+
+    _show(validate(artifact, queries, seed, csv), as_json)
+
+
+@click.command()
+@artifact_argument
+@json_option
+def bench(artifact: Path, as_json: bool) -> None:
+    """Time queries on the artifact F.
+
+    Median µs of a cold query, on a warm path of small steps, with the fields on the surface, with
+    all fields, and of the full model.
+    """
+    from offline.bench import bench
+
+    _show(bench(artifact), as_json)
+
+
+@click.group()
+def study() -> None:
+    """Measure what the choice of mesh and solver rests on."""
+
+
+@study.command("mesh-error")
+@click.option(
+    "--report",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=Path("artifacts/turbinate/report"),
+    show_default=True,
+    help="Folder for the tables and the chart.",
+)
+@json_option
+def mesh_error(report: Path, as_json: bool) -> None:
+    """Compare elements of about 6048 DOFs with a fine mesh.
+
+    Errors are fractions of the displacement that the turbinate shows in the reference mesh; takes
+    a few minutes.
+    """
+    from offline.studies.mesh_error import mesh_error
+
+    _show(mesh_error(report), as_json)
+
+
+@study.command()
+@click.argument("scene")
+@click.option("--artifact", type=ARTIFACT, metavar="F", help="[default: artifacts/NAME.h5]")
+@click.option("--snapshots", type=click.IntRange(min=20), default=1000, show_default=True)
+@click.option("--queries", type=click.IntRange(min=1), default=300, show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@json_option
+def baselines(
+    scene: str, artifact: Path | None, snapshots: int, queries: int, seed: int, as_json: bool
+) -> None:
+    """Compare the artifact of SCENE with simpler reduced models.
+
+    Regression of POD coefficients and Galerkin in global POD bases learn from full solutions of
+    SNAPSHOTS random loads; all answer the QUERIES that palpate validate asks with this seed. The
+    table goes to NAME/report/baselines.csv beside the artifact. A killed run goes on where it
+    stopped.
+    """
+    from offline.scenes import find_scene
+    from offline.studies.baselines import baselines
+
+    path = artifact or Path("artifacts") / f"{find_scene(scene).name}.h5"
+    _show(baselines(path, snapshots, queries, seed), as_json)
+
+
+@study.command()
+@artifact_argument
+@click.option("--paths", type=click.IntRange(min=1), default=10, show_default=True)
+@click.option("--steps", type=click.IntRange(min=1), default=60, show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@json_option
+def continuity(artifact: Path, paths: int, steps: int, seed: int, as_json: bool) -> None:
+    """Measure jumps of the artifact F as the contact glides.
+
+    Largest change of the displacement field over steps of 0.05 mm that the full model does not
+    show, in mm.
+    """
+    from offline.studies.continuity import continuity
+
+    _show(continuity(artifact, paths, steps, seed), as_json)
+
+
+@study.command("mesh-independence")
+@click.option("--queries", type=click.IntRange(min=20), default=1000, show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@json_option
+def mesh_independence(queries: int, seed: int, as_json: bool) -> None:
+    """Time the same queries on turbinate and turbinate-fine.
+
+    Both with one sparse atlas of equal layout, modes and cubature points; takes a few minutes.
+    """
+    import tempfile
+
+    from offline.studies.mesh_independence import compare
+
+    with tempfile.TemporaryDirectory() as folder:
+        _show(compare(queries, seed, Path(folder)), as_json)
+
+
+@study.command("newton-step")
+@click.option("--element", type=click.Choice(["hex8", "hex20"]), default="hex20", show_default=True)
+@click.option("--repeats", type=click.IntRange(min=1), default=20, show_default=True)
+@json_option
+def newton_step(element: str, repeats: int, as_json: bool) -> None:
+    """Time a Newton step of the full model beside FElupe's.
+
+    Medians in ms on one thread; ratio is FElupe with its default solver over palpate, ratio_best
+    with the fastest solver at hand.
+    """
+    from offline.studies.newton_step import compare
+
+    _show(compare(element, repeats), as_json)
+
+
+def _show(report: Mapping[str, object], as_json: bool) -> None:
+    """Print a report as JSON, or as one ``name value`` line per leaf."""
+    if as_json:
+        click.echo(json.dumps(report))
+        return
+    leaves = list(_leaves(report))
+    width = max(len(name) for name, _ in leaves)
+    for name, value in leaves:
+        text = f"{value:.4g}" if isinstance(value, float) else str(value)
+        click.echo(f"{name:<{width}}  {text}")
+
+
+def _leaves(report: Mapping[str, object], prefix: str = "") -> list[tuple[str, object]]:
+    leaves: list[tuple[str, object]] = []
+    for name, value in report.items():
+        leaves += (
+            _leaves(value, f"{prefix}{name}.")
+            if isinstance(value, Mapping)
+            else [(prefix + name, value)]
+        )
+    return leaves

@@ -1,0 +1,117 @@
+"""Empirical cubature: few quadrature points of positive weight that do the work of all.
+
+The reduced internal force is a sum over quadrature points ``sum_q w_q G_q^T P_q``.  Points ``c``
+and weights ``x_c > 0`` are chosen by non-negative least squares so that ``sum_c x_c G_c^T P_c``
+equals the whole sum in training states, and the volume too (Hernandez, Caicedo & Ferrer 2017; An,
+Kim & James 2008).  States off equilibrium belong to the training: in equilibrium the sum is the
+load, whatever the tissue does, and says little about the points.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import qr_delete, solve_triangular
+
+Array = NDArray[np.float64]
+
+OVERSAMPLING = 10
+
+EXACT = 1e-9
+"""Relative residual that needs no further point."""
+
+
+def compress(contributions: Array, size: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Replace many equations by the few combinations that matter (randomised range finder).
+
+    Parameters
+    ----------
+    contributions : ndarray, shape (q, r)
+        Contribution of each point (row) to each sum (column).
+    size : int
+        Equations to keep.
+
+    Returns
+    -------
+    A : ndarray, shape (size, q)
+        Equations, each scaled by its singular value.
+    b : ndarray, shape (size,)
+        Their sums over all points.
+    """
+    noise = rng.standard_normal((contributions.shape[1], size + OVERSAMPLING))
+    sketch = contributions @ noise.astype(contributions.dtype)
+    sketch = contributions @ (contributions.T @ np.linalg.qr(sketch)[0])
+    Q = np.linalg.qr(sketch)[0]
+    _, s, Wt = np.linalg.svd(contributions.T @ Q, full_matrices=False)
+    A = (Q @ Wt.T * s).T[:size]
+    A = np.ascontiguousarray(A, dtype=np.float64)
+    return A, A.sum(axis=1)
+
+
+def nonnegative(A: Array, b: Array, most: int) -> tuple[NDArray[np.int64], Array]:
+    """Sparse non-negative solution of ``A x ~ b`` (Lawson & Hanson 1974, stopped early).
+
+    Parameters
+    ----------
+    A : ndarray, shape (r, q)
+    b : ndarray, shape (r,)
+    most : int
+        Largest number of points.
+
+    Returns
+    -------
+    chosen : ndarray, shape (c,)
+        Columns with positive weight, ascending.
+    weights : ndarray, shape (c,)
+    """
+    norms = np.linalg.norm(A, axis=0)
+    usable = norms > 1e-12 * norms.max()
+    chosen: list[int] = []
+    x = np.empty(0)
+    Q, R = np.empty((len(b), 0)), np.empty((0, 0))
+    residual = b.copy()
+    target = EXACT * np.linalg.norm(b)
+    blocked = np.zeros(A.shape[1], dtype=bool)
+    while np.linalg.norm(residual) > target and len(chosen) < min(most, len(b)):
+        gain = np.where(usable & ~blocked, A.T @ residual / np.maximum(norms, 1e-300), -np.inf)
+        gain[chosen] = -np.inf
+        best = int(np.argmax(gain))
+        if not gain[best] > 0:
+            break
+        Q, R = _append(Q, R, A[:, best])
+        chosen.append(best)
+        x = np.append(x, 0.0)
+        while True:
+            z = solve_triangular(R, Q.T @ b)
+            if (z > 0).all():
+                x = z
+                blocked[:] = False
+                break
+            falling = z <= 0
+            step = np.min(x[falling] / (x[falling] - z[falling]))
+            x = x + step * (z - x)
+            dropped = int(np.flatnonzero(falling)[np.argmin(x[falling])])
+            if dropped == len(chosen) - 1 and step == 0.0:
+                blocked[best] = True  # would leave at once: try another first
+            del chosen[dropped]
+            x = np.delete(x, dropped)
+            Q, R = qr_delete(Q, R, dropped, which="col", check_finite=False)
+            Q, R = Q[:, : len(chosen)], R[: len(chosen)]
+        residual = b - A[:, chosen] @ x
+    order = np.argsort(chosen)
+    return np.array(chosen, dtype=np.int64)[order], x[order]
+
+
+def _append(Q: Array, R: Array, column: Array) -> tuple[Array, Array]:
+    """Thin QR with one more column (twice-iterated Gram-Schmidt)."""
+    r = Q.T @ column
+    rest = column - Q @ r
+    again = Q.T @ rest
+    rest -= Q @ again
+    norm = np.linalg.norm(rest)
+    k = R.shape[0]
+    grown = np.zeros((k + 1, k + 1))
+    grown[:k, :k] = R
+    grown[:k, k] = r + again
+    grown[k, k] = norm
+    return np.column_stack([Q, rest / norm]), grown

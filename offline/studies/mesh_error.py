@@ -1,0 +1,227 @@
+"""What the mesh costs in accuracy: elements of about the turbinate's 6048 DOFs beside a fine mesh.
+
+Every mesh carries the same loads: one pressure, position and direction per contact point, spread
+over the whole accessible surface, its ends included, at which the tissue moves by ``INDENTATION``
+of its local thickness (``MAX_PRESSURE`` where that is less). Two displacements are compared: the
+largest of all nodes, and the mean under the footprint, which does not depend on where the nodes
+happen to lie.
+
+The reference is refined all over but keeps the scene's geometry; other fine meshes say how far it
+can be trusted. The clamped edge slows every element's convergence, so that a few per cent between
+fine meshes remain.
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from offline.full_model import Equilibrium, FullModel
+from offline.mesh import build_mesh, local_thickness
+from offline.sampling import spread_points
+from offline.scenes import find_scene
+from offline.surface_mesh import accessible_surface
+from shared.endoscope import footprint
+from shared.quadrature import surface_quadrature
+from shared.scene import ElementName
+
+Array = NDArray[np.float64]
+
+POINTS = 12
+INDENTATION = 0.25
+"""Displacement under the footprint over the local thickness."""
+
+MAX_PRESSURE = 5.0
+"""kPa. Beyond it hex20 elements of the reference's size buckle inwardly between their 2x2x2 points
+(det F < 0 at 3x3x3 points), which neither mean dilatation nor full quadrature confirms."""
+
+VALUES = {"hex8": 9, "hex8-mean-dilatation": 72, "hex8-fbar": 18, "hex20": 9}
+"""Displacement gradients (9 numbers each) that one sample of a cubature needs: a point its own,
+with F-bar the element's mean beside it, with mean dilatation all eight of the element."""
+
+
+@dataclass(frozen=True)
+class Discretisation:
+    """How the turbinate is meshed: element, divisions and grading of a scene."""
+
+    element: ElementName
+    divisions: tuple[int, int, int]
+    grading: float
+
+    def __str__(self) -> str:
+        along, through, length = self.divisions
+        return f"{self.element} {along}x{through}x{length} graded {self.grading:g}"
+
+
+REFERENCE = Discretisation("hex20", (26, 5, 26), 1.7)
+SECOND_OPINIONS = (
+    Discretisation("hex20", (20, 3, 20), 1.7),
+    Discretisation("hex8-mean-dilatation", (40, 6, 36), 1.7),
+)
+PROBE = Discretisation("hex20", (13, 2, 13), 1.7)
+CANDIDATES = (
+    *(Discretisation("hex20", (13, 2, 13), grading) for grading in (1.0, 1.4, 1.7, 1.85)),
+    Discretisation("hex20", (14, 2, 12), 1.75),
+    Discretisation("hex20", (15, 2, 11), 1.7),
+    *(
+        Discretisation(element, (23, 3, 20), grading)
+        for element in ("hex8-mean-dilatation", "hex8-fbar", "hex8")
+        for grading in (1.0, 1.7)
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A contact point with its outward normal, local thickness (mm) and pressure (kPa)."""
+
+    position: Array
+    normal: Array
+    thickness: float
+    pressure: float
+
+
+class Body:
+    """The turbinate in one discretisation, ready to be pressed."""
+
+    def __init__(self, how: Discretisation) -> None:
+        scene = find_scene("turbinate")
+        geometry = scene.geometry.model_copy(
+            update={"element": how.element, "divisions": how.divisions, "grading": how.grading}
+        )
+        scene = scene.model_copy(update={"geometry": geometry})
+        self.seed, self.radius = scene.seed, scene.endoscope.radius
+        self.mesh = build_mesh(scene)
+        self.model = FullModel.of(scene, self.mesh)
+        self._quadrature = surface_quadrature(self.mesh.nodes, self.mesh.faces)
+        self._nodal = np.empty(len(self.mesh.nodes))
+
+    def press(
+        self, position: Array, normal: Array, pressure: float, start: Array | None = None
+    ) -> tuple[float, float, Equilibrium]:
+        """Press straight in: largest displacement, mean one under the footprint (mm), state."""
+        area = footprint(self._quadrature, position, normal, self.radius, self._nodal)
+        state = self.model.solve(-pressure * np.outer(self._nodal, normal), start)
+        largest = float(np.linalg.norm(state.displacement, axis=1).max())
+        under = float(np.linalg.norm(self._nodal @ state.displacement)) / area
+        return largest, under, state
+
+
+def contacts(reference: Body, probe: Body) -> list[Contact]:
+    """Contact points all over the reference's surface, with the pressures that ``probe`` needs."""
+    surface = accessible_surface(reference.mesh)
+    found = []
+    for point in spread_points(surface, POINTS, np.random.default_rng(reference.seed)):
+        position, normal, _ = surface.project(point)
+        (thickness,) = local_thickness(reference.mesh, position[None], normal[None])
+        pressure = _pressure(probe, position, normal, INDENTATION * thickness)
+        found.append(Contact(position, normal, float(thickness), pressure))
+    return found
+
+
+def _pressure(
+    body: Body, position: Array, normal: Array, target: float, step: float = 0.5
+) -> float:
+    """Pressure (kPa) that first moves the footprint by ``target`` (mm), along the load path."""
+    before, pressure, under, start = 0.0, 0.0, 0.0, None
+    while under < target:
+        if pressure == MAX_PRESSURE:
+            return pressure
+        before, pressure = under, pressure + step
+        _, under, state = body.press(position, normal, pressure, start)
+        start = state.displacement
+    return pressure - step * (under - target) / (under - before)
+
+
+def displacements(body: Body, loads: list[Contact]) -> Array:
+    """Largest displacement and mean one under the footprint, shape (loads, 2) mm."""
+    return np.array([body.press(x.position, x.normal, x.pressure)[:2] for x in loads])
+
+
+def mesh_error(report: Path) -> dict[str, Any]:
+    """Compare the candidates with the reference.
+
+    Parameters
+    ----------
+    report : Path
+        Folder to write ``mesh_error.csv`` (a row per mesh), ``mesh_error_points.csv`` (a row per
+        contact point) and ``mesh_error.png`` to.
+
+    Returns
+    -------
+    dict
+        Per mesh: ``dofs``, ``points`` of quadrature, ``values`` that a cubature samples at once,
+        and of the errors (fractions) of either displacement the least, mean and greatest.
+    """
+    reference = Body(REFERENCE)
+    loads = contacts(reference, Body(PROBE))
+    exact = displacements(reference, loads)
+    rows: dict[str, dict[str, Any]] = {}
+    errors: dict[str, Array] = {}
+    for how in tqdm((REFERENCE, *SECOND_OPINIONS, *CANDIDATES), desc="meshes"):
+        body = reference if how == REFERENCE else Body(how)
+        moved = exact if body is reference else displacements(body, loads)
+        error = errors[str(how)] = moved / exact - 1
+        row = rows[str(how)] = {
+            "dofs": body.mesh.nodes.size,
+            "points": 8 * len(body.mesh.elements),
+            "values": VALUES[how.element],
+        }
+        for name, column in zip(("largest", "under_footprint"), error.T, strict=True):
+            row[f"{name}_least"] = float(column.min())
+            row[f"{name}_mean"] = float(column.mean())
+            row[f"{name}_greatest"] = float(column.max())
+    report.mkdir(parents=True, exist_ok=True)
+    _write(report / "mesh_error.csv", [{"mesh": name} | row for name, row in rows.items()])
+    _write(report / "mesh_error_points.csv", _point_rows(loads, exact, errors))
+    _draw(report / "mesh_error.png", errors)
+    return dict(rows)
+
+
+def _point_rows(
+    loads: list[Contact], exact: Array, errors: dict[str, Array]
+) -> list[dict[str, Any]]:
+    return [
+        {
+            **dict(zip(("x_mm", "y_mm", "z_mm"), load.position.tolist(), strict=True)),
+            "thickness_mm": load.thickness,
+            "pressure_kPa": load.pressure,
+            "largest_mm": exact[i, 0],
+            "under_footprint_mm": exact[i, 1],
+        }
+        | {name: error[i, 0] for name, error in errors.items()}
+        for i, load in enumerate(loads)
+    ]
+
+
+def _write(path: Path, rows: list[dict[str, Any]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        for row in rows:
+            writer.writerow({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items()})
+
+
+def _draw(path: Path, errors: dict[str, Array]) -> None:
+    """Bars from the least to the greatest error of the largest displacement, a dot per point."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 0.4 * len(errors) + 1.4), layout="constrained")
+    axes = figure.add_subplot()
+    axes.axvspan(-5, 5, color="0.92")
+    axes.axvline(0, color="0.5", linewidth=0.8)
+    for row, error in enumerate(errors.values()):
+        percent = 100 * error[:, 0]
+        axes.barh(row, np.ptp(percent), left=percent.min(), height=0.5, color="tab:blue", alpha=0.5)
+        axes.plot(percent, np.full(len(percent), row), ".", color="tab:blue")
+    axes.set_yticks(range(len(errors)), list(errors))
+    axes.invert_yaxis()
+    axes.margins(x=0.03)
+    axes.set_xlabel(f"error of the largest displacement against {REFERENCE}, %")
+    figure.savefig(path, dpi=110)

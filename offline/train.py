@@ -1,0 +1,414 @@
+"""The training pipeline: from a scene to its artifact.
+
+1. The largest pressure at points all over the accessible surface (full model).
+2. Regions: nonlinear Ritz vectors of many footprints and a common basis for them.
+3. Patches: modes, cubature and first guess of every local model.
+4. Full solutions of random loads, which calibrate the error estimate, and others, which validate.
+
+Every finished task is on disk before it counts; see ``offline.checkpoint``.
+"""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import RBFInterpolator
+from scipy.spatial import cKDTree
+
+from offline.checkpoint import Checkpoint, content_key
+from offline.mesh import mesh_quality
+from offline.patches import PatchResult, PatchTask
+from offline.sampling import (
+    area,
+    centred_points,
+    neighbours,
+    random_points,
+    spacing_count,
+    spread_points,
+)
+from offline.scenes import find_scene
+from offline.validate import Comparison, compare, random_loads, summarise
+from offline.workers import Tasks, resume, worker_pool
+from offline.workshop import RegionResult, Workshop, open_workshop
+from shared.artifact import Dataset, write_artifact
+from shared.atlas import Atlas, Estimator, LocalModels
+from shared.reduced import NARROW
+from shared.scene import Scene
+
+Array = NDArray[np.float64]
+
+ARTIFACTS = Path("artifacts")
+
+RITZ_REACH = 0.8
+"""How far from its centre a local model learns from footprints, in units of the patch spacing."""
+
+CONTACTS_PER_PATCH = 400
+COVERAGE = 0.985
+"""Share of calibration errors that the estimate must cover: above 95 %, for unseen ones to be."""
+
+
+def train(scene: str | Path, out: Path | None = None, workers: int | None = None) -> Path:
+    """Train a scene and write its artifact.
+
+    Parameters
+    ----------
+    scene : str or Path
+        Shipped name or TOML file.
+    out : Path, optional
+        ``artifacts/NAME.h5`` if absent.
+    workers : int, optional
+        Processes; one per core if absent.
+
+    Returns
+    -------
+    path : Path
+    """
+    trained = find_scene(scene)
+    path = out or ARTIFACTS / f"{trained.name}.h5"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pool = worker_pool(open_workshop, trained.text, str(trained.folder), count=workers)
+    checkpoint = Checkpoint(path.parent / f".{path.stem}.training", content_key(trained))
+    with pool:
+        Pipeline(trained, pool, checkpoint).run(path)
+    checkpoint.remove()
+    return path
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where patches, regions and Ritz vectors lie.
+
+    Attributes
+    ----------
+    centres, normals : ndarray, shape (p, 3)
+    region : ndarray, shape (p,), int
+    ritz : ndarray, shape (r, 3), mm
+    ritz_of_patch : list of ndarray
+        Indices of the footprints a patch learns from.
+    contacts : ndarray, shape (c, 3), mm
+    contacts_of_patch : list of ndarray
+    extent : float, mm
+    """
+
+    centres: Array
+    normals: Array
+    region: NDArray[np.int32]
+    ritz: Array
+    ritz_of_patch: list[NDArray[np.int64]]
+    contacts: Array
+    contacts_of_patch: list[NDArray[np.int64]]
+    extent: float
+
+
+class Pipeline:
+    """One training run.
+
+    Parameters
+    ----------
+    scene : Scene
+    executor : Executor
+        Of workers initialized by ``open_workshop``.
+    checkpoint : Checkpoint
+    """
+
+    def __init__(self, scene: Scene, executor: Executor, checkpoint: Checkpoint) -> None:
+        self.scene = scene
+        self.executor = executor
+        self.checkpoint = checkpoint
+        self.workshop = Workshop(scene)
+        self.surface = self.workshop.surface
+        self.seconds: dict[str, float] = {}
+        self.provenance = self._provenance()  # now: sources may change while it runs
+
+    def run(self, path: Path) -> None:
+        """Train and write the artifact."""
+        limits = self._load_range()
+        layout = self.layout()
+        regions = self._regions(layout, limits)
+        models = self._patches(layout, limits, regions)
+        estimator, documents, rows = self._validate(models, limits)
+        documents["training"] |= {"layout": self._describe(layout, models)}
+        self._write(path, models, limits, estimator, documents)
+        report = path.parent / path.stem / "report"
+        report.mkdir(parents=True, exist_ok=True)
+        Comparison.write_csv(report / "validation.csv", rows)
+
+    def untested_atlas(self, limits: Array, layout: Layout) -> Atlas:
+        """An atlas without error estimate: stages 2 and 3 only."""
+        models = self._patches(layout, limits, self._regions(layout, limits))
+        return self._atlas(models, limits, Estimator(np.zeros((2, 6))), {})
+
+    # --- stages --------------------------------------------------------------------------------
+
+    def _load_range(self) -> Array:
+        """Load range (v, 7) at the vertices of the surface."""
+        rng = np.random.default_rng([self.scene.seed, 1])
+        count = spacing_count(self.surface, self.scene.training.limit_spacing)
+        points = spread_points(self.surface, max(count, 16), rng)
+        tasks = {f"range-{i}": (Workshop.load_range, x) for i, x in enumerate(points)}
+        found = self._stage("load range", tasks, lambda fields: {"fields": fields})
+        fields = np.array([found[name]["fields"] for name in tasks])
+        fields[:, 0] = np.log(fields[:, 0])
+        smooth = RBFInterpolator(points, fields, neighbors=16, kernel="linear")
+        at_vertices = smooth(self.surface.vertices)
+        at_vertices[:, 0] = np.exp(at_vertices[:, 0])
+        return at_vertices
+
+    def layout(self) -> Layout:
+        """Place patches, regions and Ritz vectors."""
+        settings, surface = self.scene.training, self.surface
+        rng = np.random.default_rng([self.scene.seed, 2])
+        centres = centred_points(surface, spacing_count(surface, settings.patch_spacing), rng)
+        normals = np.array([surface.project(x)[1] for x in centres])
+        seeds = centred_points(surface, spacing_count(surface, settings.region_spacing), rng)
+        region = cKDTree(seeds).query(centres)[1].astype(np.int32)
+        region = np.unique(region, return_inverse=True)[1].astype(np.int32)
+        ritz = spread_points(surface, spacing_count(surface, settings.ritz_spacing), rng)
+        contacts = np.vstack(
+            [surface.vertices, random_points(surface, CONTACTS_PER_PATCH * len(centres), rng)]
+        )
+        near, _ = cKDTree(centres).query(contacts)
+        contacts_of_patch = [
+            hits[np.linalg.norm(contacts[hits] - centres[k], axis=1) < near[hits] + settings.blend]
+            for k, hits in enumerate(neighbours(contacts, centres, near.max() + settings.blend))
+        ]
+        return Layout(
+            centres=centres,
+            normals=normals,
+            region=region,
+            ritz=ritz,
+            ritz_of_patch=neighbours(ritz, centres, RITZ_REACH * settings.patch_spacing),
+            contacts=contacts,
+            contacts_of_patch=contacts_of_patch,
+            extent=1.02 * near.max() + settings.blend,
+        )
+
+    def _regions(self, layout: Layout, limits: Array) -> list[tuple[RegionResult, dict[int, int]]]:
+        """Basis and Ritz vectors of each region, with the place of each footprint among them."""
+        tasks, members = {}, []
+        for r in range(int(layout.region.max()) + 1):
+            patches = np.flatnonzero(layout.region == r)
+            used = np.unique(np.concatenate([layout.ritz_of_patch[k] for k in patches]))
+            points = layout.ritz[used]
+            tasks[f"region-{r}"] = (
+                Workshop.region,
+                points,
+                self._range_at(points, limits)[:, 0],
+                self.scene.training.region_modes,
+            )
+            members.append({int(i): place for place, i in enumerate(used)})
+        found = self._stage("Ritz vectors", tasks, asdict)
+        results = [RegionResult(**found[name]) for name in tasks]
+        # a small region may have fewer vectors to give than asked for
+        modes = min(len(result.steps) for result in results)
+        return list(zip([result.truncate(modes) for result in results], members, strict=True))
+
+    def _patches(
+        self, layout: Layout, limits: Array, regions: Sequence[tuple[RegionResult, dict[int, int]]]
+    ) -> LocalModels:
+        ranges = self._range_at(layout.contacts, limits)
+        contact_normals = np.array([self.surface.project(x)[1] for x in layout.contacts])
+        pressures = self._range_at(layout.centres, limits)[:, 0]
+        tasks = {}
+        for k in range(len(layout.centres)):
+            result, places = regions[layout.region[k]]
+            chosen = [places[int(i)] for i in layout.ritz_of_patch[k]]
+            hits = layout.contacts_of_patch[k]
+            tasks[f"patch-{k}"] = (
+                Workshop.patch,
+                PatchTask(
+                    centre=layout.centres[k],
+                    normal=layout.normals[k],
+                    pressure=float(pressures[k]),
+                    basis=result.basis,
+                    steps=result.steps,
+                    orthonormal=result.orthonormal,
+                    ritz=np.moveaxis(result.ritz[chosen], 1, 0).reshape(len(result.steps), -1),
+                    contacts=layout.contacts[hits],
+                    normals=contact_normals[hits],
+                    ranges=ranges[hits],
+                    extent=layout.extent,
+                    blend=self.scene.training.blend,
+                    seed=self.scene.seed + k,
+                ),
+            )
+        found = self._stage("local models", tasks, asdict)
+        results = [PatchResult(**found[name]) for name in tasks]
+        return LocalModels(
+            basis=np.stack([result.basis for result, _ in regions]),
+            steps=np.stack([result.steps for result, _ in regions]),
+            region=layout.region,
+            centres=layout.centres,
+            frames=np.stack([r.frame for r in results]),
+            pressures=pressures,
+            modes=np.stack([r.modes for r in results]).astype(np.float32),
+            point_from=np.concatenate([[0], np.cumsum([len(r.points) for r in results])]),
+            points=np.concatenate([r.points for r in results]),
+            weights=np.concatenate([r.weights for r in results]),
+            guess=np.stack([r.guess for r in results]).astype(np.float32),
+            errors=np.array([float(r.error) for r in results]),
+            extent=layout.extent,
+            blend=self.scene.training.blend,
+        )
+
+    def _validate(
+        self, models: LocalModels, limits: Array
+    ) -> tuple[Estimator, dict[str, Any], list[Comparison]]:
+        """Calibrate the error estimate, then validate on other loads."""
+        count = self.scene.training.samples
+        rng = np.random.default_rng([self.scene.seed, 3])
+        loads = random_loads(self.workshop.surface, limits, self.scene, 2 * count, rng)
+        tasks = {f"sample-{i}": (Workshop.sample, load) for i, load in enumerate(loads)}
+        found = self._stage(
+            "full solutions",
+            tasks,
+            lambda u: {"displacement": np.empty(0) if u is None else u},
+        )
+        atlas = self._atlas(models, limits, Estimator(np.zeros((2, 6))), {})
+        rows = [
+            compare(self.workshop, atlas, load, found[name]["displacement"])
+            for name, load in zip(tasks, loads, strict=True)
+            if found[name]["displacement"].size
+        ]
+        half = len(rows) // 2
+        estimator = calibrate(rows[:half])
+        for row in rows[half:]:
+            row.estimate(estimator)
+        documents = {
+            "provenance": self.provenance,
+            "training": {"seconds": self.seconds, "mesh": mesh_quality(self.workshop.mesh)},
+            "validation": summarise(rows[half:]),
+        }
+        return estimator, documents, rows[half:]
+
+    # --- pieces --------------------------------------------------------------------------------
+
+    def _range_at(self, points: Array, limits: Array) -> Array:
+        return np.array([self.surface.locate(x, limits)[3] for x in points])
+
+    def _stage(
+        self,
+        title: str,
+        tasks: Tasks,
+        pack: Callable[[Any], Mapping[str, Any]],
+    ) -> dict[str, Any]:
+        """Run the tasks that are not in the checkpoint yet; return all results by name."""
+        started = time.perf_counter()
+        results = resume(title, self.executor, self.checkpoint, tasks, pack)
+        self.seconds[title] = round(time.perf_counter() - started, 2)
+        return results
+
+    def _describe(self, layout: Layout, models: LocalModels) -> dict[str, Any]:
+        points = np.diff(models.point_from)
+        return {
+            "area_mm2": round(area(self.surface), 1),
+            "dofs": 3 * len(self.workshop.mesh.nodes),
+            "patches": len(layout.centres),
+            "regions": int(layout.region.max()) + 1,
+            "ritz_footprints": len(layout.ritz),
+            "wide_modes": models.modes.shape[2],
+            "narrow_modes": NARROW,
+            "cubature_points_median": float(np.median(points)),
+            "cubature_points_max": int(points.max()),
+            "quadrature_points": self.workshop.model.weights.size,
+        }
+
+    def _provenance(self) -> dict[str, Any]:
+        packages = ("numpy", "scipy", "numba", "h5py", "palpate")
+        try:
+            commit = subprocess.run(
+                ["git", "rev-parse", "HEAD"],
+                cwd=Path(__file__).parent, capture_output=True, text=True, check=True,
+            ).stdout.strip()  # fmt: skip
+        except (OSError, subprocess.CalledProcessError):
+            commit = "unknown"
+        return {
+            "started": datetime.now(UTC).isoformat(timespec="seconds"),
+            "packages": {name: metadata.version(name) for name in packages},
+            "python": platform.python_version(),
+            "git_commit": commit,
+            "seed": self.scene.seed,
+            "content_key": content_key(self.scene),
+        }
+
+    def _atlas(
+        self, models: LocalModels, limits: Array, estimator: Estimator, documents: dict[str, Any]
+    ) -> Atlas:
+        return Atlas(
+            self.scene.name, self.scene, documents, self.workshop.body, self.surface, limits,
+            models, estimator,
+        )  # fmt: skip
+
+    def _write(
+        self,
+        path: Path,
+        models: LocalModels,
+        limits: Array,
+        estimator: Estimator,
+        documents: dict[str, Any],
+    ) -> None:
+        mesh, surface = self.workshop.mesh, self.surface
+        one = "1"
+        datasets = {
+            "nodes": Dataset(mesh.nodes, "mm", "nodes, dof = 3 node + axis"),
+            "elements": Dataset(mesh.elements, one, "nodes of each hexahedron, VTK order"),
+            "faces": Dataset(mesh.faces, one, "nodes of each boundary face, VTK order, outward"),
+            "clamped": Dataset(mesh.clamped, one, "nodes held fixed"),
+            "accessible": Dataset(mesh.accessible, one, "faces an endoscope can touch"),
+            "surface_vertices": Dataset(surface.vertices, "mm", "accessible surface"),
+            "surface_triangles": Dataset(surface.triangles, one, "triangles of it, outward"),
+            "surface_normals": Dataset(surface.normals, one, "outward unit normals at vertices"),
+            "load_range": Dataset(
+                limits, "kPa, mm/kPa", "at vertices: limit along the normal, compliance"
+            ),
+            "basis": Dataset(
+                models.basis, "basis_steps", "modes of each region, (r, M, 3 n)", compress=True
+            ),
+            "basis_steps": Dataset(models.steps, "mm", "value of one step of a mode"),
+            "patch_region": Dataset(models.region, one, "region of each local model"),
+            "patch_centres": Dataset(models.centres, "mm", "centres of local models"),
+            "patch_frames": Dataset(models.frames, one, "rows: normal and two tangents"),
+            "patch_pressures": Dataset(models.pressures, "kPa", "load scale of local models"),
+            "patch_modes": Dataset(
+                models.modes.astype(np.float16), one, "modes in the basis of the region"
+            ),
+            "patch_guess": Dataset(
+                models.guess.astype(np.float16), one, "first guess beyond the linear response"
+            ),
+            "patch_errors": Dataset(models.errors, one, "relative error of cubature, energy norm"),
+            "patch_extent": Dataset(np.array(models.extent), "mm", "reach of a local model"),
+            "patch_blend": Dataset(np.array(models.blend), "mm", "width of blending"),
+            "cubature_from": Dataset(models.point_from, one, "first point of each local model"),
+            "cubature_points": Dataset(models.points, one, "quadrature point, by element"),
+            "cubature_weights": Dataset(models.weights, "mm^3", "weight of each point"),
+            "error_coefficients": Dataset(
+                estimator.coefficients, one, "log error = c . features; displacement, von Mises"
+            ),
+        }
+        documents["provenance"]["wall_seconds"] = round(sum(self.seconds.values()), 1)
+        write_artifact(path, self.scene.text, documents, datasets)
+
+
+def calibrate(rows: Sequence[Comparison]) -> Estimator:
+    """Fit the error estimate to errors of known loads, so that it covers ``COVERAGE`` of them."""
+    X = np.array(
+        [Estimator.features(r.load, r.tilt, r.missed, r.cubature, r.compliance) for r in rows]
+    )
+    coefficients = []
+    for name in ("displacement", "von_mises"):
+        y = np.log([max(getattr(r, name), 1e-8) for r in rows])
+        c = np.linalg.lstsq(X, y)[0]
+        c[0] += np.quantile(y - X @ c, COVERAGE)
+        coefficients.append(c)
+    return Estimator(np.array(coefficients))

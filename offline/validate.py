@@ -1,0 +1,222 @@
+"""The reduced against the full model on loads it has not seen, over the whole surface and range."""
+
+from __future__ import annotations
+
+import csv as csv_format
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from offline.sampling import cone, random_points
+from offline.workers import completed, worker_pool
+from offline.workshop import Load, Workshop, open_artifact
+from shared.artifact import read_artifact
+from shared.atlas import Atlas, Estimator
+from shared.endoscope import pressure_limit
+from shared.errors import PalpateError
+from shared.scene import Scene
+from shared.surface import Surface
+
+Array = NDArray[np.float64]
+
+UNSEEN = 100
+"""Sets these random numbers apart from those of the stages of training, which count from 1."""
+
+
+@dataclass
+class Comparison:
+    """One load answered by both models; errors are relative L2 norms.
+
+    Attributes
+    ----------
+    x, y, z : float, mm
+    pressure, limit : float, kPa
+    load, tilt, missed : float
+        Features of the error estimate: fraction of the limits, and the residual missed.
+    displacement, von_mises : float
+        Errors over all nodes, and over all nodes outside the clamped layer.
+    peak_displacement : float, mm
+    von_mises_p99 : float
+        Relative error of the field's 99th percentile.
+    estimated_displacement, estimated_von_mises : float
+    converged, in_range : bool
+    iterations : int
+    """
+
+    x: float
+    y: float
+    z: float
+    pressure: float
+    limit: float
+    load: float
+    tilt: float
+    missed: float
+    cubature: float
+    compliance: float
+    displacement: float
+    von_mises: float
+    peak_displacement: float
+    von_mises_p99: float
+    converged: bool
+    in_range: bool
+    iterations: int
+    estimated_displacement: float = field(default=float("nan"))
+    estimated_von_mises: float = field(default=float("nan"))
+
+    def estimate(self, estimator: Estimator) -> None:
+        """Fill in the estimated errors."""
+        self.estimated_displacement, self.estimated_von_mises = estimator(
+            self.load, self.tilt, self.missed, self.cubature, self.compliance
+        )
+
+    @staticmethod
+    def write_csv(path: Path, rows: Sequence[Comparison]) -> None:
+        """Write one row per load."""
+        with path.open("w", newline="") as file:
+            writer = csv_format.DictWriter(file, list(asdict(rows[0])), lineterminator="\n")
+            writer.writeheader()
+            for row in rows:
+                writer.writerow(
+                    {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in asdict(row).items()}
+                )
+
+
+def validate(artifact: Path, queries: int, seed: int, csv: Path | None = None) -> dict[str, Any]:
+    """Compare an artifact with its full model on new random loads.
+
+    Parameters
+    ----------
+    artifact : Path
+    queries : int
+        Loads, over the whole surface, cone of directions and range of pressures.
+    seed : int
+        Of the loads; those of training come from none.
+    csv : Path, optional
+        Where to write one row per load.
+
+    Returns
+    -------
+    dict
+        As ``summarise``, and ``without_equilibrium``: loads that the full model had no answer to,
+        and which count in nothing else.
+    """
+    atlas = Atlas.load(artifact)
+    workshop = Workshop.of_artifact(read_artifact(artifact))
+    loads = unseen_loads(atlas, queries, seed)
+    tasks = {str(i): (Workshop.sample, load) for i, load in enumerate(loads)}
+    rows = {}
+    with worker_pool(open_artifact, artifact) as pool:
+        for name, reference in tqdm(completed(pool, tasks), "full solutions", len(tasks)):
+            if reference is not None:
+                rows[int(name)] = compare(workshop, atlas, loads[int(name)], reference)
+    compared = [rows[i] for i in sorted(rows)]
+    if not compared:
+        raise PalpateError(f"{artifact}: the full model has no equilibrium under any of the loads")
+    if csv:
+        csv.parent.mkdir(parents=True, exist_ok=True)
+        Comparison.write_csv(csv, compared)
+    return summarise(compared) | {"without_equilibrium": queries - len(compared)}
+
+
+def unseen_loads(atlas: Atlas, count: int, seed: int) -> list[Load]:
+    """Random loads that training has not seen, whatever the seed."""
+    rng = np.random.default_rng([atlas.scene.seed, UNSEEN, seed])
+    return random_loads(atlas.surface, atlas.limits, atlas.scene, count, rng)
+
+
+def random_loads(
+    surface: Surface, limits: Array, scene: Scene, count: int, rng: np.random.Generator
+) -> list[Load]:
+    """Random loads over the whole surface, cone of directions and range of pressures.
+
+    Contact points are uniform over the area, one in eight on the rim of the surface; directions are
+    uniform in the cone, one in eight on its border; pressures are denser towards the limit.
+    """
+    points = random_points(surface, count, rng)
+    rim = surface.rim()
+    loads = []
+    for i, point in enumerate(points):
+        if i % 8 == 0:
+            point = surface.vertices[rng.choice(rim)]
+        x, normal, _, fields = surface.locate(point, limits)
+        tilt = scene.endoscope.max_tilt
+        direction = cone(normal, tilt, 1, rng, border=i % 8 == 1)[0]
+        limit = pressure_limit(fields, normal, direction)
+        loads.append(Load(x, direction, float(limit * np.sqrt(rng.random()))))
+    return loads
+
+
+def relative(approximation: Array, reference: Array) -> float:
+    """Relative L2 error; 0 where there is nothing to approximate."""
+    scale = np.linalg.norm(reference)
+    return float(np.linalg.norm(approximation - reference) / scale) if scale else 0.0
+
+
+def compare(workshop: Workshop, atlas: Atlas, load: Load, reference: Array) -> Comparison:
+    """Answer a load with the reduced model and compare with the full ``reference`` (n, 3) mm."""
+    solution = atlas.solve(load.position, load.pressure, load.direction)
+    displacement = atlas.displacement(solution).astype(float)
+    exact, stress = workshop.von_mises(reference), atlas.von_mises(solution).astype(float)
+    kept = workshop.beyond_clamped_layer
+    p99 = np.percentile(exact[kept], 99)
+    x, y, z = solution.contact_point.tolist()
+    return Comparison(
+        x=x,
+        y=y,
+        z=z,
+        pressure=load.pressure,
+        limit=solution.pressure_limit,
+        load=load.pressure / solution.pressure_limit,
+        tilt=solution.tilt / atlas.scene.endoscope.max_tilt,
+        missed=solution.missed,
+        cubature=solution.cubature,
+        compliance=float(np.linalg.norm(solution.contact_displacement)) / load.pressure,
+        displacement=relative(displacement, reference),
+        von_mises=relative(stress[kept], exact[kept]),
+        peak_displacement=float(np.linalg.norm(reference, axis=1).max()),
+        von_mises_p99=float(abs(np.percentile(stress[kept], 99) - p99) / p99),
+        converged=solution.converged,
+        in_range=solution.in_range,
+        iterations=solution.iterations,
+        estimated_displacement=solution.error_displacement,
+        estimated_von_mises=solution.error_von_mises,
+    )
+
+
+def statistics(errors: Sequence[float]) -> dict[str, float]:
+    """Mean, 95th percentile and maximum."""
+    return {
+        "mean": float(np.mean(errors)),
+        "p95": float(np.percentile(errors, 95)),
+        "max": float(np.max(errors)),
+    }
+
+
+def summarise(rows: Sequence[Comparison]) -> dict[str, Any]:
+    """Errors over all loads; ``covered`` is the share whose errors are within both estimates."""
+    covered = [
+        r.displacement <= r.estimated_displacement and r.von_mises <= r.estimated_von_mises
+        for r in rows
+    ]
+    ratios = {
+        name: float(
+            np.median(
+                [getattr(r, f"estimated_{name}") / max(getattr(r, name), 1e-12) for r in rows]
+            )
+        )
+        for name in ("displacement", "von_mises")
+    }
+    return {
+        "queries": len(rows),
+        "unconverged": sum(not r.converged for r in rows),
+        "covered": float(np.mean(covered)),
+        "displacement": statistics([r.displacement for r in rows]),
+        "von_mises": statistics([r.von_mises for r in rows]),
+        "von_mises_p99": statistics([r.von_mises_p99 for r in rows]),
+        "estimate_over_error_median": ratios,
+    }

@@ -1,0 +1,253 @@
+"""One process's workplace: a scene's full model with its surface, and the tasks of training on it.
+
+A task takes and returns plain arrays, so that any executor with the ``concurrent.futures``
+interface can run it; ``open_workshop`` or ``open_artifact`` is the initializer of its workers.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offline.full_model import Equilibrium, FullModel, NoEquilibrium
+from offline.mesh import Mesh, build_mesh, local_thickness
+from offline.patches import PatchResult, PatchTask, train_patch
+from offline.sampling import tangents
+from offline.spaces import energy_pod, ritz_vectors
+from offline.surface_mesh import accessible_surface
+from shared.artifact import Artifact, read_artifact
+from shared.atlas import Body
+from shared.endoscope import SurfaceQuadrature, footprint
+from shared.quadrature import stress_recovery, surface_quadrature
+from shared.scene import Scene, parse_scene
+from shared.stress import StressRecovery, nodal_von_mises
+from shared.surface import Surface
+
+Array = NDArray[np.float64]
+
+TANGENTIAL = 0.6
+"""Weight of tangential against normal load in the Ritz vectors: about sin 30 degrees and some."""
+
+POINTS_IN_BASIS = 100
+"""Footprints whose Ritz vectors make a region's basis; those of the others are projected on it."""
+
+RESOLUTION = 2e-6
+"""Displacement (mm) that a step of a stored mode amounts to where the mode is at work: a mode of
+small amplitude is stored in coarse steps, which compress well."""
+
+
+@dataclass(frozen=True)
+class Load:
+    """A pressed footprint: contact point, unit direction and pressure (kPa)."""
+
+    position: Array
+    direction: Array
+    pressure: float
+
+
+@dataclass(frozen=True)
+class RegionResult:
+    """Basis of a region, (M, 3 n) int16 in steps (M,), and what patches learn from.
+
+    ``orthonormal`` (M, M) holds, as columns in the basis, modes orthonormal in the energy of the
+    rest state; ``ritz`` (k, M, 19) are Ritz vectors in those.
+    """
+
+    basis: NDArray[np.int16]
+    steps: NDArray[np.float32]
+    orthonormal: NDArray[np.float32]
+    ritz: NDArray[np.float32]
+
+    def truncate(self, modes: int) -> RegionResult:
+        """The leading modes; ``orthonormal`` is triangular, so its leading block stays right."""
+        return RegionResult(
+            self.basis[:modes],
+            self.steps[:modes],
+            self.orthonormal[:modes, :modes],
+            self.ritz[:, :modes],
+        )
+
+
+class Workshop:
+    """The full model of a scene and what it needs to be pressed.
+
+    Parameters
+    ----------
+    scene : Scene
+    mesh : Mesh, optional
+        Built from the scene if absent.
+    """
+
+    def __init__(self, scene: Scene, mesh: Mesh | None = None) -> None:
+        self.scene = scene
+        self.mesh = build_mesh(scene) if mesh is None else mesh
+        self.model = FullModel.of(scene, self.mesh)
+        self.surface: Surface = accessible_surface(self.mesh)
+        self._nodal = np.zeros(len(self.mesh.nodes))
+
+    @classmethod
+    def of_artifact(cls, artifact: Artifact) -> Workshop:
+        """Full model on the very mesh that an artifact was trained on."""
+        return cls(
+            parse_scene(artifact.scene),
+            Mesh(**{part.name: artifact.arrays[part.name] for part in fields(Mesh)}),
+        )
+
+    @cached_property
+    def quadrature(self) -> SurfaceQuadrature:
+        """Integration points of the whole boundary."""
+        return surface_quadrature(self.mesh.nodes, self.mesh.faces)
+
+    @cached_property
+    def body(self) -> Body:
+        """Mesh and tissue as the reduced model sees them."""
+        mesh, model = self.mesh, self.model
+        return Body(mesh.nodes, mesh.elements, mesh.faces, mesh.clamped, model.mu, model.lam)
+
+    @cached_property
+    def beyond_clamped_layer(self) -> NDArray[np.bool_]:
+        """Nodes of no element that touches the support, (n,)."""
+        layer = self.mesh.elements[self.mesh.clamped[self.mesh.elements].any(axis=1)]
+        outside = np.ones(len(self.mesh.nodes), dtype=bool)
+        outside[layer] = False
+        return outside
+
+    def unit_load(self, position: Array) -> tuple[Array, Array]:
+        """Nodal weights (n,) mm^2 of a unit pressure at a surface point, and the normal there."""
+        x, normal, _ = self.surface.project(position)
+        footprint(self.quadrature, x, normal, self.scene.endoscope.radius, self._nodal)
+        return self._nodal.copy(), normal
+
+    def load_vector(self, load: Load) -> Array:
+        """Nodal forces (n, 3) mN."""
+        nodal, _ = self.unit_load(load.position)
+        return load.pressure * nodal[:, None] * load.direction
+
+    def solve(self, load: Load, start: Array | None = None) -> Equilibrium:
+        """Full solution; raises ``NoEquilibrium``."""
+        return self.model.solve(self.load_vector(load), start)
+
+    @cached_property
+    def _recovery(self) -> StressRecovery:
+        mesh, model = self.mesh, self.model
+        return stress_recovery(mesh.nodes, mesh.elements, model.mu, model.lam)
+
+    def von_mises(self, displacement: Array) -> Array:
+        """Nodal von Mises stress (n,) kPa."""
+        out = np.zeros(len(self.mesh.nodes))
+        nodal_von_mises(self._recovery, np.ascontiguousarray(displacement, dtype=float), out)
+        return out
+
+    # --- tasks ---------------------------------------------------------------------------------
+
+    def load_range(self, position: Array) -> Array:
+        """Load range at a surface point: fields (7,) of ``shared.endoscope.pressure_limit``.
+
+        The limit along the normal is where the tissue moves by the scene's indentation.
+        """
+        nodal, normal = self.unit_load(position)
+        unit = np.einsum("n,ij->nij", nodal, np.eye(3)).reshape(-1, 3)[self.model.free]
+        C = unit.T @ self.model.solve_linear(unit) / nodal.sum()
+        thickness = local_thickness(self.mesh, position[None], normal[None])[0]
+        wanted = self.scene.load.max_indentation * thickness
+        pressure, start = 0.1 * self.scene.tissue.young, None
+        for _ in range(20):
+            try:
+                state = self.model.solve(-pressure * nodal[:, None] * normal, start)
+            except NoEquilibrium:
+                pressure, start = 0.5 * pressure, None
+                continue
+            moved = np.linalg.norm(state.displacement, axis=1).max()
+            if abs(moved / wanted - 1) < 0.02:
+                break
+            factor = min(2.5, max(0.3, wanted / moved))
+            pressure, start = factor * pressure, factor * state.displacement
+        return np.array([pressure, *np.diag(C), C[0, 1], C[0, 2], C[1, 2]])
+
+    def region(self, positions: Array, pressures: Array, modes: int) -> RegionResult:
+        """Basis of a region and the Ritz vectors of footprints at ``positions`` (k, 3) in it."""
+        model = self.model
+        vectors = np.stack(
+            [self._ritz(x, p) for x, p in zip(positions, pressures, strict=True)], axis=1
+        )
+        stride = max(1, len(positions) // POINTS_IN_BASIS)
+        basis, _ = energy_pod(model, vectors[:, ::stride].reshape(len(model.free), -1), modes)
+        vectors = vectors.reshape(len(model.free), -1)
+        amplitude = np.sqrt(np.mean(((model.rest_stiffness @ basis).T @ vectors) ** 2, axis=1))
+        largest = np.abs(basis).max(axis=0)
+        steps = np.clip(RESOLUTION / amplitude, largest / np.iinfo(np.int16).max, largest / 100)
+        stored = np.round(basis / steps).astype(np.int16)
+        # rounding costs the modes their orthonormality: give it back by a change of coordinates
+        rounded = stored * steps.astype(np.float32)
+        stiff = model.rest_stiffness @ rounded
+        L = np.linalg.cholesky(rounded.T @ stiff)
+        full = np.zeros((len(steps), 3 * len(self.mesh.nodes)), np.int16)
+        full[:, model.free] = stored.T
+        ritz = np.linalg.solve(L, stiff.T @ vectors).reshape(len(steps), len(positions), -1)
+        return RegionResult(
+            basis=full,
+            steps=steps.astype(np.float32),
+            orthonormal=np.linalg.inv(L).T.astype(np.float32),
+            ritz=np.moveaxis(ritz, 1, 0).astype(np.float32),
+        )
+
+    def _ritz(self, position: Array, pressure: float) -> Array:
+        nodal, normal = self.unit_load(position)
+        frame = np.array([normal, *tangents(normal)])
+        frame[1:] *= TANGENTIAL
+        loads = (pressure * nodal[:, None, None] * frame.T).reshape(-1, 3)
+        return ritz_vectors(self.model, loads[self.model.free])
+
+    def patch(self, task: PatchTask) -> PatchResult:
+        """Train a local model."""
+        return train_patch(self.scene, self.body, self.model.weights.ravel(), task)
+
+    def sample(self, load: Load) -> NDArray[np.float32] | None:
+        """Full displacement (n, 3) mm, None where there is no equilibrium."""
+        try:
+            return self.solve(load).displacement.astype(np.float32)
+        except NoEquilibrium:
+            return None
+
+
+_workshop: Workshop | None = None
+
+
+def _end_with_parent() -> None:
+    """Stop this worker when the process that started it is killed."""
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def open_workshop(text: str, folder: str) -> None:
+    """Initialize a worker process on a scene, given by its text and where its files lie."""
+    global _workshop
+    _end_with_parent()
+    _workshop = Workshop(parse_scene(text, Path(folder)))
+
+
+def open_artifact(path: Path) -> None:
+    """Initialize a worker process on the mesh of an artifact."""
+    global _workshop
+    _end_with_parent()
+    _workshop = Workshop.of_artifact(read_artifact(path))
+
+
+def run(task: Callable[..., object], *args: object) -> object:
+    """Run ``task(workshop, *args)`` in a worker."""
+    return task(_workshop, *args)

@@ -1,0 +1,1 @@
+"""Serves artifacts: loads in, deformation and stress out, over HTTP."""

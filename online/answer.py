@@ -1,0 +1,116 @@
+"""From a request to the bytes of its answer: solve, recover, encode. The service's hot path.
+
+Nothing here awaits: an answer has the model for itself from its first line to its last.
+"""
+
+import math
+from time import perf_counter_ns
+
+import numpy as np
+from starlette.responses import Response
+
+from online import wire
+from online.errors import Refusal
+from online.negotiation import JSON
+from online.schemas import SolveRequest
+from online.store import Model
+from shared.answer import describe
+from shared.atlas import Atlas, Solution
+from shared.errors import QueryError
+
+ABSURD = 10.0
+"""Multiple of the largest trained pressure from which on there is no answer at all."""
+
+
+def answer(model: Model, request: SolveRequest, media_type: str, max_json_numbers: int) -> Response:
+    """Solve a request from rest and write the answer.
+
+    Each request is answered on its own: the same request has the same answer, whatever came
+    before it. Sessions are for clients that want a warm start.
+
+    Raises
+    ------
+    Refusal
+        If the load is not one the model can be asked about, or it has no equilibrium.
+    """
+    atlas = model.atlas
+    contact = request.contacts[0]
+    if media_type == JSON:
+        _check_size(atlas, request, max_json_numbers)
+    if contact.pressure > ABSURD * atlas.pressure_max:
+        raise Refusal(
+            "unanswerable_query",
+            "contacts.0.pressure",
+            f"More than {ABSURD:g} times the {atlas.pressure_max:.3g} kPa of the training",
+            {"le": ABSURD * atlas.pressure_max},
+        )
+
+    start = perf_counter_ns()
+    try:
+        solution = atlas.solve(
+            contact.position, contact.pressure, contact.direction, contact.radius
+        )
+    except QueryError as error:
+        raise Refusal("unanswerable_query", f"contacts.0.{error.field}", error.message) from None
+    solved = perf_counter_ns()
+    if not solution.converged:
+        raise Refusal(
+            "no_equilibrium",
+            "contacts.0.pressure",
+            "There is no equilibrium under this load; the model was trained for up to "
+            f"{solution.pressure_limit:.3g} kPa there",
+            {"le": solution.pressure_limit},
+        )
+
+    fields = {}
+    if request.region != "none":
+        if "displacement" in request.outputs:
+            fields["displacement"] = atlas.displacement(solution, request.region)
+        if "von_mises" in request.outputs:
+            known = fields.get("displacement") if request.region == "all" else None
+            fields["von_mises"] = atlas.von_mises(solution, request.region, known)
+    recovered = perf_counter_ns()
+
+    head = describe(atlas.name, solution)
+    _check_finite(solution, fields)
+    head["timing"] = {
+        "solve_us": (solved - start) / 1e3,
+        "recover_us": (recovered - solved) / 1e3,
+    }
+    body = wire.encode(media_type, head, fields)
+    encoded = perf_counter_ns()
+    timing = (
+        f"solve;dur={(solved - start) / 1e6:.4f}, "
+        f"recover;dur={(recovered - solved) / 1e6:.4f}, "
+        f"encode;dur={(encoded - recovered) / 1e6:.4f}"
+    )
+    return Response(body, media_type=media_type, headers={"server-timing": timing})
+
+
+def _check_size(atlas: Atlas, request: SolveRequest, limit: int) -> None:
+    """Refuse fields that would keep the event loop busy writing decimals."""
+    nodes = {"none": 0, "surface": len(atlas.surface_nodes), "all": len(atlas.nodes)}
+    per_node = 3 * ("displacement" in request.outputs) + ("von_mises" in request.outputs)
+    numbers = per_node * nodes[request.region]
+    if numbers > limit:
+        raise Refusal(
+            "too_large_for_json",
+            "region",
+            f"{numbers} numbers are too many for JSON; accept application/octet-stream instead",
+            {"max_numbers": limit},
+        )
+
+
+def _check_finite(solution: Solution, fields: wire.Arrays) -> None:
+    """Let no NaN and no infinity out, whatever the model thinks of itself."""
+    scalars = (
+        solution.force.sum()
+        + solution.contact_displacement.sum()
+        + solution.error_displacement
+        + solution.error_von_mises
+        + solution.min_jacobian
+    )
+    if not (math.isfinite(scalars) and all(np.isfinite(f).all() for f in fields.values())):
+        raise Refusal(
+            "no_equilibrium", "contacts.0.pressure", "The answer to this load is not finite"
+        )

@@ -1,0 +1,102 @@
+"""The service as an ASGI application."""
+
+import asyncio
+import gc
+import logging
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from importlib.metadata import version
+from typing import Any
+
+from fastapi import FastAPI
+from pydantic.json_schema import models_json_schema
+
+from online import errors
+from online.answer import answer
+from online.negotiation import OFFERED
+from online.routes import add_routes
+from online.schemas import SolveRequest
+from online.settings import Settings
+from online.store import Model, Store
+
+logger = logging.getLogger(__name__)
+
+
+def create_app(
+    settings: Settings,
+    store: Store | None = None,
+    on_ready: Callable[[Store], None] | None = None,
+) -> FastAPI:
+    """Make the service.
+
+    It answers at once; the models are loaded and warmed meanwhile, and ``/ready`` says when that
+    is done.
+
+    Parameters
+    ----------
+    settings : Settings
+    store : Store, optional
+        Where models come from; by default the artifacts of `settings`.
+    on_ready : callable, optional
+        Called once, when every model is warm.
+    """
+    models = Store(settings.artifacts) if store is None else store
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        preparing = asyncio.create_task(_prepare(models, on_ready))
+        yield
+        await preparing
+
+    app = FastAPI(
+        title="Palpate",
+        version=version("palpate"),
+        summary="Press soft tissue and get its answer in real time",
+        description="Units are mm, mN, kPa and s throughout.",
+        lifespan=lifespan,
+        redirect_slashes=False,
+        redoc_url=None,
+        # Even unused it looks for a tracer in every request; the service times itself.
+        telemetry={"tracing": False, "metrics": False, "logs": False},
+    )
+    errors.install(app)
+    add_routes(app, models, settings)
+    _describe_request(app)
+    return app
+
+
+async def _prepare(store: Store, on_ready: Callable[[Store], None] | None) -> None:
+    """Load and warm the models in a thread, then keep the collector away from them."""
+    try:
+        await asyncio.to_thread(store.open, _warm)
+    except Exception:
+        logger.exception("the models could not be loaded")
+        return
+    gc.collect()
+    gc.freeze()
+    store.ready = True
+    if on_ready is not None:
+        on_ready(store)
+
+
+def _warm(model: Model) -> None:
+    """Call every kernel and encoder once, so that no client pays for a first time."""
+    for region in ("none", "surface", "all"):
+        request = SolveRequest.model_validate({"contacts": [model.example], "region": region})
+        for media_type in OFFERED:
+            answer(model, request, media_type, max_json_numbers=10**9)
+
+
+def _describe_request(app: FastAPI) -> None:
+    """Add the schema of the hand-read request body to the application's OpenAPI document."""
+    generate = app.openapi
+
+    def openapi() -> dict[str, Any]:
+        document = generate()
+        _, definitions = models_json_schema(
+            [(SolveRequest, "validation")], ref_template="#/components/schemas/{model}"
+        )
+        document["components"]["schemas"].update(definitions["$defs"])
+        return document
+
+    app.openapi = openapi  # type: ignore[method-assign]

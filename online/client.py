@@ -1,0 +1,179 @@
+"""A small client: answers as arrays, refusals as exceptions."""
+
+import http.client
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+from urllib.parse import quote, urlsplit
+
+import numpy as np
+from numpy.typing import NDArray
+
+from online import wire
+from online.negotiation import BINARY, JSON
+from shared.errors import PalpateError
+
+
+class ServiceError(PalpateError):
+    """The service refused a request.
+
+    Parameters
+    ----------
+    status : int
+        HTTP status.
+    error : dict
+        ``code``, ``field``, ``message`` and ``allowed`` as the service sent them.
+    """
+
+    def __init__(self, status: int, error: dict[str, Any]) -> None:
+        super().__init__(
+            f"{error['field']}: {error['message']}" if error["field"] else error["message"]
+        )
+        self.status = status
+        self.code: str = error["code"]
+        self.field: str = error["field"]
+        self.allowed: Any = error["allowed"]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """How the tissue answers a load.
+
+    Parameters
+    ----------
+    contact, trust, timing : dict
+        As `online.schemas` describes them.
+    force : ndarray, shape (3,), mN
+    contact_displacement : ndarray, shape (3,), mm
+    displacement : ndarray, shape (k, 3), float32, mm, or None if not asked for
+    von_mises : ndarray, shape (k,), float32, kPa, or None if not asked for
+    """
+
+    contact: dict[str, Any]
+    trust: dict[str, Any]
+    timing: dict[str, float]
+    force: NDArray[np.float64]
+    contact_displacement: NDArray[np.float64]
+    displacement: NDArray[np.float32] | None
+    von_mises: NDArray[np.float32] | None
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """The mesh that the fields of a region belong to.
+
+    Parameters
+    ----------
+    nodes : ndarray, shape (k, 3), float32, mm
+    triangles : ndarray, shape (t, 3), int32
+        Indices into `nodes`, outward.
+    surface_nodes : ndarray, shape (s,), int32
+        The surface nodes among all nodes.
+    clamped : ndarray, shape (k,), uint8
+    """
+
+    nodes: NDArray[np.float32]
+    triangles: NDArray[np.int32]
+    surface_nodes: NDArray[np.int32]
+    clamped: NDArray[np.uint8]
+
+
+class Client:
+    """One connection to a service.
+
+    Examples
+    --------
+    >>> with Client("http://127.0.0.1:8000") as client:             # doctest: +SKIP
+    ...     answer = client.solve("turbinate", (13.1, 20.0, 9.5), pressure=4.0, region="surface")
+    ...     print(answer.force, answer.displacement.max())
+    """
+
+    def __init__(self, url: str, timeout: float = 10.0) -> None:
+        parts = urlsplit(url)
+        if parts.scheme != "http" or parts.hostname is None:
+            raise PalpateError(f"{url}: not an address like http://127.0.0.1:8000")
+        self._connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=timeout)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._connection.close()
+
+    def scenes(self) -> dict[str, Any]:
+        """Ask what is served and what was refused."""
+        return json.loads(self._request("GET", "/scenes", JSON))
+
+    def scene(self, name: str) -> dict[str, Any]:
+        """Ask what may be asked of a scene, and how well it is answered."""
+        return json.loads(self._request("GET", f"/scenes/{quote(name, safe='')}", JSON))
+
+    def mesh(self, name: str, region: str = "surface") -> Mesh:
+        """Get the undeformed mesh of a region, ``surface`` or ``all``."""
+        path = f"/scenes/{quote(name, safe='')}/mesh?region={quote(region)}"
+        _, arrays = wire.decode(self._request("GET", path, BINARY))
+        return Mesh(**arrays)
+
+    def solve(
+        self,
+        name: str,
+        position: Sequence[float],
+        pressure: float,
+        direction: Sequence[float] | None = None,
+        radius: float | None = None,
+        outputs: Sequence[str] = ("displacement", "von_mises"),
+        region: str = "none",
+    ) -> Answer:
+        """Press the tissue.
+
+        Parameters
+        ----------
+        name : str
+            A served scene.
+        position : sequence of 3 floats, mm
+        pressure : float, kPa
+        direction : sequence of 3 floats, optional
+            Default: the inward normal.
+        radius : float, mm, optional
+            Default: the scene's.
+        outputs, region
+            The fields to return, and for which nodes: ``none``, ``surface`` or ``all``.
+
+        Raises
+        ------
+        ServiceError
+            If the service refuses.
+        """
+        contact: dict[str, Any] = {"position": list(position), "pressure": pressure}
+        if direction is not None:
+            contact["direction"] = list(direction)
+        if radius is not None:
+            contact["radius"] = radius
+        body = json.dumps({"contacts": [contact], "outputs": list(outputs), "region": region})
+        path = f"/scenes/{quote(name, safe='')}/solve"
+        head, fields = wire.decode(self._request("POST", path, BINARY, body.encode()))
+        return Answer(
+            contact=head["contact"],
+            trust=head["trust"],
+            timing=head["timing"],
+            force=np.array(head["force"]),
+            contact_displacement=np.array(head["contact_displacement"]),
+            displacement=fields.get("displacement"),
+            von_mises=fields.get("von_mises"),
+        )
+
+    def _request(self, method: str, path: str, accept: str, body: bytes | None = None) -> bytes:
+        headers = {"Accept": accept, "Content-Type": JSON}
+        self._connection.request(method, path, body, headers)
+        response = self._connection.getresponse()
+        content = response.read()
+        if response.status != 200:
+            raise ServiceError(response.status, json.loads(content)["error"])
+        return content

@@ -1,0 +1,264 @@
+"""What goes over the wire, for the validator and for the reader of the OpenAPI page.
+
+Units are mm, mN, kPa and s. Requests are checked against these models; answers are written straight
+from arrays (`online.answer`), and their models below only describe them.
+"""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, field_validator
+from pydantic_core import PydanticCustomError
+
+from online.errors import invalid
+
+Output = Literal["displacement", "von_mises"]
+Region = Literal["none", "surface", "all"]
+MeshRegion = Literal["surface", "all"]
+
+Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
+Component = Annotated[float, Field(ge=-1e3, le=1e3)]
+Position = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
+Direction = Annotated[list[Component], Field(min_length=3, max_length=3)]
+Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+
+SHORTEST_DIRECTION = 1e-3
+
+EXAMPLE_CONTACT: dict[str, JsonValue] = {
+    "position": [5.0, 5.0, 5.0],
+    "pressure": 4.0,
+    "direction": [0.1, 0.0, -1.0],
+}
+EXAMPLE: dict[str, JsonValue] = {
+    "contacts": [EXAMPLE_CONTACT],
+    "outputs": ["displacement"],
+    "region": "surface",
+}
+
+
+class _Strict(BaseModel):
+    """Refuses unknown keys, NaN, infinities, and booleans or strings in place of numbers."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+
+
+class Contact(_Strict):
+    """One endoscope pressing on the tissue."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [EXAMPLE_CONTACT]})
+
+    position: Position = Field(
+        description="Where the endoscope presses, [x, y, z] mm in the undeformed body's frame. "
+        "Off the surface it is projected, up to the scene's reach."
+    )
+    pressure: float = Field(
+        ge=0,
+        le=1e6,
+        description="Peak of the pressure footprint, kPa. Above the scene's range the answer says "
+        "in_range: false; above ten times its end it is refused.",
+    )
+    direction: Direction | None = Field(
+        None,
+        description="Where the endoscope pushes, [x, y, z] of any length from 0.001 up; less than "
+        "90 degrees from the inward normal. Default: the inward normal.",
+    )
+    radius: float | None = Field(
+        None, ge=1e-2, le=1e3, description="Radius of the footprint, mm. Default: the scene's."
+    )
+
+    @field_validator("direction")
+    @classmethod
+    def _has_a_direction(cls, direction: list[float] | None) -> list[float] | None:
+        if direction is not None and sum(c * c for c in direction) < SHORTEST_DIRECTION**2:
+            raise PydanticCustomError(
+                "zero_vector", "Input should not be a zero vector", {"min_norm": SHORTEST_DIRECTION}
+            )
+        return direction
+
+
+class SolveRequest(_Strict):
+    """A load, and what to answer about it."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [EXAMPLE]})
+
+    contacts: list[Contact] = Field(
+        min_length=1, max_length=1, description="The endoscopes at work; one, for now."
+    )
+    outputs: list[Output] = Field(
+        ["displacement", "von_mises"], max_length=2, description="The fields to return."
+    )
+    region: Region = Field(
+        "none",
+        description="The nodes to return fields for, in the order of the mesh of that region; with "
+        "none, the answer holds the contact, the force and the trust block.",
+    )
+
+
+_NAMES = {"": list(SolveRequest.model_fields), "contacts": list(Contact.model_fields)}
+
+
+def parse_request(body: bytes) -> SolveRequest:
+    """Make a request of its JSON text; raise `Refusal` with the field that is wrong."""
+    try:
+        return SolveRequest.model_validate_json(body)
+    except ValidationError as error:
+        details = error.errors(include_url=False, include_input=False)
+        raise invalid(details, _NAMES) from None
+
+
+class ContactAnswer(BaseModel):
+    """The load that was applied."""
+
+    position: Vector = Field(description="The contact on the undeformed surface, mm.")
+    normal: Vector = Field(description="Outward unit normal there.")
+    distance: float = Field(description="How far the requested position was from there, mm.")
+    direction: Vector = Field(description="Unit vector of the push.")
+    pressure: float = Field(description="kPa")
+    radius: float = Field(description="mm")
+    pressure_limit: float = Field(description="Largest pressure trained for there, kPa.")
+
+
+class ErrorEstimate(BaseModel):
+    """Expected relative L2 errors against the full model, as fractions."""
+
+    displacement: float
+    von_mises: float
+
+
+class Trust(BaseModel):
+    """Whether and how far to believe the answer."""
+
+    converged: bool = Field(description="Always true: a load without equilibrium is refused.")
+    iterations: int = Field(description="Newton steps taken.")
+    in_range: bool = Field(
+        description="Whether the load is in the range the model was trained for."
+    )
+    out_of_range: list[str] = Field(description="The contact's fields that are not.")
+    error_estimate: ErrorEstimate
+    min_jacobian: float = Field(description="Smallest volume ratio met; 1 at rest, 0 is collapse.")
+
+
+class Fields(BaseModel):
+    """The fields asked for, one entry per node of the region."""
+
+    displacement: list[Vector] | None = Field(None, description="mm")
+    von_mises: list[float] | None = Field(None, description="Cauchy stress, kPa")
+
+
+class Timing(BaseModel):
+    """Where the server's time went, µs."""
+
+    solve_us: float
+    recover_us: float
+
+
+class Answer(BaseModel):
+    """How the tissue answers a load."""
+
+    scene: str
+    contact: ContactAnswer
+    force: Vector = Field(description="Force on the tissue, mN.")
+    contact_displacement: Vector = Field(description="Displacement of the contact point, mm.")
+    trust: Trust
+    fields: Fields
+    timing: Timing
+
+
+class MeshFields(BaseModel):
+    """Nodes and the surface they make."""
+
+    nodes: list[Vector] = Field(description="mm; the order of every field of this region.")
+    triangles: list[Annotated[list[int], Field(min_length=3, max_length=3)]] = Field(
+        description="The body's surface: indices into nodes, counter-clockwise from outside."
+    )
+    surface_nodes: list[int] = Field(
+        description="Where the nodes of region surface are among those of region all."
+    )
+    clamped: list[Literal[0, 1]] = Field(description="Per node: 1 if held fixed.")
+
+
+class Mesh(BaseModel):
+    """The undeformed mesh of a region."""
+
+    scene: str
+    region: MeshRegion
+    fields: MeshFields
+
+
+class Refused(BaseModel):
+    """A file that is not served."""
+
+    file: str
+    reason: str
+
+
+class SceneEntry(BaseModel):
+    """A scene that is served."""
+
+    name: str
+    description: str
+
+
+class SceneList(BaseModel):
+    """What is served and what could not be."""
+
+    scenes: list[SceneEntry]
+    refused: list[Refused]
+
+
+class Ranges(BaseModel):
+    """The loads the model was trained for; outside, answers say in_range: false."""
+
+    pressure: list[float] = Field(
+        description="[from, to] kPa, where the surface takes most; see pressure_limit"
+    )
+    tilt: list[float] = Field(description="[from, to] degrees between push and inward normal")
+    radius: float = Field(description="mm")
+    reach: float = Field(description="Farthest a position may be from the surface, mm.")
+
+
+class Size(BaseModel):
+    """What the fields of this scene hold."""
+
+    nodes: int
+    dofs: int
+    surface_nodes: int
+    triangles: int
+
+
+class SceneSummary(BaseModel):
+    """One scene: what may be asked and how well it is answered."""
+
+    name: str
+    description: str
+    ranges: Ranges
+    tolerance: dict[str, float] = Field(description="Relative L2 errors promised, as fractions.")
+    size: Size
+    info: dict[str, Any] = Field(description="Training, validation and provenance.")
+    example: dict[str, Any] = Field(description="A request that this scene can answer.")
+
+
+class Status(BaseModel):
+    """The service is up."""
+
+    status: Literal["ok", "ready"]
+
+
+class Checked(BaseModel):
+    """The request is well-formed."""
+
+    valid: Literal[True]
+
+
+class ErrorBody(BaseModel):
+    """What is wrong."""
+
+    code: str
+    field: str = Field(description="Path of what is wrong in the request: contacts.0.pressure")
+    message: str
+    allowed: Any = Field(description="What would be right, where that is short.")
+
+
+class Problem(BaseModel):
+    """Why there is no answer."""
+
+    error: ErrorBody

@@ -1,0 +1,24 @@
+"""What the service can be told."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of one service.
+
+    Parameters
+    ----------
+    artifacts : Path
+        Directory of the artifacts to serve.
+    max_body : int, bytes
+        Largest request body. A query needs some hundred bytes.
+    max_json_numbers : int
+        Most field values in one JSON answer. The event loop serves nobody else while it writes
+        them (about 25 ns each); larger fields are for the binary formats.
+    """
+
+    artifacts: Path
+    max_body: int = 64 * 1024
+    max_json_numbers: int = 100_000

@@ -1,0 +1,36 @@
+"""An answer without its fields, as every JSON of the software has it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from shared.atlas import Solution
+
+
+def describe(scene: str, solution: Solution) -> dict[str, Any]:
+    """Write the part of an answer that does not grow with the mesh, JSON-able."""
+    return {
+        "scene": scene,
+        "contact": {
+            "position": solution.contact_point.tolist(),
+            "normal": solution.normal.tolist(),
+            "distance": solution.distance,
+            "direction": solution.direction.tolist(),
+            "pressure": solution.pressure,
+            "radius": solution.radius,
+            "pressure_limit": solution.pressure_limit,
+        },
+        "force": solution.force.tolist(),
+        "contact_displacement": solution.contact_displacement.tolist(),
+        "trust": {
+            "converged": solution.converged,
+            "iterations": solution.iterations,
+            "in_range": solution.in_range,
+            "out_of_range": solution.out_of_range,
+            "error_estimate": {
+                "displacement": solution.error_displacement,
+                "von_mises": solution.error_von_mises,
+            },
+            "min_jacobian": solution.min_jacobian,
+        },
+    }

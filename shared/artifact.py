@@ -1,0 +1,154 @@
+"""The artifact: one HDF5 file per scene, written whole or not at all, verified when read.
+
+A file holds plain numeric datasets, each with ``units``, a one-line ``description`` and the SHA-256
+of its bytes, and as root attributes the format's name and version, the scene's text, and JSON
+documents (provenance, training and validation figures).  Nothing in it is executed or unpickled.
+
+Before the HDF5 part stands a seal, one line of text in HDF5's user block: the format's name and
+version and the SHA-256 of the rest of the file.  It is checked before HDF5 sees the file: one wrong
+bit in HDF5's own structures can keep its library busy for ever.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from io import BufferedRandom, BufferedReader
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.errors import PalpateError
+
+FORMAT = "palpate-artifact"
+FORMAT_VERSION = 1
+
+SEAL_BYTES = 512
+"""The smallest user block that HDF5 offers."""
+
+
+class ArtifactError(PalpateError):
+    """A file that is no usable artifact; the message names the file and what is wrong with it."""
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """An array with what a reader needs to know of it; integers gain from being compressed."""
+
+    values: NDArray[Any]
+    units: str
+    description: str
+    compress: bool = False
+
+
+@dataclass(frozen=True)
+class Artifact:
+    """Contents of an artifact.
+
+    Attributes
+    ----------
+    scene : str
+        The scene's TOML text.
+    documents : dict
+        JSON-able: ``provenance``, ``training``, ``validation``.
+    arrays : dict of ndarray
+    """
+
+    scene: str
+    documents: dict[str, Any]
+    arrays: dict[str, NDArray[Any]]
+
+
+def digest(values: NDArray[Any]) -> str:
+    """SHA-256 of an array's type, shape and bytes."""
+    values = np.ascontiguousarray(values)
+    header = f"{values.dtype.str}{values.shape}".encode()
+    sha = hashlib.sha256(header)
+    sha.update(values.data if values.ndim else values.tobytes())
+    return sha.hexdigest()
+
+
+def write_artifact(
+    path: Path, scene: str, documents: Mapping[str, Any], datasets: Mapping[str, Dataset]
+) -> None:
+    """Write an artifact beside ``path``, flush it to disk, then move it into place."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.part")
+    try:
+        with h5py.File(temporary, "w", userblock_size=SEAL_BYTES) as file:
+            file.attrs["format"] = FORMAT
+            file.attrs["format_version"] = FORMAT_VERSION
+            file.attrs["scene"] = scene
+            file.attrs["documents"] = json.dumps(documents, sort_keys=True)
+            for key, dataset in datasets.items():
+                filters = {"compression": 4, "shuffle": True} if dataset.compress else {}
+                stored = file.create_dataset(key, data=dataset.values, **filters)
+                stored.attrs["units"] = dataset.units
+                stored.attrs["description"] = dataset.description
+                stored.attrs["sha256"] = digest(dataset.values)
+        with temporary.open("r+b") as written:
+            seal = f"{FORMAT} {FORMAT_VERSION} {_digest_of_rest(written)}\n"
+            written.seek(0)
+            written.write(seal.encode())
+            written.flush()
+            os.fsync(written.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_artifact(path: Path) -> Artifact:
+    """Read and verify an artifact.
+
+    Raises
+    ------
+    ArtifactError
+        If the file is missing, truncated, altered, of another format or of another version.
+    """
+    try:
+        with path.open("rb") as file:
+            _check_seal(file, path)
+        with h5py.File(path, "r") as opened:
+            return _read(opened, path)
+    except ArtifactError:
+        raise
+    except OSError as error:
+        raise ArtifactError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except Exception as error:  # h5py raises whatever a file leads it to
+        raise ArtifactError(f"{path}: incomplete: {error}") from error
+
+
+def _check_seal(file: BufferedReader, path: Path) -> None:
+    seal = re.fullmatch(rb"%b (\d+) ([0-9a-f]{64})\n\0+" % FORMAT.encode(), file.read(SEAL_BYTES))
+    if seal is None:
+        raise ArtifactError(f"{path}: not an artifact of this software")
+    version = int(seal[1])
+    if version != FORMAT_VERSION:
+        raise ArtifactError(
+            f"{path}: format version {version}, this software reads {FORMAT_VERSION}; "
+            "train the scene again or use the matching release"
+        )
+    if _digest_of_rest(file) != seal[2].decode():
+        raise ArtifactError(f"{path}: truncated or altered: it does not match its checksum")
+
+
+def _digest_of_rest(file: BufferedReader | BufferedRandom) -> str:
+    """SHA-256 of all that follows the seal."""
+    file.seek(SEAL_BYTES)
+    return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _read(file: h5py.File, path: Path) -> Artifact:
+    arrays = {}
+    for key, stored in file.items():
+        arrays[key] = stored[()]
+        if digest(arrays[key]) != stored.attrs["sha256"]:
+            raise ArtifactError(f"{path}: altered: dataset {key!r} does not match its checksum")
+    return Artifact(str(file.attrs["scene"]), json.loads(str(file.attrs["documents"])), arrays)

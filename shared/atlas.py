@@ -1,0 +1,583 @@
+"""An artifact in memory, ready to answer: locate, solve, recover fields, state the trust."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from shared import equilibrium
+from shared.artifact import Artifact, ArtifactError, read_artifact
+from shared.endoscope import pressure_limit
+from shared.errors import QueryError
+from shared.quadrature import stress_recovery, surface_quadrature, volume_quadrature
+from shared.reduced import (
+    AREA,
+    GUESS_FEATURES,
+    ITERATIONS,
+    LEADING,
+    MAX_ACTIVE,
+    MISSED,
+    NARROW,
+    SCALARS,
+    SMALLEST_J,
+    STATUS,
+    Memory,
+    Outcome,
+    Patches,
+    Scratch,
+    answer,
+    expand,
+)
+from shared.scene import Scene, SceneError, parse_scene
+from shared.stress import nodal_von_mises
+from shared.surface import Surface, boundary_triangles
+from shared.tissue import lame
+
+Array = NDArray[np.float64]
+Field = NDArray[np.float32]
+Region = Literal["surface", "all"]
+
+
+@dataclass(frozen=True)
+class Body:
+    """Mesh and tissue of a scene, as both sides see them.
+
+    Attributes
+    ----------
+    nodes : ndarray, shape (n, 3), mm
+    elements : ndarray, shape (e, 8) or (e, 20), int32
+    faces : ndarray, shape (f, 4) or (f, 8), int32
+    clamped : ndarray, shape (n,), bool
+    mu, lam : ndarray, shape (e,), kPa
+    """
+
+    nodes: Array
+    elements: NDArray[np.int32]
+    faces: NDArray[np.int32]
+    clamped: NDArray[np.bool_]
+    mu: Array
+    lam: Array
+
+
+@dataclass(frozen=True)
+class LocalModels:
+    """What training finds out about p patches of r wide modes each, from regions of M modes each.
+
+    Attributes
+    ----------
+    basis : ndarray, shape (regions, M, 3 n), int16
+        Modes of each region in steps of ``steps``; orthonormal in the energy of the rest state.
+    steps : ndarray, shape (regions, M), float32, mm
+    region : ndarray, shape (p,), int32
+        Region of each patch.
+    centres : ndarray, shape (p, 3), mm
+    frames : ndarray, shape (p, 3, 3)
+        Rows: outward normal and two tangents.
+    pressures : ndarray, shape (p,), kPa
+        Load scale.
+    modes : ndarray, shape (p, M, r), float32
+        Wide modes of each patch in the basis of its region.
+    point_from : ndarray, shape (p + 1,), int64
+        Cubature points of patch k are rows ``point_from[k] : point_from[k + 1]``.
+    points : ndarray, shape (c,), int32
+        Quadrature point, counted element by element.
+    weights : ndarray, shape (c,), mm^3
+    guess : ndarray, shape (p, features, LEADING + PATH), float32
+    errors : ndarray, shape (p,)
+        Relative error of the cubature in the energy norm, on loads it was not fitted to.
+    extent : float, mm
+        Largest distance of a contact point from the centre of a patch that answers for it.
+    blend : float, mm
+    """
+
+    basis: NDArray[np.int16]
+    steps: Field
+    region: NDArray[np.int32]
+    centres: Array
+    frames: Array
+    pressures: Array
+    modes: Field
+    point_from: NDArray[np.int64]
+    points: NDArray[np.int32]
+    weights: Array
+    guess: Field
+    errors: Array
+    extent: float
+    blend: float
+
+
+def assemble_patches(body: Body, models: LocalModels, radius: float) -> Patches:
+    """Everything the compiled query needs; ``radius`` (mm) is the largest footprint allowed."""
+    gradients, _ = volume_quadrature(body.nodes, body.elements, 2)
+    per_element = gradients.shape[1]
+    surface = surface_quadrature(body.nodes, body.faces)
+    bases = models.basis.reshape(*models.steps.shape, len(body.nodes), 3)
+    modes, rows = [], []
+    point_gradients = np.empty((9 * len(models.points), models.modes.shape[2]), np.float32)
+    for k, centre in enumerate(models.centres):
+        region = models.region[k]
+        C = models.steps[region][:, None] * models.modes[k]
+        chosen = models.points[models.point_from[k] : models.point_from[k + 1]]
+        element, q = np.divmod(chosen, per_element)
+        nodes, local = np.unique(body.elements[element], return_inverse=True)
+        V = np.tensordot(bases[region][:, nodes], C, (0, 0))[local.reshape(len(chosen), -1)]
+        first, last = 9 * models.point_from[k], 9 * models.point_from[k + 1]
+        point_gradients[first:last] = _mode_gradients(V, gradients[element, q])
+        near = np.flatnonzero(
+            np.sum((surface.points - centre) ** 2, axis=1) < (models.extent + radius) ** 2
+        )
+        nodes, local = np.unique(surface.nodes[near], return_inverse=True)
+        loaded = bases[region][:, nodes]
+        modes.append(np.tensordot(loaded, C, (0, 0)))
+        rows.append((near, local.reshape(len(near), -1)))
+    near = np.concatenate([r[0] for r in rows])
+    element = models.points // per_element
+    return Patches(
+        centres=models.centres,
+        frames=models.frames,
+        pressures=models.pressures,
+        point_from=models.point_from,
+        gradients=point_gradients,
+        weights=models.weights,
+        mu=body.mu[element],
+        lam=body.lam[element],
+        node_from=_offsets(modes),
+        modes=np.vstack(modes),
+        face_from=_offsets([r[0] for r in rows]),
+        face_points=surface.points[near],
+        face_normals=surface.normals[near],
+        face_areas=surface.areas[near],
+        face_nodes=np.vstack([r[1] for r in rows]).astype(np.int32),
+        face_shape=surface.shape[near],
+        guess=models.guess,
+        blend=models.blend,
+    )
+
+
+def _mode_gradients(V: Field, gradients: Array) -> Field:
+    """Gradients (9 c, m) of modes V (c, n, 3, m), at points with shape gradients (c, n, 3)."""
+    c, _, _, m = V.shape
+    # (c, 1, J, n) @ (c, i, n, m) -> (c, i, J, m)
+    G = np.matmul(np.swapaxes(gradients, 1, 2)[:, None].astype(V.dtype), np.swapaxes(V, 1, 2))
+    return np.ascontiguousarray(G.reshape(9 * c, m))
+
+
+def _offsets(parts: list[Any]) -> NDArray[np.int64]:
+    return np.concatenate([[0], np.cumsum([len(part) for part in parts])]).astype(np.int64)
+
+
+class State:
+    """Working memory and last answer of one caller; not to be shared between threads."""
+
+    def __init__(self, patches: Patches) -> None:
+        r = patches.modes.shape[2]
+        rows = 9 * int(np.diff(patches.point_from).max())
+        self.memory = Memory(
+            patch=np.full(MAX_ACTIVE, -1, np.int64),
+            wide=np.zeros((MAX_ACTIVE, r)),
+            guess=np.zeros((MAX_ACTIVE, r)),
+            factor=np.zeros((MAX_ACTIVE, NARROW, NARROW)),
+            factorised=np.zeros(MAX_ACTIVE, np.int64),
+        )
+        self.scratch = Scratch(
+            F=np.zeros(rows),
+            P=np.zeros(rows),
+            H=np.zeros((3, rows)),
+            AG=np.zeros((9, NARROW)),
+            G=np.zeros((rows, NARROW)),
+            vectors=np.zeros((NARROW - LEADING, r)),
+            single=np.zeros(rows, np.float32),
+            tangent=np.zeros((NARROW, NARROW)),
+            point=np.zeros((10, 9)),
+            newton=np.zeros((4, NARROW)),
+            q=np.zeros(NARROW),
+            load=np.zeros(NARROW),
+            overlap=np.zeros(NARROW),
+            wide_load=np.zeros(r),
+            derivative=np.zeros(r),
+            wide_single=np.zeros(r, np.float32),
+            features=np.zeros(GUESS_FEATURES),
+            nodal=np.zeros(int(np.diff(patches.node_from).max())),
+            distance=np.zeros(len(patches.centres)),
+        )
+        self.outcome = Outcome(np.zeros(MAX_ACTIVE), np.zeros(SCALARS), np.zeros(3))
+
+    def forget(self) -> None:
+        """Make the next answer independent of the last."""
+        self.memory.patch[:] = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """Answer to one query.
+
+    Attributes
+    ----------
+    contact_point : ndarray, shape (3,), mm
+        Queried position moved to the surface.
+    normal : ndarray, shape (3,)
+        Outward unit normal there.
+    distance : float, mm
+        How far the position was moved.
+    direction : ndarray, shape (3,)
+        Unit direction of the load.
+    tilt : float, degrees
+        Of the direction from the inward normal.
+    missed : float
+        Residual left in the wide space before it is added to the narrow one, relative to the load.
+    cubature : float
+        Cubature error of the patches that answer.
+    pressure, radius : float
+        kPa at the footprint's centre, mm.
+    pressure_limit : float, kPa
+        Largest trained pressure at this point in this direction.
+    force : ndarray, shape (3,), mN
+        Resultant of the load.
+    contact_displacement : ndarray, shape (3,), mm
+        Mean over the footprint, weighted with its pressure.
+    converged : bool
+    iterations : int
+    in_range : bool
+        Whether the load is of the kind the model was trained and validated for.
+    out_of_range : tuple of str
+        The fields that are not.
+    error_displacement, error_von_mises : float
+        Estimated relative L2 errors against the full model, calibrated to cover 95 % of cases.
+    min_jacobian : float
+        Smallest det F among the cubature points.
+    patches : tuple of (int, float, ndarray)
+        Active patches: number, weight, answer (r,) in the wide space.
+    solve_seconds : float
+    """
+
+    contact_point: Array
+    normal: Array
+    distance: float
+    direction: Array
+    tilt: float
+    missed: float
+    cubature: float
+    pressure: float
+    radius: float
+    pressure_limit: float
+    force: Array
+    contact_displacement: Array
+    converged: bool
+    iterations: int
+    in_range: bool
+    out_of_range: tuple[str, ...]
+    error_displacement: float
+    error_von_mises: float
+    min_jacobian: float
+    patches: tuple[tuple[int, float, Array], ...]
+    solve_seconds: float
+
+
+@dataclass(frozen=True)
+class Estimator:
+    """Calibrated error estimate: ``log error = c . features``, one row per quantity.
+
+    Features: 1, tilt over the largest tilt, and the logs of the pressure over its limit, of the
+    residual missed, of the patch's cubature error and of the contact's displacement over pressure.
+    """
+
+    coefficients: Array  # (2, 6): displacement, von Mises
+
+    @staticmethod
+    def features(
+        load: float, tilt: float, missed: float, cubature: float, compliance: float
+    ) -> tuple[float, ...]:
+        """Feature vector of load and tilt fraction, residual, cubature error and mm/kPa."""
+        logs = (math.log(max(value, 1e-6)) for value in (load, missed, cubature, compliance))
+        return 1.0, tilt, *logs
+
+    def __call__(
+        self, load: float, tilt: float, missed: float, cubature: float, compliance: float
+    ) -> tuple[float, float]:
+        """Estimated relative errors of displacement and von Mises stress."""
+        features = self.features(load, tilt, missed, cubature, compliance)
+        displacement, von_mises = self.coefficients @ features
+        return math.exp(displacement), math.exp(von_mises)
+
+
+class Atlas:
+    """A trained scene that answers queries.
+
+    Parameters
+    ----------
+    name : str
+    scene : Scene
+    info : dict
+        JSON-able documents of the artifact.
+    body : Body
+    surface : Surface
+        Accessible surface.
+    limits : ndarray, shape (v, 7)
+        Load range at the surface's vertices; see ``shared.endoscope.pressure_limit``.
+    models : LocalModels
+    estimator : Estimator
+    """
+
+    def __init__(
+        self,
+        name: str,
+        scene: Scene,
+        info: dict[str, Any],
+        body: Body,
+        surface: Surface,
+        limits: Array,
+        models: LocalModels,
+        estimator: Estimator,
+    ) -> None:
+        self.name = name
+        self.scene = scene
+        self.info = info
+        self.body = body
+        self.surface = surface
+        self.limits = limits
+        self.models = models
+        self.estimator = estimator
+        self.patches = assemble_patches(body, models, scene.endoscope.radius)
+        self.surface_nodes, self.surface_triangles = boundary_triangles(body.faces)
+        self._recovery = stress_recovery(body.nodes, body.elements, body.mu, body.lam)
+        self._full = np.zeros((len(body.nodes), 3))
+        self._stress = np.zeros(len(body.nodes))
+        self._state = self.new_state()
+
+    @classmethod
+    def load(cls, path: str | Path) -> Atlas:
+        """Load an artifact.
+
+        Raises
+        ------
+        ArtifactError
+        """
+        path = Path(path)
+        artifact = read_artifact(path)
+        try:
+            return cls.from_artifact(artifact)
+        except (KeyError, SceneError, ValueError, IndexError) as error:
+            raise ArtifactError(f"{path}: incomplete or inconsistent: {error}") from error
+
+    @classmethod
+    def from_artifact(cls, artifact: Artifact) -> Atlas:
+        """Build from the contents of an artifact."""
+        arrays = artifact.arrays
+        scene = parse_scene(artifact.scene)
+        mu, lam = lame(scene.tissue.young, scene.tissue.poisson)
+        count = len(arrays["elements"])
+        return cls(
+            name=scene.name,
+            scene=scene,
+            info=artifact.documents,
+            body=Body(
+                arrays["nodes"],
+                arrays["elements"],
+                arrays["faces"],
+                arrays["clamped"],
+                np.full(count, mu),
+                np.full(count, lam),
+            ),
+            surface=Surface(
+                arrays["surface_vertices"], arrays["surface_triangles"], arrays["surface_normals"]
+            ),
+            limits=arrays["load_range"],
+            models=LocalModels(
+                basis=arrays["basis"],
+                steps=arrays["basis_steps"],
+                region=arrays["patch_region"],
+                centres=arrays["patch_centres"],
+                frames=arrays["patch_frames"],
+                pressures=arrays["patch_pressures"],
+                modes=arrays["patch_modes"].astype(np.float32),
+                point_from=arrays["cubature_from"],
+                points=arrays["cubature_points"],
+                weights=arrays["cubature_weights"],
+                guess=arrays["patch_guess"].astype(np.float32),
+                errors=arrays["patch_errors"],
+                extent=float(arrays["patch_extent"]),
+                blend=float(arrays["patch_blend"]),
+            ),
+            estimator=Estimator(arrays["error_coefficients"]),
+        )
+
+    @property
+    def nodes(self) -> Array:
+        """Nodes (n, 3) mm."""
+        return self.body.nodes
+
+    @property
+    def clamped(self) -> NDArray[np.bool_]:
+        """Nodes held fixed (n,)."""
+        return self.body.clamped
+
+    @cached_property
+    def pressure_max(self) -> float:
+        """Largest trained pressure anywhere on the surface, kPa."""
+        return float(self.limits[:, 0].max())
+
+    def new_state(self) -> State:
+        """Working memory and warm start for one session or thread."""
+        return State(self.patches)
+
+    def solve(
+        self,
+        position: ArrayLike,
+        pressure: float,
+        direction: ArrayLike | None = None,
+        radius: float | None = None,
+        state: State | None = None,
+    ) -> Solution:
+        """Answer one pressed footprint.
+
+        Parameters
+        ----------
+        position : array_like, shape (3,), mm
+            Contact point; projected onto the accessible surface if within the scene's reach of it.
+        pressure : float, kPa
+            At the footprint's centre.
+        direction : array_like, shape (3,), optional
+            Of the load; the inward normal if absent.
+        radius : float, optional
+            Of the footprint, mm; the scene's if absent.
+        state : State, optional
+            Where the last answer is remembered to start from; without it every answer is cold.
+
+        Raises
+        ------
+        QueryError
+            If a field is not finite, out of reach or makes no sense; see its message.
+        """
+        started = time.perf_counter()
+        endoscope = self.scene.endoscope
+        if not (math.isfinite(pressure) and pressure >= 0):
+            raise QueryError("pressure", f"must be a finite number >= 0 kPa, not {pressure}")
+        at = _vector("position", position)
+        x, normal, distance, fields = self.surface.locate(at, self.limits)
+        if distance > endoscope.reach:
+            raise QueryError(
+                "position",
+                f"{distance:.2f} mm from the accessible surface, "
+                f"at most {endoscope.reach} mm allowed",
+            )
+        if radius is None:
+            radius = endoscope.radius
+        elif not endoscope.radius / 2 <= radius <= endoscope.radius:
+            allowed = f"[{endoscope.radius / 2}, {endoscope.radius}] mm"
+            raise QueryError("radius", f"must be in {allowed}, not {radius}")
+        if direction is None:
+            towards, tilt = -normal, 0.0
+        else:
+            towards = _vector("direction", direction)
+            length = math.sqrt(towards @ towards)
+            if length == 0:
+                raise QueryError("direction", "must not be the zero vector")
+            towards = towards / length
+            cosine = -float(towards @ normal)
+            if cosine <= 0:
+                raise QueryError("direction", "must point into the tissue")
+            tilt = math.degrees(math.acos(min(1.0, cosine)))
+        limit = pressure_limit(fields, normal, towards)
+        if state is None:
+            state = self._state
+            state.forget()
+        outcome, memory = state.outcome, state.memory
+        answer(self.patches, x, normal, towards, pressure, radius, memory, state.scratch, outcome)
+        scalars = outcome.scalars
+        out_of_range = tuple(
+            name
+            for name, outside in (
+                ("pressure", pressure > limit * (1 + 1e-9)),
+                ("direction", tilt > endoscope.max_tilt + 1e-6),
+                ("radius", radius != endoscope.radius),
+            )
+            if outside
+        )
+        active = [s for s in range(MAX_ACTIVE) if outcome.weight[s] > 0]
+        patches = tuple(
+            (_number(int(memory.patch[s])), float(outcome.weight[s]), memory.wide[s].copy())
+            for s in active
+        )
+        cubature = sum(weight * float(self.models.errors[k]) for k, weight, _ in patches)
+        errors = self.estimator(
+            pressure / limit,
+            tilt / endoscope.max_tilt,
+            float(scalars[MISSED]),
+            cubature,
+            float(np.linalg.norm(outcome.displacement)) / max(pressure, 1e-6),
+        )
+        return Solution(
+            contact_point=x,
+            normal=normal,
+            distance=distance,
+            direction=towards,
+            tilt=tilt,
+            missed=float(scalars[MISSED]),
+            cubature=cubature,
+            pressure=pressure,
+            radius=radius,
+            pressure_limit=limit,
+            force=pressure * float(scalars[AREA]) * towards,
+            contact_displacement=outcome.displacement.copy(),
+            converged=bool(scalars[STATUS] == equilibrium.CONVERGED),
+            iterations=int(scalars[ITERATIONS]),
+            in_range=not out_of_range,
+            out_of_range=out_of_range,
+            error_displacement=errors[0],
+            error_von_mises=errors[1],
+            min_jacobian=float(scalars[SMALLEST_J]),
+            patches=patches,
+            solve_seconds=time.perf_counter() - started,
+        )
+
+    def coefficients(self, solution: Solution) -> dict[int, Field]:
+        """Displacement as coefficients (M,) in the basis of each region that takes part."""
+        total: dict[int, Field] = {}
+        for k, weight, c in solution.patches:
+            region = int(self.models.region[k])
+            share = self.models.modes[k] @ (weight * c).astype(np.float32)
+            total[region] = total[region] + share if region in total else share
+        return total
+
+    def displacement(self, solution: Solution, region: Region = "all") -> Field:
+        """Nodal displacement (k, 3) mm, of all nodes or those of ``surface_nodes``."""
+        field = np.zeros(self.models.basis.shape[2], np.float32)
+        for number, coefficients in self.coefficients(solution).items():
+            expand(self.models.basis[number], self.models.steps[number] * coefficients, field)
+        displacement = field.reshape(-1, 3)
+        return displacement if region == "all" else displacement[self.surface_nodes]
+
+    def von_mises(
+        self, solution: Solution, region: Region = "all", displacement: Field | None = None
+    ) -> Field:
+        """Nodal von Mises stress (k,) kPa; ``displacement`` of all nodes saves its recovery."""
+        if displacement is None:
+            displacement = self.displacement(solution, "all")
+        self._full[:] = displacement
+        nodal_von_mises(self._recovery, self._full, self._stress)
+        stress = self._stress if region == "all" else self._stress[self.surface_nodes]
+        # an answer that did not converge may be beyond single precision
+        with np.errstate(over="ignore"):
+            return stress.astype(np.float32)
+
+
+def _number(slot: int) -> int:
+    """Patch in a memory slot, whether its answer converged or not (``shared.reduced.answer``)."""
+    return slot if slot >= 0 else -2 - slot
+
+
+def _vector(field: str, value: ArrayLike) -> Array:
+    try:
+        vector = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise QueryError(field, "must be three numbers") from error
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise QueryError(field, "must be three finite numbers")
+    return vector

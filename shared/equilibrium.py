@@ -1,0 +1,114 @@
+"""Static equilibrium by Newton's method with an energy line search, for any size of model.
+
+A model takes part through three functions: ``potential`` (total potential energy, its gradient the
+residual, and the smallest det F), ``factorise`` (tangent at a state, optionally shifted towards the
+rest stiffness) and ``correct`` (solve with the factorised tangent).  The full model gives them as
+methods; the reduced model as compiled overloads, so this one source runs as Python for the former
+and as machine code for the latter.
+
+Equilibria are sought as minima: where the tangent is not positive definite it is shifted by a
+multiple of the rest stiffness until it is, and every step must lower the potential (Nocedal &
+Wright, Numerical Optimization, ch. 3).
+"""
+
+import math
+
+import numpy as np
+
+CONVERGED, STALLED, EXHAUSTED = 0, 1, 2
+
+SUFFICIENT_DECREASE = 1e-4
+ROUND_OFF = 1e-12
+SMALLEST_STEP = 1e-6
+LARGEST_SHIFT = 1e4
+
+
+def potential(system, u, residual):
+    """Write the residual (internal minus external force) at ``u``; return (energy, min det F)."""
+    return system.potential(u, residual)
+
+
+def factorise(system, u, shift):
+    """Factorise tangent(u) + shift * rest stiffness; False if it is not positive definite."""
+    return system.factorise(u, shift)
+
+
+def correct(system, residual, step):
+    """Write ``step = -(factorised tangent)^-1 residual``."""
+    system.correct(residual, step)
+
+
+def newton(system, u, work, target, reuse, max_iterations, factorised):
+    """Find the equilibrium of ``system`` near ``u``, in place.
+
+    Parameters
+    ----------
+    system
+        What ``potential``, ``factorise`` and ``correct`` understand.
+    u : ndarray, shape (n,)
+        Start on entry, equilibrium on return.
+    work : ndarray, shape (4, n)
+        Scratch: residual, step, trial state, trial residual.
+    target : float
+        Residual norm at which the state counts as equilibrium (units of the residual).
+    reuse : float
+        A factorised tangent serves again while it contracts the residual at least by this factor;
+        0 gives Newton's method proper, quadratic to the end.
+    max_iterations : int
+    factorised : bool
+        Whether ``system`` still holds the factorised tangent of a state near ``u``.
+
+    Returns
+    -------
+    status : int
+        ``CONVERGED``, ``STALLED`` (no descent found, or ``u`` inverts an element on entry) or
+        ``EXHAUSTED`` (iterations used up).
+    iterations : int
+        Corrections made.
+    norm : float
+        Residual norm at ``u``.
+    smallest : float
+        Smallest det F at ``u``.
+    """
+    residual, step, trial, trial_residual = work[0], work[1], work[2], work[3]
+    energy, smallest = potential(system, u, residual)
+    if not smallest > 0:  # beyond an inverted element there is neither residual nor tangent
+        return STALLED, 0, math.inf, smallest
+    norm = math.sqrt(np.dot(residual, residual))
+    stale = not factorised
+    iterations = 0
+    while not norm <= target:
+        if iterations == max_iterations:
+            return EXHAUSTED, iterations, norm, smallest
+        if stale:
+            shift = 0.0
+            while not factorise(system, u, shift):
+                shift = max(0.01, 4.0 * shift)
+                if shift > LARGEST_SHIFT:
+                    return STALLED, iterations, norm, smallest
+        correct(system, residual, step)
+        slope = np.dot(residual, step)
+        length = 1.0
+        while True:
+            np.multiply(step, length, trial)
+            np.add(trial, u, trial)
+            trial_energy, trial_smallest = potential(system, trial, trial_residual)
+            allowed = SUFFICIENT_DECREASE * length * slope + ROUND_OFF * abs(energy)
+            if trial_energy - energy <= allowed:
+                break
+            length *= 0.5
+            if length < SMALLEST_STEP:
+                break
+        iterations += 1
+        if length < SMALLEST_STEP:
+            if stale:
+                return STALLED, iterations, norm, smallest
+            stale = True
+            continue
+        u[:] = trial
+        residual[:] = trial_residual
+        energy, smallest = trial_energy, trial_smallest
+        previous = norm
+        norm = math.sqrt(np.dot(residual, residual))
+        stale = length < 1.0 or norm > reuse * previous
+    return CONVERGED, iterations, norm, smallest

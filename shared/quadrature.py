@@ -1,0 +1,83 @@
+"""Integration points of a mesh: in the volume, on the boundary, and for stress recovery."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.elements import HEX_CORNERS, HEX_EDGES, gauss, hexahedron, quadrilateral, shape
+from shared.endoscope import SurfaceQuadrature
+from shared.errors import PalpateError
+from shared.stress import StressRecovery
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int32]
+
+LOAD_QUADRATURE = 8
+"""Gauss points per face edge under a footprint: the load must be smooth in the contact point."""
+
+
+def volume_quadrature(nodes: Array, elements: Ints, points: int) -> tuple[Array, Array]:
+    """Gradients of the shape functions and weights at ``points``^3 Gauss points.
+
+    Returns
+    -------
+    gradients : ndarray, shape (e, q, n, 3), 1/mm
+    weights : ndarray, shape (e, q), mm^3
+
+    Raises
+    ------
+    PalpateError
+        If an element is inverted in the reference state.
+    """
+    at, w = gauss(points, 3)
+    _, dN = shape(hexahedron(elements.shape[1]), at)
+    jacobian = np.einsum("eai,qaj->eqij", nodes[elements], dN)
+    det = np.linalg.det(jacobian)
+    if not (det > 0).all():
+        worst = int(np.argmin(det.min(axis=1)))
+        raise PalpateError(f"mesh: element {worst} is inverted; change geometry.divisions")
+    gradients = np.einsum("qaj,eqji->eqai", dN, np.linalg.inv(jacobian))
+    return np.ascontiguousarray(gradients), det * w
+
+
+def surface_quadrature(
+    nodes: Array, faces: Ints, points: int = LOAD_QUADRATURE
+) -> SurfaceQuadrature:
+    """Integration points of boundary faces, ``points``^2 a face; their nodes are mesh nodes."""
+    at, w = gauss(points, 2)
+    N, dN = shape(quadrilateral(faces.shape[1]), at)
+    X = nodes[faces]
+    tangents = np.einsum("fai,qaj->fqij", X, dN)
+    normals = np.cross(tangents[..., 0], tangents[..., 1])
+    areas = np.linalg.norm(normals, axis=-1)
+    return SurfaceQuadrature(
+        points=np.einsum("qa,fai->fqi", N, X).reshape(-1, 3),
+        normals=(normals / areas[..., None]).reshape(-1, 3),
+        areas=(areas * w).reshape(-1),
+        nodes=np.repeat(faces, len(at), axis=0).astype(np.int32),
+        shape=np.tile(N, (len(faces), 1)),
+    )
+
+
+def stress_recovery(nodes: Array, elements: Ints, mu: Array, lam: Array) -> StressRecovery:
+    """Recovery of nodal stresses from 2x2x2 points per element; mu, lam (e,) kPa."""
+    gradients, _ = volume_quadrature(nodes, elements, 2)
+    at, _ = gauss(2, 3)
+    to_points, _ = shape(HEX_CORNERS, at)
+    corners = elements[:, :8]
+    midsides = np.empty((0, 3), np.int32)
+    if elements.shape[1] == 20:
+        edges = np.array(HEX_EDGES)
+        ends = corners[:, edges].reshape(-1, 2)
+        midsides = np.unique(np.column_stack([elements[:, 8:].reshape(-1), ends]), axis=0)
+        midsides = midsides[np.unique(midsides[:, 0], return_index=True)[1]]
+    return StressRecovery(
+        connectivity=np.ascontiguousarray(elements, dtype=np.int32),
+        gradients=np.ascontiguousarray(np.moveaxis(gradients, 1, 3)),
+        extrapolation=np.linalg.inv(to_points).astype(np.float64),
+        mu=np.ascontiguousarray(mu),
+        lam=np.ascontiguousarray(lam),
+        elements_at=np.bincount(corners.ravel(), minlength=len(nodes)).astype(float),
+        midsides=midsides.astype(np.int32),
+    )

@@ -1,0 +1,20 @@
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture
+def rng():
+    """Return a random generator that every run seeds alike."""
+    return np.random.default_rng(20260101)
+
+
+@pytest.fixture(scope="session")
+def artifact(tmp_path_factory):
+    """Return the artifact of the quick scene, trained here and now."""
+    path = tmp_path_factory.mktemp("trained") / "quick.h5"
+    train = "from shared.cli import main; main()", "train", "quick", "--out", str(path)
+    subprocess.run([sys.executable, "-c", *train], check=True, capture_output=True)
+    return path

@@ -1,0 +1,44 @@
+import json
+
+import numpy as np
+import pytest
+
+import offline.bench
+from offline.bench import STEP, bench, walk
+from offline.validate import unseen_loads
+from shared.atlas import Atlas
+
+KINDS = ["cold_us", "warm_us", "surface_us", "fields_us", "full_us"]
+
+
+@pytest.fixture
+def short(monkeypatch):
+    monkeypatch.setattr(offline.bench, "ROUNDS", 3)
+    monkeypatch.setattr(offline.bench, "QUERIES", 30)
+
+
+@pytest.mark.usefixtures("short")
+def test_every_kind_of_query_is_timed(artifact):
+    report = bench(artifact)
+    json.dumps(report, allow_nan=False)
+    assert list(report) == [*KINDS, "p95", "ratio"]
+    assert list(report["p95"]) == KINDS
+    assert all(0 < report[kind] <= report["p95"][kind] for kind in KINDS)
+    assert report["warm_us"] < report["cold_us"] < report["full_us"]
+    assert report["cold_us"] < report["fields_us"]
+    assert report["ratio"] == report["full_us"] / report["cold_us"]
+
+
+def test_a_walk_stays_on_the_surface_and_in_range(artifact, rng):
+    atlas = Atlas.load(artifact)
+    for start in unseen_loads(atlas, 5, 0):
+        loads = walk(atlas, start, 300, rng)
+        assert len(loads) == 300
+        positions = np.array([load.position for load in loads])
+        steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+        assert (steps <= STEP * (1 + 1e-9)).all()
+        assert (steps >= 0.9 * STEP).all()
+        for load in loads[::20]:
+            solution = atlas.solve(load.position, load.pressure, load.direction)
+            assert solution.distance < 1e-9
+            assert solution.in_range

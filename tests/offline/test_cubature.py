@@ -1,0 +1,66 @@
+"""Empirical cubature: few positive weights that reproduce the sums over all points."""
+
+import numpy as np
+import pytest
+
+from offline.cubature import compress, nonnegative
+
+POINTS, EQUATIONS = 300, 20
+
+
+@pytest.fixture
+def equations(rng):
+    """Return equations (r, q) and their sums: random ones and, as in training, the volume."""
+    A = np.vstack([rng.standard_normal((EQUATIONS - 1, POINTS)), np.ones(POINTS)])
+    return A, A.sum(axis=1)
+
+
+def test_as_many_points_as_equations_reproduce_the_sums(equations):
+    A, b = equations
+    chosen, weights = nonnegative(A, b, EQUATIONS)
+    assert len(chosen) <= EQUATIONS
+    np.testing.assert_allclose(A[:, chosen] @ weights, b, atol=1e-8 * np.linalg.norm(b))
+
+
+@pytest.mark.parametrize("most", [1, 5, 12, EQUATIONS])
+def test_weights_are_positive_and_points_few(equations, most):
+    A, b = equations
+    chosen, weights = nonnegative(A, b, most)
+    assert 0 < len(chosen) == len(weights) <= most
+    assert (weights > 0).all()
+    assert (np.diff(chosen) > 0).all()
+
+
+def test_more_points_miss_less(equations):
+    A, b = equations
+    missed = []
+    for most in (2, 5, 10, 15, EQUATIONS):
+        chosen, weights = nonnegative(A, b, most)
+        missed.append(np.linalg.norm(A[:, chosen] @ weights - b))
+    assert (np.diff(missed) < 0).all()
+
+
+def test_no_more_points_than_it_takes(rng):
+    A = np.abs(rng.standard_normal((EQUATIONS, POINTS)))
+    chosen, weights = nonnegative(A, 3 * A[:, 7], EQUATIONS)
+    np.testing.assert_array_equal(chosen, [7])
+    np.testing.assert_allclose(weights, 3)
+
+
+def test_what_solves_the_compressed_equations_solves_all(rng):
+    rank = 12
+    contributions = rng.standard_normal((POINTS, rank)) @ rng.standard_normal((rank, 500))
+    contributions += 1.0
+    A, b = compress(contributions, rank + 1, rng)
+    assert A.shape == (rank + 1, POINTS)
+    chosen, weights = nonnegative(A, b, rank + 1)
+    sums = contributions.sum(axis=0)
+    found = weights @ contributions[chosen]
+    np.testing.assert_allclose(found, sums, atol=1e-7 * np.linalg.norm(sums))
+
+
+def test_compression_keeps_what_matters(rng):
+    contributions = rng.standard_normal((POINTS, 40)) * 0.5 ** np.arange(40)
+    A, _ = compress(contributions, 15, rng)
+    expected = np.linalg.svd(contributions, compute_uv=False)
+    np.testing.assert_allclose(np.linalg.norm(A, axis=1), expected[:15], rtol=1e-6)

@@ -1,0 +1,63 @@
+"""The load on the turbinate is a smooth function of the contact point, faces' edges included."""
+
+import numpy as np
+import pytest
+
+from offline.mesh import build_mesh
+from offline.scenes import find_scene
+from offline.surface_mesh import accessible_surface
+from shared.endoscope import footprint
+from shared.quadrature import LOAD_QUADRATURE, surface_quadrature
+
+STEP = 0.05  # mm
+RADIUS = 2.0  # mm
+
+
+@pytest.fixture(scope="module")
+def turbinate():
+    mesh = build_mesh(find_scene("turbinate"))
+    return mesh, accessible_surface(mesh)
+
+
+def loads(turbinate, path, points=LOAD_QUADRATURE):
+    """Nodal weights (steps, nodes) along a path of positions."""
+    mesh, surface = turbinate
+    quadrature = surface_quadrature(mesh.nodes, mesh.faces, points)
+    nodal = np.empty((len(path), len(mesh.nodes)))
+    for row, position in zip(nodal, path, strict=True):
+        x, normal, _ = surface.project(position)
+        footprint(quadrature, x, normal, RADIUS, row)
+    return nodal
+
+
+PATHS = {
+    "along the nose": np.column_stack(
+        [np.full(200, 10.2), 15 + STEP * np.arange(200), np.full(200, 11.0)]
+    ),
+    "across the medial side": np.column_stack(
+        [np.full(160, 10.3), np.full(160, 17.3), 5 + STEP * np.arange(160)]
+    ),
+    "off the posterior end": np.column_stack(
+        [np.full(80, 10.2), STEP * np.arange(80), np.full(80, 9.0)]
+    ),
+}
+
+
+@pytest.mark.parametrize("path", PATHS.values(), ids=PATHS)
+def test_no_jump_and_no_kink(turbinate, path):
+    nodal = loads(turbinate, path)
+    scale = np.linalg.norm(nodal, axis=1).max()
+    steps = np.linalg.norm(np.diff(nodal, axis=0), axis=1) / scale
+    bends = np.linalg.norm(np.diff(nodal, 2, axis=0), axis=1) / scale
+    # A smooth load moves by about STEP / RADIUS and turns by its square; a jump or a kink would
+    # show in the second differences at the size of the first ones.
+    assert steps.max() < 2 * STEP / RADIUS
+    assert bends.max() < 0.2 * steps.max()
+
+
+@pytest.mark.parametrize("path", PATHS.values(), ids=PATHS)
+def test_quadrature_is_fine_enough(turbinate, path):
+    coarse = loads(turbinate, path[::7])
+    fine = loads(turbinate, path[::7], points=24)
+    error = np.linalg.norm(coarse - fine, axis=1) / np.linalg.norm(fine, axis=1)
+    assert error.max() < 0.01

@@ -1,0 +1,106 @@
+import json
+
+import meshio
+import numpy as np
+import pytest
+
+from offline.full_model import NoEquilibrium
+from offline.scenes import find_scene
+from offline.solve import solve
+from offline.workshop import Workshop
+from shared.artifact import read_artifact
+from shared.atlas import Atlas
+
+POSITION = (4.0, 5.5, find_scene("quick").geometry.size[2] + 0.2)
+DIRECTION = (0.2, 0.1, -1.0)
+
+
+@pytest.fixture(scope="module")
+def workshop(artifact):
+    return Workshop.of_artifact(read_artifact(artifact))
+
+
+@pytest.fixture(scope="module")
+def pressure(artifact):
+    return 0.4 * float(Atlas.load(artifact).limits[:, 0].min())
+
+
+@pytest.fixture(scope="module")
+def solved(artifact, pressure, tmp_path_factory):
+    """Return the report of a load solved by both models and the mesh with its fields."""
+    path = tmp_path_factory.mktemp("solved") / "out.vtu"
+    report = solve(artifact, POSITION, pressure, DIRECTION, full_model=True, vtu=path)
+    return report, meshio.read(path)
+
+
+def test_the_report_is_that_of_the_atlas(artifact, pressure):
+    report = solve(artifact, POSITION, pressure, DIRECTION)
+    solution = Atlas.load(artifact).solve(POSITION, pressure, DIRECTION)
+    assert report["scene"] == "quick"
+    assert report["contact"]["distance"] == pytest.approx(0.2)
+    assert report["force"] == pytest.approx(solution.force.tolist())
+    assert report["trust"]["converged"]
+    assert report["trust"]["in_range"]
+    assert report["peak"]["displacement"] > 0
+    assert report["timing"]["solve_us"] > 0
+    assert "full_model" not in report
+    json.dumps(report, allow_nan=False)
+
+
+def test_the_full_model_is_in_equilibrium_on_the_written_mesh(workshop, solved):
+    _, mesh = solved
+    np.testing.assert_array_equal(mesh.points, workshop.mesh.nodes)
+    np.testing.assert_array_equal(mesh.point_data["clamped"] != 0, workshop.mesh.clamped)
+    force, load = np.zeros(mesh.points.size), mesh.point_data["load"]
+    displacement = mesh.point_data["displacement"]
+    workshop.model.internal(displacement.ravel(), force)
+    free = workshop.model.free
+    residual = (force - load.ravel())[free]
+    assert np.linalg.norm(residual) < 1e-8 * np.linalg.norm(load)
+    assert np.abs(displacement[workshop.mesh.clamped]).max() == 0.0
+    np.testing.assert_allclose(mesh.point_data["von_mises"], workshop.von_mises(displacement))
+
+
+def test_load_and_force_agree(solved):
+    report, mesh = solved
+    np.testing.assert_allclose(mesh.point_data["load"].sum(axis=0), report["force"], rtol=1e-9)
+
+
+def test_the_errors_are_those_of_the_written_fields(workshop, solved):
+    report, mesh = solved
+    kept = workshop.beyond_clamped_layer
+    for name, nodes in (("displacement", slice(None)), ("von_mises", kept)):
+        exact, off = mesh.point_data[name][nodes], mesh.point_data[f"{name}_error"][nodes]
+        error = np.linalg.norm(off) / np.linalg.norm(exact)
+        assert report["full_model"]["error"][name] == pytest.approx(error)
+        assert 0 < error < 0.5
+    assert report["full_model"]["timing"]["solve_us"] > report["timing"]["solve_us"]
+
+
+def test_without_the_full_model_the_fields_are_the_atlas_s(artifact, pressure, tmp_path):
+    solve(artifact, POSITION, pressure, vtu=tmp_path / "out.vtu")
+    atlas, fields = Atlas.load(artifact), meshio.read(tmp_path / "out.vtu").point_data
+    solution = atlas.solve(POSITION, pressure)
+    assert list(fields) == ["displacement", "von_mises", "load", "clamped"]
+    np.testing.assert_allclose(fields["displacement"], atlas.displacement(solution), atol=1e-6)
+    np.testing.assert_allclose(fields["von_mises"], atlas.von_mises(solution), atol=1e-5)
+
+
+def test_no_load_has_no_error(artifact):
+    report = solve(artifact, POSITION, 0.0, full_model=True)
+    assert report["full_model"]["error"] == {"displacement": 0.0, "von_mises": 0.0}
+
+
+def test_a_load_without_equilibrium_is_told(artifact):
+    with pytest.raises(NoEquilibrium, match=r"^pressure: no equilibrium .* up to [0-9.]+ kPa"):
+        solve(artifact, POSITION, 1e4)
+
+
+@pytest.mark.parametrize("factor", [2.0, 5.0, 20.0, 100.0, 1000.0])
+def test_far_beyond_the_range_there_is_a_sound_answer_or_none(artifact, pressure, factor):
+    try:
+        report = solve(artifact, POSITION, factor * pressure)
+    except NoEquilibrium:
+        return
+    assert report["trust"]["min_jacobian"] > 0
+    json.dumps(report, allow_nan=False)

@@ -1,0 +1,42 @@
+"""The studies run and write what they promise; here on meshes too coarse to conclude from."""
+
+import csv
+
+import pytest
+
+from offline.studies import mesh_error, newton_step
+from offline.studies.mesh_error import Discretisation
+
+
+@pytest.mark.parametrize("element", ["hex8", "hex20"])
+def test_a_newton_step_is_faster_than_felupes(element):
+    result = newton_step.compare(element, repeats=2)
+    assert result["unknowns"] == pytest.approx(6000, rel=0.05)
+    # On an idle machine 10 (hex8) and 7 (hex20).
+    assert result["ratio"] > 3
+    assert result["ratio_best"] <= result["ratio"]
+
+
+def test_mesh_error_is_tabled_and_drawn(tmp_path, monkeypatch):
+    coarse, fine = (Discretisation("hex20", (n, 1, 4), 1.0) for n in (6, 9))
+    hex8 = Discretisation("hex8", (8, 2, 5), 1.7)
+    monkeypatch.setattr(mesh_error, "REFERENCE", fine)
+    monkeypatch.setattr(mesh_error, "PROBE", coarse)
+    monkeypatch.setattr(mesh_error, "SECOND_OPINIONS", ())
+    monkeypatch.setattr(mesh_error, "CANDIDATES", (coarse, hex8))
+    monkeypatch.setattr(mesh_error, "POINTS", 2)
+    monkeypatch.setattr(mesh_error, "INDENTATION", 0.05)
+    result = mesh_error.mesh_error(tmp_path / "report")
+    assert list(result) == [str(fine), str(coarse), str(hex8)]
+    assert result[str(fine)]["largest_greatest"] == 0.0
+    assert result[str(hex8)]["under_footprint_least"] < -0.1  # stiff
+    with (tmp_path / "report" / "mesh_error_points.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2
+    for row in rows:
+        moved = float(row["under_footprint_mm"])
+        assert moved == pytest.approx(0.05 * float(row["thickness_mm"]), rel=0.3)
+        assert float(row[str(fine)]) == 0.0
+    with (tmp_path / "report" / "mesh_error.csv").open() as file:
+        assert [row["values"] for row in csv.DictReader(file)] == ["9", "9", "9"]
+    assert (tmp_path / "report" / "mesh_error.png").stat().st_size > 5000

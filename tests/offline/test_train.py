@@ -1,0 +1,81 @@
+"""Training as a process: killed and resumed, it makes the very artifact of an undisturbed run."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import h5py
+import numpy as np
+import pytest
+
+STAGES = ("load range", "Ritz vectors", "local models", "full solutions")
+
+
+def start(path):
+    """Start `palpate train quick` as a group of processes that can be killed together."""
+    code = "from shared.cli import main; main()"
+    return subprocess.Popen(
+        [sys.executable, "-c", code, "train", "quick", "--out", path],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def finished(path):
+    """Results on disk, by path; parts of a write that was cut off do not count."""
+    return sorted((path.parent / f".{path.stem}.training").glob("*/*.h5"))
+
+
+def kill_after(process, path, name):
+    """Kill a training as soon as a result of this name is on disk."""
+    deadline = time.monotonic() + 300
+    while not any(result.name.startswith(name) for result in finished(path)):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+
+
+@pytest.fixture(scope="module")
+def resumed(tmp_path_factory):
+    """Return an artifact of a run that was killed, what was done by then, and the second's log."""
+    path = tmp_path_factory.mktemp("killed") / "quick.h5"
+    kill_after(start(path), path, "patch-")
+    assert not path.exists()
+    done = finished(path)
+    stale = done[0].parents[1] / "0123456789abcdef" / done[0].name
+    stale.parent.mkdir()
+    stale.write_bytes(b"from other code")
+    second = start(path)
+    _, log = second.communicate(timeout=300)
+    assert second.returncode == 0, log
+    return path, done, log
+
+
+def test_finished_tasks_are_kept(resumed):
+    _, done, log = resumed
+    # what the progress bars begin with
+    kept = {title: re.search(rf"{title}: .*?\| (\d+)/(\d+) \[", log).groups() for title in STAGES}
+    assert sum(int(begun) for begun, _ in kept.values()) == len(done)
+    for title in ("load range", "Ritz vectors"):
+        assert kept[title][0] == kept[title][1]
+    assert 0 < int(kept["local models"][0]) < int(kept["local models"][1])
+    assert kept["full solutions"][0] == "0"
+
+
+def test_a_resumed_run_makes_the_artifact_of_an_undisturbed_one(resumed, artifact):
+    with h5py.File(resumed[0]) as found, h5py.File(artifact) as expected:
+        assert found.keys() == expected.keys()
+        for name, dataset in expected.items():
+            np.testing.assert_array_equal(found[name][()], dataset[()], err_msg=name)
+
+
+def test_nothing_is_left_beside_the_artifact(resumed):
+    path = resumed[0]
+    assert sorted(file.name for file in path.parent.iterdir()) == ["quick", "quick.h5"]

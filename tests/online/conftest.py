@@ -1,0 +1,79 @@
+import socket
+import threading
+import time
+from contextlib import contextmanager
+
+import pytest
+import uvicorn
+from starlette.testclient import TestClient
+
+from online.app import create_app
+from online.settings import Settings
+from online.store import Store
+from shared.errors import PalpateError
+
+from .fake_atlas import FakeAtlas
+
+
+@pytest.fixture
+def fake_store(tmp_path):
+    """Return a function that makes a store of fake atlases, one per name.
+
+    An exception in place of an atlas is raised when that file is loaded.
+    """
+
+    def make(**atlases):
+        for name in atlases:
+            (tmp_path / f"{name}.h5").touch()
+
+        def load(path):
+            atlas = atlases[path.stem]
+            if isinstance(atlas, Exception):
+                raise atlas
+            return atlas
+
+        return Store(tmp_path, load)
+
+    return make
+
+
+@pytest.fixture
+def serve(fake_store, tmp_path):
+    """Return a context manager that serves fake atlases to an in-process client, once warm."""
+
+    @contextmanager
+    def serving(settings=None, **atlases):
+        store = fake_store(**atlases)
+        app = create_app(settings or Settings(tmp_path), store)
+        with TestClient(app, raise_server_exceptions=False) as client:
+            _wait_for(store)
+            yield client
+
+    return serving
+
+
+@pytest.fixture
+def client(serve):
+    """Return an in-process client of a service with one toy scene and one refused file."""
+    with serve(toy=FakeAtlas(), broken=PalpateError("broken.h5: truncated")) as client:
+        yield client
+
+
+@pytest.fixture
+def url(fake_store, tmp_path):
+    """Return the address of a toy service on a real socket."""
+    store = fake_store(toy=FakeAtlas())
+    app = create_app(Settings(tmp_path), store)
+    server = uvicorn.Server(uvicorn.Config(app, access_log=False, log_level="warning"))
+    with socket.create_server(("127.0.0.1", 0)) as bound:
+        thread = threading.Thread(target=server.run, args=([bound],))
+        thread.start()
+        _wait_for(store)
+        yield f"http://127.0.0.1:{bound.getsockname()[1]}"
+        server.should_exit = True
+        thread.join()
+
+
+def _wait_for(store):
+    while not store.ready:
+        time.sleep(0.005)

@@ -1,0 +1,112 @@
+"""A toy that answers like an `Atlas`: a block whose top dents linearly under the load."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shared.atlas import Solution
+from shared.errors import QueryError
+from shared.scene import Scene, load_scene
+from shared.surface import Surface
+
+QUICK = Path(__file__).parents[2] / "offline" / "scenes" / "quick.toml"
+
+
+class FakeAtlas:
+    """A block of 10 x 10 x 5 mm, clamped below, pressed from above.
+
+    Above `collapse` (kPa) it has no equilibrium; `poison` makes its answers NaN.
+    """
+
+    pressure_max = 8.0
+
+    def __init__(
+        self, name: str = "toy", divisions: int = 10, collapse: float = 40.0, poison: bool = False
+    ) -> None:
+        scene = load_scene(QUICK)
+        self.name = name
+        self.scene: Scene = scene.model_copy(update={"name": name})
+        self.info: dict[str, Any] = {"modes": 1, "validation": {"queries": 0}}
+        self.collapse = collapse
+        self.poison = poison
+        axis = np.linspace(0.0, 10.0, divisions + 1)
+        grid = np.stack(np.meshgrid(axis, axis, axis / 2, indexing="ij"), axis=-1)
+        self.nodes = grid.reshape(-1, 3)
+        self.clamped = self.nodes[:, 2] == 0.0
+        self.surface_nodes = np.flatnonzero(self.nodes[:, 2] == 5.0).astype(np.int32)
+        n = divisions + 1
+        corner = (np.arange(divisions)[:, None] * n + np.arange(divisions)).ravel()
+        first = np.stack([corner, corner + n, corner + n + 1], axis=1)
+        second = np.stack([corner, corner + n + 1, corner + 1], axis=1)
+        self.surface_triangles = np.concatenate([first, second]).astype(np.int32)
+        top = self.nodes[self.surface_nodes]
+        self.surface = Surface(top, self.surface_triangles, np.tile([0.0, 0.0, 1.0], (len(top), 1)))
+        self.limits = np.full((len(top), 1), self.pressure_max)
+
+    def solve(
+        self,
+        position: Any,
+        pressure: float,
+        direction: Any = None,
+        radius: float | None = None,
+        state: Any = None,
+    ) -> Solution:
+        start = time.perf_counter()
+        position = np.asarray(position, float)
+        contact = np.clip(position, [0, 0, 5], [10, 10, 5])
+        distance = float(np.linalg.norm(position - contact))
+        reach = self.scene.endoscope.reach
+        if distance > reach:
+            raise QueryError("position", f"{distance:.3g} mm from the surface; limit {reach} mm")
+        normal = np.array([0.0, 0.0, 1.0])
+        push = -normal if direction is None else np.asarray(direction, float)
+        push = push / np.linalg.norm(push)
+        if push @ normal >= 0:
+            raise QueryError("direction", "90 degrees or more from the inward normal")
+        usual = self.scene.endoscope.radius
+        radius = usual if radius is None else radius
+        out_of_range = ("pressure",) * (pressure > self.pressure_max)
+        out_of_range += ("radius",) * (radius != usual)
+        moved = 0.1 * pressure * push * (np.nan if self.poison else 1.0)
+        return Solution(
+            contact_point=contact,
+            normal=normal,
+            distance=distance,
+            direction=push,
+            tilt=float(np.degrees(np.arccos(-push @ normal))),
+            missed=0.0,
+            cubature=0.0,
+            pressure=pressure,
+            radius=radius,
+            pressure_limit=self.pressure_max,
+            force=pressure * radius**2 * push,
+            contact_displacement=moved,
+            converged=pressure <= self.collapse,
+            iterations=1,
+            in_range=not out_of_range,
+            out_of_range=out_of_range,
+            error_displacement=0.001,
+            error_von_mises=0.002,
+            min_jacobian=1.0 - 0.01 * pressure,
+            patches=(),
+            solve_seconds=time.perf_counter() - start,
+        )
+
+    def _nodes(self, region: str) -> np.ndarray:
+        return self.nodes[self.surface_nodes] if region == "surface" else self.nodes
+
+    def _shape(self, solution: Solution, region: str) -> np.ndarray:
+        nodes = self._nodes(region)
+        squared = ((nodes - solution.contact_point) ** 2).sum(axis=1)
+        return nodes[:, 2] / 5 * np.exp(-squared / (2 * solution.radius**2))
+
+    def displacement(self, solution: Solution, region: str = "all") -> np.ndarray:
+        field = np.outer(self._shape(solution, region), solution.contact_displacement)
+        return field.astype(np.float32)
+
+    def von_mises(
+        self, solution: Solution, region: str = "all", displacement: np.ndarray | None = None
+    ) -> np.ndarray:
+        return (solution.pressure * self._shape(solution, region)).astype(np.float32)

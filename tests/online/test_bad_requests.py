@@ -1,0 +1,155 @@
+"""Every bad request is answered by a 4xx that names the field, never by a 5xx or a NaN."""
+
+import json
+
+import pytest
+
+SOLVE = "/scenes/toy/solve"
+GOOD = {"position": [5.0, 5.0, 5.0], "pressure": 4.0}
+
+
+def post(client, body, path=SOLVE, **headers):
+    text = json.dumps(body) if isinstance(body, dict) else body
+    return client.post(path, content=text, headers={"content-type": "application/json", **headers})
+
+
+def contact(**changes):
+    return {"contacts": [{**GOOD, **changes}]}
+
+
+def error_of(response, status):
+    assert response.status_code == status, response.text
+    assert response.headers["content-type"] == "application/json"
+    assert "NaN" not in response.text
+    assert "Traceback" not in response.text
+    error = response.json()["error"]
+    assert set(error) == {"code", "field", "message", "allowed"}
+    assert error["message"]
+    return error
+
+
+FIELDS = {
+    "not json": ("{", "body"),
+    "empty": ("", "body"),
+    "null": ("null", "body"),
+    "a list": ("[]", "body"),
+    "not utf-8": (b'{"contacts": "\xff"}', "body"),
+    "too deep": ("[" * 5000, "body"),
+    "no contacts": ({}, "contacts"),
+    "empty contacts": ({"contacts": []}, "contacts"),
+    "two contacts": ({"contacts": [GOOD, GOOD]}, "contacts"),
+    "huge list of contacts": ({"contacts": [1] * 9999}, "contacts"),
+    "contacts not a list": ({"contacts": GOOD}, "contacts"),
+    "contact not a table": ({"contacts": [7]}, "contacts.0"),
+    "NaN pressure": ('{"contacts":[{"position":[5,5,5],"pressure":NaN}]}', "contacts.0.pressure"),
+    "Infinity": (
+        '{"contacts":[{"position":[5,5,Infinity],"pressure":1}]}',
+        "contacts.0.position.2",
+    ),
+    "-Infinity": (
+        '{"contacts":[{"position":[5,-Infinity,5],"pressure":1}]}',
+        "contacts.0.position.1",
+    ),
+    "1e999": ('{"contacts":[{"position":[5,5,5],"pressure":1e999}]}', "contacts.0.pressure"),
+    "huge integer": (contact(pressure=10**400), "contacts.0.pressure"),
+    "no pressure": ({"contacts": [{"position": [5, 5, 5]}]}, "contacts.0.pressure"),
+    "negative pressure": (contact(pressure=-1.0), "contacts.0.pressure"),
+    "absurd pressure": (contact(pressure=81.0), "contacts.0.pressure"),
+    "false pressure": (contact(pressure=False), "contacts.0.pressure"),
+    "text pressure": (contact(pressure="4"), "contacts.0.pressure"),
+    "null pressure": (contact(pressure=None), "contacts.0.pressure"),
+    "two coordinates": (contact(position=[5, 5]), "contacts.0.position"),
+    "four coordinates": (contact(position=[5, 5, 5, 5]), "contacts.0.position"),
+    "huge position": (contact(position=[5.0] * 9999), "contacts.0.position"),
+    "nested position": (contact(position=[[5, 5, 5]]), "contacts.0.position"),
+    "far position": (contact(position=[5, 5, 9]), "contacts.0.position"),
+    "very far position": (contact(position=[1e300, 5, 5]), "contacts.0.position.0"),
+    "zero direction": (contact(direction=[0, 0, 0]), "contacts.0.direction"),
+    "tiny direction": (contact(direction=[0, 0, -1e-200]), "contacts.0.direction"),
+    "outward direction": (contact(direction=[0, 0, 1]), "contacts.0.direction"),
+    "sideways direction": (contact(direction=[1, 0, 0]), "contacts.0.direction"),
+    "zero radius": (contact(radius=0), "contacts.0.radius"),
+    "misspelt field": ({"contacts": [{"position": [5, 5, 5], "presure": 1}]}, "contacts.0.presure"),
+    "unknown key": ({**contact(), "steps": 3}, "steps"),
+    "unknown output": ({**contact(), "outputs": ["strain"]}, "outputs.0"),
+    "huge outputs": ({**contact(), "outputs": ["displacement"] * 999}, "outputs"),
+    "unknown region": ({**contact(), "region": "left"}, "region"),
+}
+
+
+@pytest.mark.parametrize(("body", "field"), FIELDS.values(), ids=FIELDS)
+def test_the_field_at_fault_is_named(client, body, field):
+    error = error_of(post(client, body), 422)
+    assert error["field"].startswith(field)
+
+
+@pytest.mark.parametrize("body", [body for body, _ in FIELDS.values()], ids=FIELDS)
+def test_check_finds_the_same_faults_of_form(client, body):
+    solved, checked = (post(client, body, f"/scenes/toy/{verb}") for verb in ("solve", "check"))
+    if solved.json()["error"]["code"] == "unanswerable_query":
+        assert checked.json() == {"valid": True}
+    else:
+        assert checked.json() == solved.json()
+
+
+def test_what_is_allowed_is_said(client):
+    assert error_of(post(client, contact(pressure=-1)), 422)["allowed"] == {"ge": 0.0}
+    assert error_of(post(client, contact(presure=1)), 422)["allowed"] == [
+        "position",
+        "pressure",
+        "direction",
+        "radius",
+    ]
+    assert "reach" not in error_of(post(client, {**contact(), "reach": 1}), 422)["allowed"]
+
+
+def test_a_far_position_is_told_its_distance_and_the_limit(client):
+    error = error_of(post(client, contact(position=[5, 5, 9])), 422)
+    assert error["field"] == "contacts.0.position"
+    assert "4 mm" in error["message"]
+    assert "3.0 mm" in error["message"]
+
+
+def test_unknown_scene(client):
+    for response in (
+        post(client, contact(), "/scenes/nose/solve"),
+        post(client, contact(), "/scenes/nose/check"),
+        client.get("/scenes/nose"),
+        client.get("/scenes/nose/mesh"),
+    ):
+        error = error_of(response, 404)
+        assert error["field"] == "name"
+        assert error["allowed"] == ["toy"]
+
+
+def test_unknown_path_and_method(client):
+    assert error_of(client.get("/nowhere"), 404)["field"] == "path"
+    response = client.get(SOLVE)
+    assert error_of(response, 405)["allowed"] == ["POST"]
+    assert response.headers["allow"] == "POST"
+
+
+def test_unknown_mesh_region(client):
+    error = error_of(client.get("/scenes/toy/mesh?region=none"), 422)
+    assert error["field"] == "region"
+
+
+def test_unknown_format(client):
+    error = error_of(post(client, contact(), accept="text/html"), 406)
+    assert error["field"] == "accept"
+    assert "application/json" in error["allowed"]
+
+
+@pytest.mark.parametrize("kind", ["text/plain", "application/x-www-form-urlencoded", ""])
+def test_a_body_that_does_not_claim_to_be_json(client, kind):
+    response = client.post(SOLVE, content=json.dumps(contact()), headers={"content-type": kind})
+    assert error_of(response, 415)["field"] == "content-type"
+
+
+@pytest.mark.parametrize("declared", [True, False])
+def test_a_body_too_large(client, declared):
+    text = json.dumps(contact(position=[5.0] * 20_000)).encode()
+    body = text if declared else iter([text[:70_000], text[70_000:]])  # chunked
+    error = error_of(post(client, body), 413)
+    assert error["field"] == "body"
+    assert error["allowed"] == {"max_bytes": 65536}

@@ -1,0 +1,49 @@
+import numpy as np
+import pytest
+
+from online import wire
+from online.negotiation import BINARY
+
+from .fake_atlas import FakeAtlas
+
+
+def test_served_and_refused_are_listed(client):
+    listed = client.get("/scenes").json()
+    assert [scene["name"] for scene in listed["scenes"]] == ["toy"]
+    assert listed["refused"] == [{"file": "broken.h5", "reason": "broken.h5: truncated"}]
+
+
+def test_a_scene_tells_what_may_be_asked(client):
+    scene = client.get("/scenes/toy").json()
+    assert scene["ranges"] == {
+        "pressure": [0.0, 8.0],
+        "tilt": [0.0, 30.0],
+        "radius": 2.0,
+        "reach": 3.0,
+    }
+    assert scene["size"] == {"nodes": 1331, "dofs": 3993, "surface_nodes": 121, "triangles": 200}
+    assert scene["tolerance"]["displacement"] == 0.01
+    assert scene["info"]["modes"] == 1
+
+
+def test_a_scene_gives_an_example_that_it_can_answer(client):
+    example = client.get("/scenes/toy").json()["example"]
+    assert client.post("/scenes/toy/solve", json=example).status_code == 200
+
+
+@pytest.mark.parametrize("region", ["surface", "all"])
+def test_the_mesh_of_a_region(client, region):
+    path = f"/scenes/toy/mesh?region={region}"
+    _, arrays = wire.decode(client.get(path, headers={"accept": BINARY}).content)
+    atlas = FakeAtlas()
+    ids = atlas.surface_nodes if region == "surface" else np.arange(len(atlas.nodes))
+    np.testing.assert_allclose(arrays["nodes"], atlas.nodes[ids], atol=1e-6)
+    np.testing.assert_array_equal(arrays["clamped"], atlas.clamped[ids])
+    np.testing.assert_array_equal(
+        ids[arrays["triangles"]], atlas.surface_nodes[atlas.surface_triangles]
+    )
+    np.testing.assert_array_equal(arrays["surface_nodes"], atlas.surface_nodes)
+    document = client.get(path).json()
+    assert document["region"] == region
+    for name, array in arrays.items():
+        np.testing.assert_allclose(document["fields"][name], array, rtol=1e-6)

@@ -1,0 +1,158 @@
+import json
+import re
+
+import msgpack
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+
+from online import wire
+from online.negotiation import BINARY, MSGPACK
+from online.settings import Settings
+
+from .fake_atlas import FakeAtlas
+
+QUERY = {
+    "contacts": [{"position": [4.0, 5.0, 6.0], "pressure": 4.0, "direction": [0.0, 1.0, -2.0]}]
+}
+
+
+def solve(client, accept="application/json", **changes):
+    response = client.post(
+        "/scenes/toy/solve", json={**QUERY, **changes}, headers={"accept": accept}
+    )
+    assert response.status_code == 200, response.text
+    assert response.headers["content-type"] == accept
+    return response
+
+
+def test_the_answer_tells_contact_force_and_trust(client):
+    answer = solve(client).json()
+    direction = np.array([0.0, 1.0, -2.0]) / np.sqrt(5.0)
+    timing = answer.pop("timing")
+    assert set(timing) == {"solve_us", "recover_us"}
+    assert min(timing.values()) >= 0
+    assert answer == {
+        "scene": "toy",
+        "contact": {
+            "position": [4.0, 5.0, 5.0],
+            "normal": [0.0, 0.0, 1.0],
+            "distance": 1.0,
+            "direction": pytest.approx(direction),
+            "pressure": 4.0,
+            "radius": 2.0,
+            "pressure_limit": 8.0,
+        },
+        "force": pytest.approx(16.0 * direction),
+        "contact_displacement": pytest.approx(0.4 * direction),
+        "trust": {
+            "converged": True,
+            "iterations": 1,
+            "in_range": True,
+            "out_of_range": [],
+            "error_estimate": {"displacement": 0.001, "von_mises": 0.002},
+            "min_jacobian": 0.96,
+        },
+        "fields": {},
+    }
+
+
+@pytest.mark.parametrize("region", ["surface", "all"])
+def test_all_formats_hold_the_same_fields_in_the_order_of_the_mesh(client, region):
+    from_json = {
+        name: np.array(values, np.float32)
+        for name, values in solve(client, region=region).json()["fields"].items()
+    }
+    _, from_binary = wire.decode(solve(client, BINARY, region=region).content)
+    from_msgpack = {
+        name: np.frombuffer(entry["data"], "<f4").reshape(entry["shape"])
+        for name, entry in msgpack.unpackb(solve(client, MSGPACK, region=region).content)[
+            "fields"
+        ].items()
+    }
+    mesh = client.get(f"/scenes/toy/mesh?region={region}").json()["fields"]
+    atlas = FakeAtlas()
+    expected = atlas.displacement(atlas.solve(**QUERY["contacts"][0]), region)
+    assert len(mesh["nodes"]) == len(expected)
+    for fields in (from_json, from_binary, from_msgpack):
+        assert list(fields) == ["displacement", "von_mises"]
+        np.testing.assert_array_equal(fields["displacement"], expected)
+        np.testing.assert_array_equal(fields["von_mises"], from_binary["von_mises"])
+
+
+@pytest.mark.parametrize("outputs", [[], ["displacement"], ["von_mises"]])
+def test_only_the_outputs_asked_for_are_sent(client, outputs):
+    assert list(solve(client, outputs=outputs, region="surface").json()["fields"]) == outputs
+
+
+def test_the_same_request_has_the_same_answer_whatever_came_before(client):
+    def answer(**changes):
+        document = solve(client, region="surface", **changes).json()
+        del document["timing"]
+        return document
+
+    first = answer()
+    answer(contacts=[{"position": [1.0, 9.0, 5.0], "pressure": 7.5}])
+    assert answer() == first
+
+
+def test_a_load_beyond_training_is_answered_with_a_flag(client):
+    answer = solve(client, contacts=[{"position": [5, 5, 5], "pressure": 12}]).json()
+    assert answer["trust"]["in_range"] is False
+    assert answer["trust"]["out_of_range"] == ["pressure"]
+
+
+def test_the_header_tells_where_the_time_went(client):
+    timing = solve(client, region="all").headers["server-timing"]
+    assert re.fullmatch(r"solve;dur=[\d.]+, recover;dur=[\d.]+, encode;dur=[\d.]+", timing)
+
+
+def test_a_load_without_equilibrium_is_refused(serve):
+    with serve(toy=FakeAtlas(collapse=5.0)) as client:
+        body = json.dumps({"contacts": [{"position": [5, 5, 5], "pressure": 6}]})
+        response = client.post(
+            "/scenes/toy/solve", content=body, headers={"content-type": "application/json"}
+        )
+    assert response.status_code == 422
+    assert response.json()["error"] == {
+        "code": "no_equilibrium",
+        "field": "contacts.0.pressure",
+        "message": "There is no equilibrium under this load; the model was trained for up to "
+        "8 kPa there",
+        "allowed": {"le": 8.0},
+    }
+
+
+@pytest.mark.parametrize("accept", ["application/json", BINARY, MSGPACK])
+@pytest.mark.parametrize("region", ["none", "surface", "all"])
+def test_nan_never_leaves(serve, accept, region):
+    atlas = FakeAtlas()
+    with serve(toy=atlas) as client:
+        atlas.poison = True
+        response = client.post(
+            "/scenes/toy/solve", json={**QUERY, "region": region}, headers={"accept": accept}
+        )
+    assert response.status_code == 422
+    assert response.json()["error"]["code"] == "no_equilibrium"
+
+
+def test_fields_too_large_for_json_are_refused_in_json_only(serve, tmp_path):
+    with serve(Settings(tmp_path, max_json_numbers=1000), toy=FakeAtlas()) as client:
+        solve(client, region="surface")
+        solve(client, BINARY, region="all")
+        response = client.post("/scenes/toy/solve", json={**QUERY, "region": "all"})
+    assert response.status_code == 422
+    assert response.json()["error"]["field"] == "region"
+    assert response.json()["error"]["allowed"] == {"max_numbers": 1000}
+
+
+def test_a_bug_is_answered_without_details_and_raised_on(serve):
+    atlas = FakeAtlas()
+    with serve(toy=atlas) as client:
+        atlas.solve = None
+        response = client.post("/scenes/toy/solve", json=QUERY)
+        with pytest.raises(TypeError):
+            TestClient(client.app).post("/scenes/toy/solve", json=QUERY)
+    assert response.status_code == 500
+    assert response.json()["error"]["code"] == "internal"
+    assert "NoneType" not in response.text

@@ -1,0 +1,153 @@
+import os
+import time
+
+import h5py
+import numpy as np
+import pytest
+
+from shared.artifact import (
+    FORMAT_VERSION,
+    SEAL_BYTES,
+    ArtifactError,
+    Dataset,
+    read_artifact,
+    write_artifact,
+)
+
+SCENE = 'name = "x"\n' * 20
+DOCUMENTS = {"training": {"patches": 3}, "validation": {"displacement": {"mean": 0.01}}}
+DATASETS = {
+    "modes": Dataset(np.random.default_rng(1).random((40, 30)), "mm", "modes of the body"),
+    "basis": Dataset(np.arange(9000, dtype=np.int16).reshape(9, -1), "1", "steps", compress=True),
+    "clamped": Dataset(np.array([True, False]), "1", "nodes held fixed"),
+    "extent": Dataset(np.array(2.5), "mm", "reach of a local model"),
+}
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / "x.h5"
+    write_artifact(path, SCENE, DOCUMENTS, DATASETS)
+    return path
+
+
+def refusal(path):
+    """Return why a file is refused, and insist that this takes no time."""
+    started = time.perf_counter()
+    with pytest.raises(ArtifactError) as refused:
+        read_artifact(path)
+    assert time.perf_counter() - started < 2.0
+    assert str(refused.value).startswith(f"{path}: ")
+    return str(refused.value)
+
+
+def test_what_is_written_is_read(path):
+    artifact = read_artifact(path)
+    assert artifact.scene == SCENE
+    assert artifact.documents == DOCUMENTS
+    assert artifact.arrays.keys() == DATASETS.keys()
+    for key, dataset in DATASETS.items():
+        assert artifact.arrays[key].dtype == dataset.values.dtype
+        np.testing.assert_array_equal(artifact.arrays[key], dataset.values)
+
+
+def test_any_hdf5_tool_can_read_it(path):
+    with h5py.File(path) as file:
+        assert file.attrs["format"] == "palpate-artifact"
+        assert file.attrs["format_version"] == FORMAT_VERSION
+        assert file.attrs["scene"] == SCENE
+        for key, dataset in DATASETS.items():
+            assert file[key].attrs["units"] == dataset.units
+            assert file[key].attrs["description"] == dataset.description
+            assert len(file[key].attrs["sha256"]) == 64
+        assert file["basis"].compression == "gzip"
+        assert file["basis"].id.get_storage_size() < DATASETS["basis"].values.nbytes / 2
+        assert file["modes"].compression is None
+
+
+def test_the_seal_is_a_line_of_text(path):
+    name, version, checksum = path.read_bytes()[:SEAL_BYTES].split(b"\n")[0].split(b" ")
+    assert (name, version, len(checksum)) == (b"palpate-artifact", b"%d" % FORMAT_VERSION, 64)
+
+
+def test_wherever_it_is_cut_off_it_is_refused(path):
+    whole = path.read_bytes()
+    cuts = {*range(0, len(whole), 97), 1, SEAL_BYTES - 1, SEAL_BYTES, len(whole) - 1}
+    for length in cuts:
+        path.write_bytes(whole[:length])
+        assert refusal(path)
+    path.write_bytes(whole + b"\0")
+    assert "truncated or altered" in refusal(path)
+
+
+def test_whichever_bit_is_flipped_it_is_refused(path, rng):
+    whole = path.read_bytes()
+    # all of the seal and of HDF5's root structures, samples of the rest
+    places = {*range(1024), *rng.integers(0, len(whole), 1000).tolist()}
+    for place in places:
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(damaged)
+        assert refusal(path)
+
+
+def test_another_version_is_told(path):
+    with path.open("r+b") as file:
+        file.write(b"palpate-artifact 9 ")
+    assert f"format version 9, this software reads {FORMAT_VERSION}" in refusal(path)
+
+
+def foreign_hdf5(path):
+    with h5py.File(path, "w") as file:
+        file["temperature"] = [36.6, 37.1]
+
+
+def foreign_hdf5_with_a_user_block(path):
+    with h5py.File(path, "w", userblock_size=512) as file:
+        file["temperature"] = [36.6, 37.1]
+
+
+def text(path):
+    path.write_text("not HDF5 at all\n" * 100)
+
+
+def empty(path):
+    path.write_bytes(b"")
+
+
+@pytest.mark.parametrize("make", [foreign_hdf5, foreign_hdf5_with_a_user_block, text, empty])
+def test_foreign_files_are_told(tmp_path, make):
+    make(tmp_path / "foreign.h5")
+    assert "not an artifact" in refusal(tmp_path / "foreign.h5")
+
+
+def test_what_is_no_file_is_told(tmp_path):
+    assert "No such file" in refusal(tmp_path / "absent.h5")
+    assert "Is a directory" in refusal(tmp_path)
+
+
+def test_a_write_that_fails_leaves_what_was_there(path):
+    before = path.read_bytes()
+    unwritable = Dataset(np.array([object()]), "1", "no numbers")
+    with pytest.raises(TypeError):
+        write_artifact(path, SCENE, DOCUMENTS, {**DATASETS, "bad": unwritable})
+    assert path.read_bytes() == before
+    assert os.listdir(path.parent) == ["x.h5"]
+
+
+def test_a_kill_before_the_last_step_leaves_what_was_there(path, monkeypatch):
+    before = path.read_bytes()
+    monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        write_artifact(path, "other", {}, {})
+    assert path.read_bytes() == before
+    assert os.listdir(path.parent) == ["x.h5"]
+
+
+def test_the_umask_decides_who_reads_it(tmp_path):
+    before = os.umask(0o027)
+    try:
+        write_artifact(tmp_path / "x.h5", SCENE, DOCUMENTS, DATASETS)
+    finally:
+        os.umask(before)
+    assert (tmp_path / "x.h5").stat().st_mode & 0o777 == 0o640

@@ -1,0 +1,255 @@
+"""The local models: mechanics of the full model in few modes, and answers that are continuous."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numba import njit
+
+from offline.patches import LocalTrainer, _weighted_stress
+from offline.workshop import Load, Workshop
+from shared import equilibrium
+from shared.artifact import read_artifact
+from shared.atlas import Atlas, assemble_patches
+from shared.reduced import NARROW, LocalSystem, _narrow_space
+
+
+@pytest.fixture(scope="module")
+def atlas(artifact):
+    return Atlas.load(artifact)
+
+
+@pytest.fixture(scope="module")
+def workshop(artifact):
+    return Workshop.of_artifact(read_artifact(artifact))
+
+
+@pytest.fixture(scope="module")
+def galerkin(atlas, workshop):
+    """Return the first local model with every quadrature point and its own weight."""
+    models, region = atlas.models, atlas.models.region[0]
+    weights = workshop.model.weights.ravel()
+    return replace(
+        models,
+        basis=models.basis[[region]],
+        steps=models.steps[[region]],
+        region=np.zeros(1, np.int32),
+        centres=models.centres[:1],
+        frames=models.frames[:1],
+        pressures=models.pressures[:1],
+        modes=models.modes[:1],
+        point_from=np.array([0, len(weights)]),
+        points=np.arange(len(weights), dtype=np.int32),
+        weights=weights,
+        guess=models.guess[:1],
+    )
+
+
+@pytest.fixture(scope="module")
+def patches(atlas, galerkin):
+    return assemble_patches(atlas.body, galerkin, atlas.scene.endoscope.radius)
+
+
+@pytest.fixture(scope="module")
+def modes(galerkin):
+    """Return the wide modes as nodal displacements (3 n, r)."""
+    in_basis = galerkin.steps[0][:, None].astype(float) * galerkin.modes[0]
+    return galerkin.basis[0].T.astype(float) @ in_basis
+
+
+def local_system(patches, count):
+    """The leading modes of a patch as a system without a load."""
+    rows = len(patches.gradients)
+    return LocalSystem(
+        gradients=np.ascontiguousarray(patches.gradients[:, :count], dtype=float),
+        weights=patches.weights,
+        mu=patches.mu,
+        lam=patches.lam,
+        load=np.zeros(count),
+        F=np.zeros(rows),
+        P=np.zeros(rows),
+        AG=np.zeros((9, count)),
+        tangent=np.zeros((count, count)),
+        factor=np.zeros((count, count)),
+        point=np.zeros((11, 9)),
+    )
+
+
+@njit
+def potential(system, u, residual):
+    return equilibrium.potential(system, u, residual)
+
+
+@njit
+def factorise(system, u, shift):
+    return equilibrium.factorise(system, u, shift)
+
+
+@njit
+def correct(system, residual, step):
+    equilibrium.correct(system, residual, step)
+
+
+def residual_of(system, u):
+    residual = np.empty(len(u))
+    potential(system, u, residual)
+    return residual
+
+
+@pytest.fixture
+def state(patches, modes, rng):
+    """Return wide coefficients (r,) whose displacement is of 1 mm."""
+    q = rng.standard_normal(modes.shape[1]) / np.arange(1, modes.shape[1] + 1)
+    return q / np.abs(modes @ q).max()
+
+
+# --- one physics, two sizes ----------------------------------------------------------------------
+
+
+def test_with_every_point_it_is_the_full_model_in_its_modes(patches, modes, workshop, state):
+    system = local_system(patches, len(state))
+    residual, force = np.empty(len(state)), np.empty(len(modes))
+    energy, smallest = potential(system, state, residual)
+    expected_energy, expected_smallest = workshop.model.internal(modes @ state, force)
+    expected = modes.T @ force
+    # gradients of the modes are kept in single precision
+    assert energy == pytest.approx(expected_energy, rel=1e-5)
+    assert smallest == pytest.approx(expected_smallest, rel=1e-5)
+    assert np.linalg.norm(residual - expected) <= 1e-5 * np.linalg.norm(expected)
+
+
+def test_its_modes_are_orthonormal_in_the_energy_at_rest(modes, workshop):
+    free = modes[workshop.model.free]
+    gram = free.T @ (workshop.model.rest_stiffness @ free)
+    # modes are stored in half precision
+    np.testing.assert_allclose(gram, np.eye(len(gram)), atol=2e-3)
+
+
+def test_tangent_is_the_derivative_of_the_residual(patches, state):
+    system, u = local_system(patches, NARROW), state[:NARROW]
+    assert factorise(system, u, 0.0)
+    step = 1e-3
+    columns = []
+    for unit in step * np.eye(NARROW):
+        near = residual_of(system, u + unit) - residual_of(system, u - unit)
+        far = residual_of(system, u + 2 * unit) - residual_of(system, u - 2 * unit)
+        columns.append((8 * near - far) / (12 * step))
+    K = system.tangent
+    assert np.abs(np.stack(columns, axis=1) - K).max() <= 1e-6 * np.abs(K).max()
+
+
+def test_residual_is_the_derivative_of_the_potential(patches, state):
+    system, u, scratch = local_system(patches, NARROW), state[:NARROW], np.empty(NARROW)
+
+    def energy(shift):
+        return potential(system, u + shift, scratch)[0]
+
+    slopes = []
+    for unit in 1e-3 * np.eye(NARROW):
+        near = energy(unit) - energy(-unit)
+        far = energy(2 * unit) - energy(-2 * unit)
+        slopes.append((8 * near - far) / (12 * 1e-3))
+    expected = residual_of(system, u)
+    assert np.abs(slopes - expected).max() <= 1e-6 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.5])
+def test_correction_solves_with_the_tangent(patches, state, rng, shift):
+    system, step = local_system(patches, NARROW), np.empty(NARROW)
+    residual = rng.standard_normal(NARROW)
+    assert factorise(system, state[:NARROW], shift)
+    correct(system, residual, step)
+    np.testing.assert_allclose(
+        (system.tangent + shift * np.eye(NARROW)) @ step, -residual, rtol=0, atol=1e-10
+    )
+
+
+def test_its_path_derivatives_follow_the_equilibrium_to_third_order(atlas, galerkin):
+    trainer = LocalTrainer(atlas.body, galerkin, atlas.scene.endoscope.radius)
+    x, normal, _, fields = atlas.surface.locate(galerkin.centres[0], atlas.limits)
+    tilted = -normal + [0.3, -0.2, 0.0]
+    assert trainer.solve(x, normal, tilted / np.linalg.norm(tilted), fields[0])
+    patches, scratch = trainer.patches, trainer.state.scratch
+    _narrow_space(patches, 0, scratch.G, scratch.vectors, scratch)
+    H, P = scratch.H, np.empty(len(patches.gradients))
+
+    def out_of_balance(s):
+        F = s * H[0] + s**2 / 2 * H[1] + s**3 / 6 * H[2]
+        F.reshape(-1, 9)[:, [0, 4, 8]] += 1.0
+        assert _weighted_stress(F, patches.mu, patches.lam, patches.weights, P)
+        return np.linalg.norm(patches.gradients.T @ P - s * scratch.wide_load)
+
+    assert out_of_balance(0.25) <= 1e-2 * 0.25 * np.linalg.norm(scratch.wide_load)
+    orders = [np.log2(out_of_balance(s) / out_of_balance(s / 2)) for s in (0.5, 0.25)]
+    assert min(orders) > 3.5
+
+
+# --- answers -------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def border(atlas):
+    """Return two neighbouring centres and the contact pressure used between them."""
+    centres = atlas.models.centres
+    inside = np.argsort(np.linalg.norm(centres - centres.mean(axis=0), axis=1))
+    first = inside[0]
+    second = np.argsort(np.linalg.norm(centres - centres[first], axis=1))[1]
+    limit = atlas.solve(centres[first], 1.0).pressure_limit
+    return centres[first], centres[second], 0.8 * limit
+
+
+def test_cold_answers_repeat_to_the_bit(atlas, border):
+    first, second, pressure = border
+    x = 0.5 * (first + second)
+    once = atlas.solve(x, pressure)
+    atlas.solve(first, 0.3 * pressure)
+    again = atlas.solve(x, pressure)
+    assert [k for k, _, _ in once.patches] == [k for k, _, _ in again.patches]
+    np.testing.assert_array_equal(once.contact_displacement, again.contact_displacement)
+    np.testing.assert_array_equal(atlas.displacement(once), atlas.displacement(again))
+
+
+@pytest.mark.xfail(reason="up to 0.003: the narrow space depends on where the query starts")
+def test_a_warm_answer_is_the_cold_one(atlas, border):
+    first, second, pressure = border
+    state = atlas.new_state()
+    for share in np.linspace(0.2, 0.8, 7):
+        x, force = first + share * (second - first), (0.5 + share / 2) * pressure
+        warm = atlas.displacement(atlas.solve(x, force, state=state))
+        cold = atlas.displacement(atlas.solve(x, force))
+        assert np.linalg.norm(warm - cold) <= 1e-3 * np.linalg.norm(cold)
+
+
+@pytest.fixture(scope="module")
+def path(workshop, border):
+    """Return contact points 0.05 mm apart across a border and the full model's answers there."""
+    first, second, pressure = border
+    along = (second - first) / np.linalg.norm(second - first)
+    points = (first + second) / 2 + 0.05 * np.arange(-8, 9)[:, None] * along
+    answers, u = [], None
+    for x in points:
+        nodal, normal = workshop.unit_load(x)
+        u = workshop.solve(Load(x, -normal, pressure), u).displacement
+        answers.append(np.vstack([u, nodal @ u / nodal.sum()]))
+    return points, answers
+
+
+def jumps(atlas, path, pressure, state=None):
+    """Largest difference (mm) from the full model's increments, nodal or of the contact."""
+    answers, active = [], set()
+    for x in path[0]:
+        solution = atlas.solve(x, pressure, state=state)
+        assert solution.converged
+        active |= {k for k, _, _ in solution.patches}
+        answers.append(np.vstack([atlas.displacement(solution), solution.contact_displacement]))
+    assert len(active) > 1
+    excess = np.diff(answers, axis=0) - np.diff(path[1], axis=0)
+    return np.linalg.norm(excess, axis=2).max()
+
+
+def test_across_a_border_it_jumps_no_more_than_the_full_model(atlas, path, border):
+    assert jumps(atlas, path, border[2]) <= 0.01
+
+
+def test_nor_does_it_when_warm(atlas, path, border):
+    assert jumps(atlas, path, border[2], atlas.new_state()) <= 0.01

@@ -1,0 +1,141 @@
+"""Scenes: what is accepted, what is refused, and how the refusal reads."""
+
+import re
+
+import pytest
+from pydantic import ValidationError
+
+from shared.scene import Block, Extrusion, Scene, SceneError, load_scene, parse_scene
+
+SLAB = """
+name = "slab"
+description = "a slab"
+seed = 1
+[geometry]
+kind = "block"
+size = [10.0, 8, 5.0]
+element = "hex8"
+divisions = [4, 4, 2]
+[tissue]
+law = "neo-hookean"
+young = 15.0
+poisson = 0.45
+[support]
+side = "bottom"
+[surface]
+side = "top"
+x = [1.0, 9.0]
+[endoscope]
+radius = 2.0
+max_tilt = 30.0
+reach = 3.0
+[load]
+max_indentation = 0.4
+[tolerance]
+displacement = 0.01
+von_mises = 0.02
+[budget]
+query = 150e-6
+[training]
+limit_spacing = 4.0
+ritz_spacing = 1.0
+patch_spacing = 2.5
+region_spacing = 7.5
+modes = 64
+region_modes = 200
+blend = 0.2
+cubature_points = 100
+samples = 60
+"""
+
+
+def test_a_scene_reads_back_from_its_own_text() -> None:
+    scene = parse_scene(SLAB)
+    assert isinstance(scene.geometry, Block)
+    assert scene.geometry.size == (10.0, 8.0, 5.0)
+    assert scene.surface.x == (1.0, 9.0)
+    assert scene.text == SLAB
+    assert parse_scene(scene.text) == scene
+
+
+def test_a_section_is_not_needed_to_read_a_scene() -> None:
+    block = SLAB[SLAB.index("kind") : SLAB.index("element")]
+    extrusion = """kind = "extrusion"
+section = "nowhere.csv"
+corners = [[0, 1], [1, 1], [1, 0], [0, 0]]
+length = 40
+"""
+    text = SLAB.replace(block, extrusion).replace("bottom", "lip").replace("top", "outer")
+    scene = parse_scene(text)
+    assert isinstance(scene.geometry, Extrusion)
+    assert scene.folder is None
+
+
+def test_a_scene_is_immutable() -> None:
+    scene = parse_scene(SLAB)
+    with pytest.raises(ValidationError):
+        scene.tissue.young = 1.0  # type: ignore[misc]
+
+
+def test_load_scene_knows_its_folder(tmp_path) -> None:
+    path = tmp_path / "slab.toml"
+    path.write_text(SLAB, encoding="utf-8")
+    assert load_scene(path).folder == tmp_path
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("seed = 1", "seed = = 1", r"not TOML.*line 4"),
+        ("young", "yuong", r"tissue: unknown key 'yuong'; did you mean 'young'\?"),
+        ("[budget]", "[bugdet]", r"unknown key 'bugdet'; did you mean 'budget'\?"),
+        ("radius", "xyzzy", r"endoscope: unknown key 'xyzzy'; valid are radius, max_tilt, reach"),
+        ("size", "sise", r"geometry: unknown key 'sise'; did you mean 'size'\?"),
+        ("young = 15.0\n", "", r"tissue.young: Field required"),
+        ("0.45", "0.5", r"tissue.poisson = 0.5: .*less than 0.5"),
+        ("0.45", "-0.1", r"tissue.poisson = -0.1: .*greater than or equal to 0"),
+        ("young = 15.0", "young = nan", r"tissue.young = nan: .*finite"),
+        ("young = 15.0", "young = inf", r"tissue.young = inf: .*finite"),
+        ("young = 15.0", 'young = "15"', r"tissue.young = '15': .*valid number"),
+        ("young = 15.0", "young = true", r"tissue.young = True: .*valid number"),
+        ("[10.0, 8, 5.0]", "[10.0, -8, 5.0]", r"geometry.size.1 = -8: .*greater than 0"),
+        ("[10.0, 8, 5.0]", "[10.0, 8]", r"geometry.size.2"),
+        ("[4, 4, 2]", "[4, 0, 2]", r"geometry.divisions.1 = 0: .*greater than or equal to 1"),
+        ("[4, 4, 2]", "[4, 4.5, 2]", r"geometry.divisions.1 = 4.5: .*integer"),
+        ("hex8", "tet4", r"geometry.element = 'tet4': .*'hex20'"),
+        ("block", "sphere", r"geometry: .*'extrusion', 'block'"),
+        ('"top"', '"lip"', r"surface.side is 'lip', but the sides .* are left, right"),
+        ("[1.0, 9.0]", "[9.0, 1.0]", r"surface: x must be \[from, to\]"),
+        ('"slab"', '"../slab"', r"name = '../slab'"),
+        ("max_tilt = 30.0", "max_tilt = 90.0", r"endoscope.max_tilt = 90.0: .*less than 90"),
+        ("radius = 2.0", "radius = -2.0", r"endoscope.radius = -2.0: .*greater than 0"),
+    ],
+)
+def test_what_is_wrong_is_named(old: str, new: str, message: str) -> None:
+    assert old in SLAB
+    with pytest.raises(SceneError, match=message):
+        parse_scene(SLAB.replace(old, new))
+
+
+def test_every_wrong_field_is_reported_at_once() -> None:
+    text = SLAB.replace("young = 15.0", "young = -1.0").replace("seed = 1", "seed = -1")
+    with pytest.raises(SceneError, match=r"seed = -1.*tissue.young = -1.0"):
+        parse_scene(text)
+
+
+def test_an_unreadable_file_is_refused(tmp_path) -> None:
+    missing = tmp_path / "missing.toml"
+    with pytest.raises(SceneError, match=re.escape(str(missing))):
+        load_scene(missing)
+    binary = tmp_path / "binary.toml"
+    binary.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(SceneError, match="cannot be read"):
+        load_scene(binary)
+
+
+def test_every_number_of_a_scene_says_its_unit_or_what_it_is_relative_to() -> None:
+    words = ("mm", "kPa", "degrees", " s", "error", "over", "ratio", "elements")
+    for name, definition in Scene.model_json_schema()["$defs"].items():
+        for key, field in definition["properties"].items():
+            if field.get("type") in ("number", "array"):
+                assert any(word in field.get("description", "") for word in words), (name, key)

@@ -1,0 +1,150 @@
+"""The tissue law: stress and tangent are derivatives of the energy, and the limits are right."""
+
+import math
+
+import numpy as np
+import pytest
+
+from shared import tissue
+
+MU, LAM = tissue.lame(15.0, 0.45)
+
+
+def stress(F):
+    """Energy density and stress (3, 3) of a deformation gradient (3, 3)."""
+    P = np.empty(9)
+    W, _ = tissue.stress(F.ravel(), MU, LAM, np.empty(9), P)
+    return W, P.reshape(3, 3)
+
+
+def tangent(F):
+    """Material tangent (9, 9)."""
+    A = np.empty((9, 9))
+    tissue.tangent(F.ravel(), MU, LAM, np.empty(9), A)
+    return A
+
+
+def rotation(rng):
+    Q, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+    return Q * np.linalg.det(Q)
+
+
+@pytest.fixture(params=range(5))
+def F(request):
+    """Deformations of 40 % in each component, det F > 0."""
+    rng = np.random.default_rng(request.param)
+    while True:
+        F = np.eye(3) + rng.uniform(-0.4, 0.4, (3, 3))
+        if np.linalg.det(F) > 0.2:
+            return F
+
+
+def central_difference(function, at, step=1e-5):
+    """Derivative of ``function`` with respect to the entries of ``at``, last axis."""
+    columns = []
+    for i in range(at.size):
+        shift = np.zeros(at.size)
+        shift[i] = step
+        shift = shift.reshape(at.shape)
+        # Fourth order, so that the truncation error is far below the 1e-7 asked for.
+        near = function(at + shift) - function(at - shift)
+        far = function(at + 2 * shift) - function(at - 2 * shift)
+        columns.append((8 * near - far) / (12 * step))
+    return np.stack(columns, axis=-1)
+
+
+def test_energy_is_the_formula(F):
+    C, J = F.T @ F, np.linalg.det(F)
+    expected = MU / 2 * (np.trace(C) - 3 - 2 * math.log(J))
+    expected += LAM / 4 * (J**2 - 1 - 2 * math.log(J))
+    assert stress(F)[0] == pytest.approx(expected, rel=1e-13)
+
+
+def test_stress_is_the_derivative_of_the_energy(F):
+    P = stress(F)[1]
+    difference = central_difference(lambda G: np.array(stress(G)[0]), F, step=1e-3)
+    assert np.abs(difference - P.ravel()).max() <= 1e-7 * np.abs(P).max()
+
+
+def test_tangent_is_the_derivative_of_the_stress(F):
+    A = tangent(F)
+    difference = central_difference(lambda G: stress(G)[1].ravel(), F, step=1e-3)
+    assert np.abs(difference - A).max() <= 1e-7 * np.abs(A).max()
+
+
+def test_tangent_is_symmetric(F):
+    A = tangent(F)
+    assert np.abs(A - A.T).max() <= 1e-14 * np.abs(A).max()
+
+
+def test_rest_is_free_of_stress_and_energy():
+    W, P = stress(np.eye(3))
+    assert W == 0.0
+    assert not P.any()
+
+
+def test_rigid_rotation_is_free_of_stress_and_energy(rng):
+    for _ in range(5):
+        W, P = stress(rotation(rng))
+        assert abs(W) <= 1e-12
+        assert np.abs(P).max() <= 1e-12 * (MU + LAM)
+
+
+def test_law_is_objective(F, rng):
+    Q = rotation(rng)
+    (W, P), (W_turned, P_turned) = stress(F), stress(Q @ F)
+    assert W_turned == pytest.approx(W, rel=1e-12)
+    np.testing.assert_allclose(P_turned, Q @ P, rtol=0, atol=1e-12 * np.abs(P).max())
+
+
+def test_small_strain_is_hooke(rng):
+    gradient = rng.standard_normal((3, 3))
+    strain = (gradient + gradient.T) / 2
+    hooke = 2 * MU * strain + LAM * np.trace(strain) * np.eye(3)
+    for size in (1e-4, 1e-6):
+        P = stress(np.eye(3) + size * gradient)[1] / size
+        assert np.abs(P - hooke).max() < 100 * size * np.abs(hooke).max()
+
+
+def test_lame_parameters_give_back_the_engineering_ones():
+    young = MU * (3 * LAM + 2 * MU) / (LAM + MU)
+    assert (young, LAM / (2 * (LAM + MU))) == pytest.approx((15.0, 0.45))
+
+
+def taylor(path, order):
+    """Derivative of the stress along a path of deformation gradients at s = 0."""
+    s = 0.02 * np.arange(-5, 6)
+    stresses = np.array([stress(path(at))[1].ravel() for at in s])
+    series = np.polynomial.polynomial.polyfit(s / s[-1], stresses, len(s) - 1)
+    return math.factorial(order) * series[order] / s[-1] ** order
+
+
+def test_path_derivatives_at_rest(rng):
+    H, H2 = rng.uniform(-0.5, 0.5, (2, 3, 3))
+    second, third = np.empty(9), np.empty(9)
+    tissue.second_derivative(H.ravel(), MU, LAM, second)
+    expected = taylor(lambda s: np.eye(3) + s * H, 2)
+    assert np.abs(second - expected).max() <= 1e-7 * np.abs(expected).max()
+    tissue.third_derivative(H.ravel(), H2.ravel(), MU, LAM, third)
+    expected = taylor(lambda s: np.eye(3) + s * H + s**2 / 2 * H2, 3)
+    assert np.abs(third - expected).max() <= 1e-7 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("J", [0.0, -1.0, math.nan])
+def test_inverted_tissue_has_infinite_energy(J):
+    F = np.diag([J, 1.0, 1.0])
+    assert stress(F)[0] == tissue.INVERTED
+
+
+def test_von_mises_against_the_textbook(F):
+    P = stress(F)[1]
+    J = np.linalg.det(F)
+    cauchy = P @ F.T / J
+    deviator = cauchy - np.trace(cauchy) / 3 * np.eye(3)
+    expected = math.sqrt(1.5 * np.sum(deviator**2))
+    assert tissue.von_mises(F.ravel(), P.ravel(), J) == pytest.approx(expected, rel=1e-13)
+
+
+def test_von_mises_of_uniaxial_stress_is_that_stress():
+    P = np.diag([0.0, 0.0, -7.0])
+    assert tissue.von_mises(np.eye(3).ravel(), P.ravel(), 1.0) == pytest.approx(7.0)
