@@ -36,12 +36,12 @@ def standard_residual(conn, grad, weight, mu, lam, u, r):
     conn (e, n) int32; grad (e, q, n, 3) 1/mm; weight (e, q) mm^3; mu, lam (e,) kPa;
     u, r (3 nodes,) mm and mN.
     """
-    F, Finv, P = np.empty(9), np.empty(9), np.empty(9)
+    F, P = np.empty(9), np.empty(9)
     energy, smallest = 0.0, np.inf
     for e in range(len(conn)):
         for q in range(weight.shape[1]):
             _deformation_gradient(conn[e], grad[e, q], u, F)
-            W, J = tissue.stress(F, mu[e], lam[e], Finv, P)
+            W, J = tissue.stress(F, mu[e], lam[e], P)
             smallest = min(smallest, J)
             if not J > 0.0:
                 return tissue.INVERTED, smallest
@@ -148,17 +148,16 @@ def dilatation_residual(conn, grad, weight, theta_grad, theta_weight, mu, lam, u
             alpha = (theta / J) ** (1.0 / 3.0)
             for i in range(9):
                 Fbar[i] = alpha * F[i]
-            W, _ = tissue.stress(Fbar, mu[e], lam[e], Finv, P)
+            W, _ = tissue.stress(Fbar, mu[e], lam[e], P)
             w = weight[e, q]
             energy += w * W
             p = 0.0  # P : F / 3
             for i in range(9):
                 p += P[i] * F[i] / 3.0
             by_theta += w * alpha * p / theta
-            # Finv belongs to Fbar; F^-T = alpha Fbar^-T
             for i in range(3):
                 for j in range(3):
-                    stress = w * alpha * (P[3 * i + j] - p * alpha * Finv[3 * j + i])
+                    stress = w * alpha * (P[3 * i + j] - p * Finv[3 * j + i])
                     for a in range(n):
                         f[3 * a + i] += stress * grad[e, q, a, j]
         for a in range(n):
@@ -190,7 +189,7 @@ def dilatation_tangent(conn, grad, weight, theta_grad, theta_weight, mu, lam, u,
             alpha = (theta / J) ** (1.0 / 3.0)
             for i in range(9):
                 Fbar[i] = alpha * F[i]
-            tissue.stress(Fbar, mu[e], lam[e], Finv, P)
+            tissue.stress(Fbar, mu[e], lam[e], P)
             tissue.tangent(Fbar, mu[e], lam[e], Finv, A)
             for i in range(9):
                 Finv[i] *= alpha  # back to F^-1

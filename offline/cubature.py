@@ -9,20 +9,22 @@ load, whatever the tissue does, and says little about the points.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr_delete, solve_triangular
 
 Array = NDArray[np.float64]
 
-OVERSAMPLING = 10
-
 EXACT = 1e-9
 """Relative residual that needs no further point."""
 
 
-def compress(contributions: Array, size: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Replace many equations by the few combinations that matter (randomised range finder).
+def compress(
+    contributions: NDArray[np.floating[Any]], size: int, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Replace many equations by few of the same least squares (randomised range finder).
 
     Parameters
     ----------
@@ -34,17 +36,15 @@ def compress(contributions: Array, size: int, rng: np.random.Generator) -> tuple
     Returns
     -------
     A : ndarray, shape (size, q)
-        Equations, each scaled by its singular value.
+        Equations: ``|A x|`` is ``|contributions.T x|`` but for what ``size`` directions of ``x``
+        do not catch.
     b : ndarray, shape (size,)
         Their sums over all points.
     """
-    noise = rng.standard_normal((contributions.shape[1], size + OVERSAMPLING))
-    sketch = contributions @ noise.astype(contributions.dtype)
-    sketch = contributions @ (contributions.T @ np.linalg.qr(sketch)[0])
-    Q = np.linalg.qr(sketch)[0]
-    _, s, Wt = np.linalg.svd(contributions.T @ Q, full_matrices=False)
-    A = (Q @ Wt.T * s).T[:size]
-    A = np.ascontiguousarray(A, dtype=np.float64)
+    noise = rng.standard_normal((contributions.shape[1], size))
+    Q = np.linalg.qr(contributions @ noise.astype(contributions.dtype))[0]
+    B = contributions.T @ Q
+    A = np.asarray(np.linalg.qr(B, mode="r"), dtype=float) @ Q.T
     return A, A.sum(axis=1)
 
 

@@ -5,24 +5,26 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from offline.cubature import compress, nonnegative
 from offline.sampling import cone, tangents
-from offline.spaces import local_modes
-from shared import equilibrium, tissue
+from offline.spaces import Footprint, local_modes
+from shared import equilibrium
 from shared.atlas import Body, LocalModels, State, assemble_patches
 from shared.endoscope import pressure_limit
 from shared.reduced import (
-    GUESS_FEATURES,
+    FEATURES,
+    LANES,
     LEADING,
     PATH,
+    PATH_FEATURES,
+    SECOND_FEATURES,
     STATUS,
     Patches,
-    answer,
-    guess_features,
-    path_stress,
+    load_features,
+    nonlinear_stress,
+    press,
 )
 from shared.scene import Scene
 
@@ -38,10 +40,13 @@ TEST_LOADS = 6
 
 GUESS_LOADS = 500
 
-WIDE, PATH_DERIVATIVES = 0.2, 0.05
-"""Weights of the forces in the wide space, relative to those that displace the answer."""
+PATH_LOADS, FITTED_TILT = 24, 45.0
+"""Directions of load to which a footprint's path derivatives are fitted, and their cone."""
 
-EQUATIONS = 240
+WIDE = 0.4
+"""Weight of the forces in the wide space, relative to those that displace the answer."""
+
+EQUATIONS = 300
 """Combinations of the reduced internal force that cubature is fitted to."""
 
 
@@ -58,8 +63,10 @@ class PatchTask:
         Its region's modes, (M, 3 n) int16 and (M,) float32.
     orthonormal : ndarray, shape (M, M), float32
         Orthonormal modes in that basis.
-    ritz : ndarray, shape (M, k), float32
-        Ritz vectors in and round the patch, in the orthonormal modes.
+    ritz : ndarray, shape (k, M, 19), float32
+        Ritz vectors of the footprints in and round the patch, in the orthonormal modes.
+    footprints : list of Footprint
+        Those footprints.
     contacts, normals : ndarray, shape (c, 3)
         Contact points the patch answers for.
     ranges : ndarray, shape (c, 7)
@@ -75,6 +82,7 @@ class PatchTask:
     steps: NDArray[np.float32]
     orthonormal: NDArray[np.float32]
     ritz: NDArray[np.float32]
+    footprints: list[Footprint]
     contacts: Array
     normals: Array
     ranges: Array
@@ -91,6 +99,7 @@ class PatchResult:
     modes: NDArray[np.float16]
     points: NDArray[np.int32]
     weights: Array
+    path: NDArray[np.float16]
     guess: NDArray[np.float16]
     residual: float
     error: float
@@ -108,10 +117,7 @@ class LocalTrainer:
         """Solve a load from rest; False if there is no equilibrium."""
         state = self.state
         state.forget()
-        answer(
-            self.patches, x, normal, direction, pressure, self.radius,
-            state.memory, state.scratch, state.outcome,
-        )  # fmt: skip
+        press(state.bound, x, normal, direction, pressure, self.radius)
         return bool(state.outcome.scalars[STATUS] == equilibrium.CONVERGED)
 
     @property
@@ -154,7 +160,9 @@ def train_patch(scene: Scene, body: Body, weights: Array, task: PatchTask) -> Pa
     settings = scene.training
     frame = np.array([task.normal, *tangents(task.normal)])
     # stored in half precision, so trained in it
-    leading = local_modes(task.ritz.astype(np.float64), settings.modes)
+    ritz = task.ritz.astype(np.float64)
+    leading = local_modes(np.hstack(list(ritz)), settings.modes)
+    path = _fit_path(leading.T @ ritz, task, frame).astype(np.float16)
     modes = (task.orthonormal @ leading).astype(np.float16)
     models = LocalModels(
         basis=task.basis[None],
@@ -167,13 +175,14 @@ def train_patch(scene: Scene, body: Body, weights: Array, task: PatchTask) -> Pa
         point_from=np.array([0, len(weights)]),
         points=np.arange(len(weights), dtype=np.int32),
         weights=weights,
-        guess=np.zeros((1, GUESS_FEATURES, LEADING + PATH), np.float32),
+        path=path[None].astype(np.float32),
+        guess=np.zeros((1, FEATURES, LEADING + PATH), np.float32),
         errors=np.zeros(1),
         extent=task.extent,
         blend=task.blend,
     )
     galerkin = LocalTrainer(body, models, scene.endoscope.radius)
-    contributions = _training_forces(galerkin, scene, task, rng)
+    contributions = _training_forces(galerkin, scene, task, rng)[: len(weights)]
     points, chosen_weights, residual = _cubature(
         contributions, weights, settings.cubature_points, rng
     )
@@ -187,8 +196,41 @@ def train_patch(scene: Scene, body: Body, weights: Array, task: PatchTask) -> Pa
     guess = _fit_guess(reduced, scene, task, frame, rng)
     error = _cubature_error(galerkin, reduced, scene, task, rng)
     return PatchResult(
-        frame, modes, models.points, chosen_weights, guess.astype(np.float16), residual, error
+        frame, modes, models.points, chosen_weights, path, guess.astype(np.float16), residual, error
     )
+
+
+def _fit_path(ritz: Array, task: PatchTask, frame: Array) -> Array:
+    """Second and third path derivative (PATH_FEATURES, r) from Ritz vectors (k, r, 19)."""
+    rng = np.random.default_rng(task.seed)
+    rows, second, third = [], [], []
+    features = np.zeros(FEATURES)
+    for footprint, vectors in zip(task.footprints, ritz, strict=True):
+        loads = footprint.pressure * cone(footprint.normal, FITTED_TILT, PATH_LOADS, rng)
+        for load in loads:
+            load_features(frame, task.centre, footprint.point, load / task.pressure, features)
+            rows.append(features[:PATH_FEATURES].copy())
+        two, three = footprint.path_derivatives(vectors, loads)
+        second.append(two)
+        third.append(three)
+    A = np.array(rows)
+    return np.vstack(
+        [
+            _fit(A[:, :SECOND_FEATURES], np.vstack(second)),
+            _fit(A[:, SECOND_FEATURES:], np.vstack(third)),
+        ]
+    )
+
+
+def _fit(A: Array, B: Array) -> Array:
+    """Least squares ``A X ~ B``, each column of A scaled to one and slightly damped."""
+    scale = np.sqrt(np.mean(A**2, axis=0)) + 1e-300
+    A = A / scale
+    ridge = 1e-4 * np.sqrt(len(A)) * np.eye(A.shape[1])
+    X = np.linalg.lstsq(np.vstack([A, ridge]), np.vstack([B, np.zeros((len(ridge), B.shape[1]))]))[
+        0
+    ]
+    return X / scale[:, None]
 
 
 def _cubature_error(
@@ -226,59 +268,50 @@ def _training_forces(
     First what displaces the answer: the internal force in and off equilibrium in the narrow space,
     times the square root of the compliance there, so that its error is one of displacement in the
     energy norm.  With less weight the same force in the wide space relative to the load, which
-    leads to the residual, and its second and third derivatives along the load path.
+    leads to the residual.
     """
-    patches = trainer.patches
-    G = patches.gradients
     columns = []
-    P = np.empty(len(G))
+    gradients = _point_gradients(trainer.patches)
     for _ in range(LOADS):
         if not trainer.solve(*random_load(scene, task, rng)):
             continue
         wide, load = trainer.wide, trainer.load_size
-        compliance = trainer.narrow_compliance / np.linalg.norm(wide)
+        compliance = (trainer.narrow_compliance / np.linalg.norm(wide)).astype(np.float32)
         departure = OFF_EQUILIBRIUM * np.abs(wide) * rng.standard_normal(len(wide))
         for state in (wide, wide + departure):
-            F = (G @ state.astype(np.float32)).astype(np.float64)
-            F.reshape(-1, 9)[:, [0, 4, 8]] += 1.0
-            if _weighted_stress(F, patches.mu, patches.lam, patches.weights, P):
-                force = _contributions(P, G)
-                columns += [force @ compliance.astype(np.float32), force * np.float32(WIDE / load)]
-        for order in (2, 3):
-            H = trainer.state.scratch.H
-            path_stress(order, H, patches.mu, patches.lam, patches.weights, P)
-            force = _contributions(P, G)
-            size = np.linalg.norm(force.sum(axis=0))
-            columns.append(force * (np.float32(PATH_DERIVATIVES) / size))
+            force = _contributions(trainer.patches, gradients, state)
+            if force is not None:
+                columns += [force @ compliance, force * np.float32(WIDE / load)]
     return np.hstack(columns)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _weighted_stress(F, mu, lam, weights, P):
-    """P (9 c,) times weight at gradients F (9 c,); False where a point is inverted."""
-    Finv = np.empty(9)
-    for c in range(len(weights)):
-        _, J = tissue.stress(F[9 * c : 9 * c + 9], mu[c], lam[c], Finv, P[9 * c : 9 * c + 9])
-        if not J > 0.0:
-            return False
-        for i in range(9):
-            P[9 * c + i] *= weights[c]
-    return True
+def _point_gradients(patches: Patches) -> NDArray[np.float32]:
+    """Gradients (c, 9, r) of the wide modes of a single patch."""
+    rows = patches.gradients[0] * patches.steps[0][:, None]
+    tiles = rows.reshape(len(rows), -1, 9, LANES)
+    return np.ascontiguousarray(tiles.transpose(1, 3, 2, 0).reshape(-1, 9, len(rows)))
 
 
-def _contributions(P: Array, G: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Internal force of every point (c, r) from weighted stresses (9 c,)."""
-    points = P.reshape(-1, 1, 9).astype(np.float32)
-    return (points @ G.reshape(len(points), 9, -1))[:, 0]
+def _contributions(
+    patches: Patches, gradients: NDArray[np.float32], state: Array
+) -> NDArray[np.float32] | None:
+    """Nonlinear force of every point (c, r) at wide coefficients; None where one is inverted."""
+    H = np.dot(gradients, state.astype(np.float32)).reshape(-1, LANES, 9)
+    rows = np.ascontiguousarray(H.transpose(0, 2, 1)).reshape(-1)
+    P, (J, trace, linear) = np.empty_like(rows), np.empty((3, len(gradients)))
+    weights, mu, lam = patches.weights[0], patches.mu[0], patches.lam[0]
+    nonlinear_stress(rows, weights, mu, lam, J, trace, linear, P)
+    if not J.min() > 0.0:
+        return None
+    points = P.reshape(-1, 9, LANES).transpose(0, 2, 1).reshape(-1, 1, 9)
+    return (points @ gradients)[:, 0]
 
 
 def _cubature(
     contributions: NDArray[np.float32], weights: Array, most: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], Array, float]:
-    """Points and weights that reproduce the sums of the contributions and the volume."""
-    scale = np.sqrt(np.mean(contributions.sum(axis=0) ** 2))
-    volume = (scale * weights / weights.sum()).astype(np.float32)
-    A, b = compress(np.column_stack([contributions, volume]), EQUATIONS, rng)
+    """Points and weights that reproduce the sums of the contributions."""
+    A, b = compress(contributions, EQUATIONS, rng)
     chosen, x = nonnegative(A, b, most)
     residual = np.linalg.norm(A[:, chosen] @ x - b) / np.linalg.norm(b)
     return chosen, x * weights[chosen], float(residual)
@@ -289,16 +322,11 @@ def _fit_guess(
 ) -> Array:
     """Coefficients (features, m) of what equilibria add to the linear response."""
     rows, targets = [], []
-    features = np.zeros(GUESS_FEATURES)
+    features = np.zeros(FEATURES)
     for _ in range(GUESS_LOADS):
         x, normal, direction, pressure = random_load(scene, task, rng)
         if trainer.solve(x, normal, direction, pressure):
-            guess_features(frame, task.centre, x, direction * pressure / task.pressure, features)
+            load_features(frame, task.centre, x, direction * pressure / task.pressure, features)
             rows.append(features.copy())
             targets.append(trainer.beyond_linear)
-    A, B = np.array(rows), np.array(targets)
-    scale = np.sqrt(np.mean(A**2, axis=0)) + 1e-300
-    A /= scale
-    ridge = 1e-4 * np.sqrt(len(A)) * np.eye(A.shape[1])
-    solution = np.linalg.lstsq(np.vstack([A, ridge]), np.vstack([B, 0 * ridge[:, : B.shape[1]]]))[0]
-    return solution / scale[:, None]
+    return _fit(np.array(rows), np.array(targets))

@@ -94,7 +94,10 @@ def cone(
 
 def tangents(normal: Array) -> tuple[Array, Array]:
     """Two unit vectors that complete ``normal`` to an orthonormal frame."""
-    axis = np.eye(3)[np.argmin(np.abs(normal))]
-    t = np.cross(normal, axis)
-    t /= np.linalg.norm(t)
-    return t, np.cross(normal, t)
+    i = int(np.argmin(np.abs(normal)))
+    j, k = (i + 1) % 3, (i + 2) % 3
+    across = math.hypot(normal[j], normal[k])
+    t, b = np.zeros(3), np.empty(3)
+    t[j], t[k] = normal[k] / across, -normal[j] / across  # normal x axis i
+    b[i], b[j], b[k] = -across, normal[i] * normal[j] / across, normal[i] * normal[k] / across
+    return t, b

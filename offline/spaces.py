@@ -17,11 +17,13 @@ along the lines ``t = s d`` of as many directions ``d`` as there are vectors.
 from __future__ import annotations
 
 import itertools
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from offline.full_model import FullModel
+from offline.sampling import tangents
 
 Array = NDArray[np.float64]
 
@@ -34,6 +36,45 @@ def _lattice(order: int) -> Array:
     """Directions on which every form of this order in three variables is determined."""
     points = [p for p in itertools.product(range(order + 1), repeat=3) if sum(p) == order]
     return np.array(points, dtype=float) / order
+
+
+TANGENTIAL = 0.6
+"""Weight of tangential against normal load in the Ritz vectors: about sin 30 degrees and some."""
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """Where and how hard the endoscope presses for Ritz vectors.
+
+    Attributes
+    ----------
+    point, normal : ndarray, shape (3,)
+        mm, and outward normal.
+    pressure : float, kPa
+        Scale of the load.
+    """
+
+    point: Array
+    normal: Array
+    pressure: float
+
+    @property
+    def loads(self) -> Array:
+        """The three loads (rows, kPa) whose Ritz vectors are taken."""
+        frame = np.array([self.normal, *tangents(self.normal)])
+        frame[1:] *= TANGENTIAL
+        return self.pressure * frame
+
+    def path_derivatives(self, vectors: Array, loads: Array) -> tuple[Array, Array]:
+        """Second and third derivative (n, k) along the paths to ``loads`` (n, 3) kPa.
+
+        ``vectors`` (k, 19) are coefficients of its ``ritz_vectors``: forms in the load, given by
+        their values on lattices.
+        """
+        t = _solve(self.loads.T, loads.T).T
+        second = _solve(_monomials(_lattice(2), 2).T, _monomials(t, 2).T)
+        third = _solve(_monomials(_lattice(3), 3).T, _monomials(t, 3).T)
+        return 2 * (vectors[:, 3:9] @ second).T, 6 * (vectors[:, 9:] @ third).T
 
 
 def ritz_vectors(model: FullModel, loads: Array) -> Array:
@@ -57,7 +98,7 @@ def ritz_vectors(model: FullModel, loads: Array) -> Array:
         np.stack([-_even_part(model, a, SECOND_STEP) for a in paths.T], axis=1)
     )
     # the second-order vector of any direction follows from those six: a quadratic form
-    forms = np.linalg.solve(_quadratic(second_at).T, _quadratic(third_at).T).T
+    forms = np.linalg.solve(_monomials(second_at, 2).T, _monomials(third_at, 2).T).T
     rows = [
         -_odd_part(model, a, b, THIRD_STEP)
         for a, b in zip((first @ third_at.T).T, (second @ forms.T).T, strict=True)
@@ -66,11 +107,14 @@ def ritz_vectors(model: FullModel, loads: Array) -> Array:
     return np.hstack([first, second / 2, third / 6])
 
 
-def _quadratic(directions: Array) -> Array:
-    """Monomials of degree two, (k, 6)."""
-    return np.stack(
-        [directions[:, i] * directions[:, j] for i in range(3) for j in range(i, 3)], axis=1
-    )
+def _solve(A: Array, B: Array) -> Array:
+    return np.asarray(np.linalg.solve(A, B), dtype=float)
+
+
+def _monomials(t: Array, degree: int) -> Array:
+    """All monomials of a degree in three variables: (k, 3) to (k, 6) or (k, 10)."""
+    factors = itertools.combinations_with_replacement(range(3), degree)
+    return np.stack([t[:, list(f)].prod(axis=1) for f in factors], axis=1)
 
 
 def _even_part(model: FullModel, a: Array, step: float) -> Array:

@@ -38,6 +38,7 @@ from offline.sampling import (
     spread_points,
 )
 from offline.scenes import find_scene
+from offline.spaces import Footprint
 from offline.validate import Comparison, compare, random_loads, summarise
 from offline.workers import Tasks, resume, worker_pool
 from offline.workshop import RegionResult, Workshop, open_workshop
@@ -135,8 +136,7 @@ class Pipeline:
         """Train and write the artifact."""
         limits = self._load_range()
         layout = self.layout()
-        regions = self._regions(layout, limits)
-        models = self._patches(layout, limits, regions)
+        models = self.local_models(layout, limits)
         estimator, documents, rows = self._validate(models, limits)
         documents["training"] |= {"layout": self._describe(layout, models)}
         self._write(path, models, limits, estimator, documents)
@@ -146,7 +146,7 @@ class Pipeline:
 
     def untested_atlas(self, limits: Array, layout: Layout) -> Atlas:
         """An atlas without error estimate: stages 2 and 3 only."""
-        models = self._patches(layout, limits, self._regions(layout, limits))
+        models = self.local_models(layout, limits)
         return self._atlas(models, limits, Estimator(np.zeros((2, 6))), {})
 
     # --- stages --------------------------------------------------------------------------------
@@ -194,17 +194,17 @@ class Pipeline:
             extent=1.02 * near.max() + settings.blend,
         )
 
-    def _regions(self, layout: Layout, limits: Array) -> list[tuple[RegionResult, dict[int, int]]]:
+    def _regions(
+        self, layout: Layout, footprints: Sequence[Footprint]
+    ) -> list[tuple[RegionResult, dict[int, int]]]:
         """Basis and Ritz vectors of each region, with the place of each footprint among them."""
         tasks, members = {}, []
         for r in range(int(layout.region.max()) + 1):
             patches = np.flatnonzero(layout.region == r)
             used = np.unique(np.concatenate([layout.ritz_of_patch[k] for k in patches]))
-            points = layout.ritz[used]
             tasks[f"region-{r}"] = (
                 Workshop.region,
-                points,
-                self._range_at(points, limits)[:, 0],
+                [footprints[i] for i in used],
                 self.scene.training.region_modes,
             )
             members.append({int(i): place for place, i in enumerate(used)})
@@ -214,9 +214,18 @@ class Pipeline:
         modes = min(len(result.steps) for result in results)
         return list(zip([result.truncate(modes) for result in results], members, strict=True))
 
-    def _patches(
-        self, layout: Layout, limits: Array, regions: Sequence[tuple[RegionResult, dict[int, int]]]
-    ) -> LocalModels:
+    def _footprints(self, layout: Layout, limits: Array) -> list[Footprint]:
+        """Where Ritz vectors are taken, with the loads expected there."""
+        found = []
+        for point in layout.ritz:
+            x, normal, _, fields = self.surface.locate(point, limits)
+            found.append(Footprint(x, normal, float(fields[0])))
+        return found
+
+    def local_models(self, layout: Layout, limits: Array) -> LocalModels:
+        """Stages 2 and 3."""
+        footprints = self._footprints(layout, limits)
+        regions = self._regions(layout, footprints)
         ranges = self._range_at(layout.contacts, limits)
         contact_normals = np.array([self.surface.project(x)[1] for x in layout.contacts])
         pressures = self._range_at(layout.centres, limits)[:, 0]
@@ -234,7 +243,8 @@ class Pipeline:
                     basis=result.basis,
                     steps=result.steps,
                     orthonormal=result.orthonormal,
-                    ritz=np.moveaxis(result.ritz[chosen], 1, 0).reshape(len(result.steps), -1),
+                    ritz=result.ritz[chosen],
+                    footprints=[footprints[i] for i in layout.ritz_of_patch[k]],
                     contacts=layout.contacts[hits],
                     normals=contact_normals[hits],
                     ranges=ranges[hits],
@@ -256,6 +266,7 @@ class Pipeline:
             point_from=np.concatenate([[0], np.cumsum([len(r.points) for r in results])]),
             points=np.concatenate([r.points for r in results]),
             weights=np.concatenate([r.weights for r in results]),
+            path=np.stack([r.path for r in results]).astype(np.float32),
             guess=np.stack([r.guess for r in results]).astype(np.float32),
             errors=np.array([float(r.error) for r in results]),
             extent=layout.extent,
@@ -382,6 +393,9 @@ class Pipeline:
             "patch_pressures": Dataset(models.pressures, "kPa", "load scale of local models"),
             "patch_modes": Dataset(
                 models.modes.astype(np.float16), one, "modes in the basis of the region"
+            ),
+            "patch_path": Dataset(
+                models.path.astype(np.float16), one, "derivatives along a load path, polynomials"
             ),
             "patch_guess": Dataset(
                 models.guess.astype(np.float16), one, "first guess beyond the linear response"

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from offline.full_model import Equilibrium, FullModel, NoEquilibrium
 from offline.mesh import Mesh, build_mesh, local_thickness
 from offline.patches import PatchResult, PatchTask, train_patch
-from offline.sampling import tangents
-from offline.spaces import energy_pod, ritz_vectors
+from offline.spaces import Footprint, energy_pod, ritz_vectors
 from offline.surface_mesh import accessible_surface
 from shared.artifact import Artifact, read_artifact
 from shared.atlas import Body
@@ -32,9 +31,6 @@ from shared.stress import StressRecovery, nodal_von_mises
 from shared.surface import Surface
 
 Array = NDArray[np.float64]
-
-TANGENTIAL = 0.6
-"""Weight of tangential against normal load in the Ritz vectors: about sin 30 degrees and some."""
 
 POINTS_IN_BASIS = 100
 """Footprints whose Ritz vectors make a region's basis; those of the others are projected on it."""
@@ -172,13 +168,11 @@ class Workshop:
             pressure, start = factor * pressure, factor * state.displacement
         return np.array([pressure, *np.diag(C), C[0, 1], C[0, 2], C[1, 2]])
 
-    def region(self, positions: Array, pressures: Array, modes: int) -> RegionResult:
-        """Basis of a region and the Ritz vectors of footprints at ``positions`` (k, 3) in it."""
+    def region(self, footprints: list[Footprint], modes: int) -> RegionResult:
+        """Basis of a region and the Ritz vectors of footprints in it."""
         model = self.model
-        vectors = np.stack(
-            [self._ritz(x, p) for x, p in zip(positions, pressures, strict=True)], axis=1
-        )
-        stride = max(1, len(positions) // POINTS_IN_BASIS)
+        vectors = np.stack([self._ritz(footprint) for footprint in footprints], axis=1)
+        stride = max(1, len(footprints) // POINTS_IN_BASIS)
         basis, _ = energy_pod(model, vectors[:, ::stride].reshape(len(model.free), -1), modes)
         vectors = vectors.reshape(len(model.free), -1)
         amplitude = np.sqrt(np.mean(((model.rest_stiffness @ basis).T @ vectors) ** 2, axis=1))
@@ -191,7 +185,7 @@ class Workshop:
         L = np.linalg.cholesky(rounded.T @ stiff)
         full = np.zeros((len(steps), 3 * len(self.mesh.nodes)), np.int16)
         full[:, model.free] = stored.T
-        ritz = np.linalg.solve(L, stiff.T @ vectors).reshape(len(steps), len(positions), -1)
+        ritz = np.linalg.solve(L, stiff.T @ vectors).reshape(len(steps), len(footprints), -1)
         return RegionResult(
             basis=full,
             steps=steps.astype(np.float32),
@@ -199,11 +193,9 @@ class Workshop:
             ritz=np.moveaxis(ritz, 1, 0).astype(np.float32),
         )
 
-    def _ritz(self, position: Array, pressure: float) -> Array:
-        nodal, normal = self.unit_load(position)
-        frame = np.array([normal, *tangents(normal)])
-        frame[1:] *= TANGENTIAL
-        loads = (pressure * nodal[:, None, None] * frame.T).reshape(-1, 3)
+    def _ritz(self, footprint: Footprint) -> Array:
+        nodal, _ = self.unit_load(footprint.point)
+        loads = (nodal[:, None, None] * footprint.loads.T).reshape(-1, 3)
         return ritz_vectors(self.model, loads[self.model.free])
 
     def patch(self, task: PatchTask) -> PatchResult:

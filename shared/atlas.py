@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import operator
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -14,26 +15,34 @@ from numpy.typing import ArrayLike, NDArray
 
 from shared import equilibrium
 from shared.artifact import Artifact, ArtifactError, read_artifact
-from shared.endoscope import pressure_limit
+from shared.bound import bind
+from shared.endoscope import LIMIT_FIELDS
 from shared.errors import QueryError
 from shared.quadrature import stress_recovery, surface_quadrature, volume_quadrature
 from shared.reduced import (
     AREA,
-    GUESS_FEATURES,
+    COSINE,
+    DISTANCE,
+    FEATURES,
     ITERATIONS,
+    LANES,
     LEADING,
+    LIMIT,
     MAX_ACTIVE,
     MISSED,
     NARROW,
     SCALARS,
     SMALLEST_J,
+    STATE,
     STATUS,
+    TILE,
     Memory,
     Outcome,
     Patches,
     Scratch,
-    answer,
+    Solver,
     expand,
+    query,
 )
 from shared.scene import Scene, SceneError, parse_scene
 from shared.stress import nodal_von_mises
@@ -43,6 +52,9 @@ from shared.tissue import lame
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
 Region = Literal["surface", "all"]
+
+_INWARD = np.zeros(3)
+"""Direction that stands for the inward normal."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +101,9 @@ class LocalModels:
     points : ndarray, shape (c,), int32
         Quadrature point, counted element by element.
     weights : ndarray, shape (c,), mm^3
-    guess : ndarray, shape (p, features, LEADING + PATH), float32
+    path : ndarray, shape (p, PATH_FEATURES, r), float32
+        Second and third derivative of the equilibrium along a load path, as polynomials.
+    guess : ndarray, shape (p, FEATURES, LEADING + PATH), float32
     errors : ndarray, shape (p,)
         Relative error of the cubature in the energy norm, on loads it was not fitted to.
     extent : float, mm
@@ -107,6 +121,7 @@ class LocalModels:
     point_from: NDArray[np.int64]
     points: NDArray[np.int32]
     weights: Array
+    path: Field
     guess: Field
     errors: Array
     extent: float
@@ -119,17 +134,24 @@ def assemble_patches(body: Body, models: LocalModels, radius: float) -> Patches:
     per_element = gradients.shape[1]
     surface = surface_quadrature(body.nodes, body.faces)
     bases = models.basis.reshape(*models.steps.shape, len(body.nodes), 3)
+    count, r = len(models.centres), models.modes.shape[2]
+    most = -(-int(np.diff(models.point_from).max()) // LANES) * LANES
+    point_gradients = np.zeros((count, r, 9 * most), np.int16)
+    steps = np.empty((count, r), np.float32)
+    weights, mu, lam = (np.zeros((count, most)) for _ in range(3))
     modes, rows = [], []
-    point_gradients = np.empty((9 * len(models.points), models.modes.shape[2]), np.float32)
     for k, centre in enumerate(models.centres):
         region = models.region[k]
         C = models.steps[region][:, None] * models.modes[k]
-        chosen = models.points[models.point_from[k] : models.point_from[k + 1]]
-        element, q = np.divmod(chosen, per_element)
+        own = slice(models.point_from[k], models.point_from[k + 1])
+        element, q = np.divmod(models.points[own], per_element)
         nodes, local = np.unique(body.elements[element], return_inverse=True)
-        V = np.tensordot(bases[region][:, nodes], C, (0, 0))[local.reshape(len(chosen), -1)]
-        first, last = 9 * models.point_from[k], 9 * models.point_from[k + 1]
-        point_gradients[first:last] = _mode_gradients(V, gradients[element, q])
+        V = np.tensordot(bases[region][:, nodes], C, (0, 0))[local.reshape(len(element), -1)]
+        G = _tiles(_mode_gradients(V, gradients[element, q]), most)
+        steps[k] = np.maximum(np.abs(G).max(axis=1), 1e-30) / np.iinfo(np.int16).max
+        point_gradients[k] = np.rint(G / steps[k, :, None])
+        weights[k, : len(element)] = models.weights[own]
+        mu[k, : len(element)], lam[k, : len(element)] = body.mu[element], body.lam[element]
         near = np.flatnonzero(
             np.sum((surface.points - centre) ** 2, axis=1) < (models.extent + radius) ** 2
         )
@@ -138,35 +160,42 @@ def assemble_patches(body: Body, models: LocalModels, radius: float) -> Patches:
         modes.append(np.tensordot(loaded, C, (0, 0)))
         rows.append((near, local.reshape(len(near), -1)))
     near = np.concatenate([r[0] for r in rows])
-    element = models.points // per_element
     return Patches(
-        centres=models.centres,
+        centres=np.ascontiguousarray(models.centres.T),
         frames=models.frames,
         pressures=models.pressures,
-        point_from=models.point_from,
         gradients=point_gradients,
-        weights=models.weights,
-        mu=body.mu[element],
-        lam=body.lam[element],
+        steps=steps,
+        weights=weights,
+        mu=mu,
+        lam=lam,
         node_from=_offsets(modes),
-        modes=np.vstack(modes),
+        modes=np.vstack(modes).reshape(-1, 3 * r),
         face_from=_offsets([r[0] for r in rows]),
         face_points=surface.points[near],
         face_normals=surface.normals[near],
         face_areas=surface.areas[near],
         face_nodes=np.vstack([r[1] for r in rows]).astype(np.int32),
         face_shape=surface.shape[near],
-        guess=models.guess,
+        path=models.path,
+        guess=np.pad(models.guess, ((0, 0), (0, 0), (0, NARROW - models.guess.shape[2]))),
         blend=models.blend,
     )
 
 
 def _mode_gradients(V: Field, gradients: Array) -> Field:
-    """Gradients (9 c, m) of modes V (c, n, 3, m), at points with shape gradients (c, n, 3)."""
+    """Gradients (c, 9, m) of modes V (c, n, 3, m), at points with shape gradients (c, n, 3)."""
     c, _, _, m = V.shape
     # (c, 1, J, n) @ (c, i, n, m) -> (c, i, J, m)
     G = np.matmul(np.swapaxes(gradients, 1, 2)[:, None].astype(V.dtype), np.swapaxes(V, 1, 2))
-    return np.ascontiguousarray(G.reshape(9 * c, m))
+    return G.reshape(c, 9, m)
+
+
+def _tiles(G: Field, points: int) -> Field:
+    """Gradients (c, 9, m) as rows (m, 9 points) in tiles, filled up with zeros."""
+    filled = np.zeros((points, *G.shape[1:]), G.dtype)
+    filled[: len(G)] = G
+    return filled.reshape(-1, LANES, *G.shape[1:]).transpose(3, 0, 2, 1).reshape(G.shape[2], -1)
 
 
 def _offsets(parts: list[Any]) -> NDArray[np.int64]:
@@ -174,11 +203,18 @@ def _offsets(parts: list[Any]) -> NDArray[np.int64]:
 
 
 class State:
-    """Working memory and last answer of one caller; not to be shared between threads."""
+    """Working memory and last answer of one caller; not to be shared between threads.
 
-    def __init__(self, patches: Patches) -> None:
-        r = patches.modes.shape[2]
-        rows = 9 * int(np.diff(patches.point_from).max())
+    Parameters
+    ----------
+    patches : Patches
+    triangles : int
+        Of the surface that is queried.
+    """
+
+    def __init__(self, patches: Patches, triangles: int = 0) -> None:
+        _, r, entries = patches.gradients.shape
+        points = LANES * (entries // TILE)
         self.memory = Memory(
             patch=np.full(MAX_ACTIVE, -1, np.int64),
             wide=np.zeros((MAX_ACTIVE, r)),
@@ -187,27 +223,40 @@ class State:
             factorised=np.zeros(MAX_ACTIVE, np.int64),
         )
         self.scratch = Scratch(
-            F=np.zeros(rows),
-            P=np.zeros(rows),
-            H=np.zeros((3, rows)),
-            AG=np.zeros((9, NARROW)),
-            G=np.zeros((rows, NARROW)),
+            gradients=np.zeros((NARROW, entries), np.float32),
+            increments=np.zeros((NARROW, entries), np.float32),
+            H=np.zeros(entries, np.float32),
+            P=np.zeros(entries, np.float32),
+            J=np.zeros(points),
+            trace=np.zeros(points),
+            linear=np.zeros(points),
+            state=np.zeros(STATE * points, np.float32),
             vectors=np.zeros((NARROW - LEADING, r)),
-            single=np.zeros(rows, np.float32),
+            stepped=np.zeros((NARROW - LEADING, r), np.float32),
             tangent=np.zeros((NARROW, NARROW)),
-            point=np.zeros((10, 9)),
             newton=np.zeros((4, NARROW)),
             q=np.zeros(NARROW),
+            guess=np.zeros(NARROW, np.float32),
             load=np.zeros(NARROW),
-            overlap=np.zeros(NARROW),
+            scaled_load=np.zeros(3),
+            unit_loads=np.zeros(3 * r, np.float32),
             wide_load=np.zeros(r),
-            derivative=np.zeros(r),
-            wide_single=np.zeros(r, np.float32),
-            features=np.zeros(GUESS_FEATURES),
+            residual=np.zeros(r),
+            features=np.zeros(FEATURES),
             nodal=np.zeros(int(np.diff(patches.node_from).max())),
-            distance=np.zeros(len(patches.centres)),
+            distance=np.zeros(patches.centres.shape[1]),
+            surface=np.zeros(triangles + 6),
         )
-        self.outcome = Outcome(np.zeros(MAX_ACTIVE), np.zeros(SCALARS), np.zeros(3))
+        self.outcome = Outcome(
+            weight=np.zeros(MAX_ACTIVE),
+            scalars=np.zeros(SCALARS),
+            displacement=np.zeros(3),
+            point=np.zeros(3),
+            normal=np.zeros(3),
+            direction=np.zeros(3),
+            range=np.zeros(LIMIT_FIELDS),
+        )
+        self.bound = bind(Solver(patches, self.memory, self.scratch, self.outcome))
 
     def forget(self) -> None:
         """Make the next answer independent of the last."""
@@ -289,6 +338,10 @@ class Estimator:
     """
 
     coefficients: Array  # (2, 6): displacement, von Mises
+    _rows: list[list[float]] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_rows", self.coefficients.tolist())
 
     @staticmethod
     def features(
@@ -303,7 +356,8 @@ class Estimator:
     ) -> tuple[float, float]:
         """Estimated relative errors of displacement and von Mises stress."""
         features = self.features(load, tilt, missed, cubature, compliance)
-        displacement, von_mises = self.coefficients @ features
+        logs = (sum(map(operator.mul, row, features)) for row in self._rows)
+        displacement, von_mises = logs
         return math.exp(displacement), math.exp(von_mises)
 
 
@@ -345,7 +399,9 @@ class Atlas:
         self.models = models
         self.estimator = estimator
         self.patches = assemble_patches(body, models, scene.endoscope.radius)
+        self._ground = bind(surface.ground(limits))
         self.surface_nodes, self.surface_triangles = boundary_triangles(body.faces)
+        self._cubature: list[float] = models.errors.tolist()
         self._recovery = stress_recovery(body.nodes, body.elements, body.mu, body.lam)
         self._full = np.zeros((len(body.nodes), 3))
         self._stress = np.zeros(len(body.nodes))
@@ -400,6 +456,7 @@ class Atlas:
                 point_from=arrays["cubature_from"],
                 points=arrays["cubature_points"],
                 weights=arrays["cubature_weights"],
+                path=arrays["patch_path"].astype(np.float32),
                 guess=arrays["patch_guess"].astype(np.float32),
                 errors=arrays["patch_errors"],
                 extent=float(arrays["patch_extent"]),
@@ -425,7 +482,7 @@ class Atlas:
 
     def new_state(self) -> State:
         """Working memory and warm start for one session or thread."""
-        return State(self.patches)
+        return State(self.patches, len(self.surface.triangles))
 
     def solve(
         self,
@@ -460,37 +517,39 @@ class Atlas:
         if not (math.isfinite(pressure) and pressure >= 0):
             raise QueryError("pressure", f"must be a finite number >= 0 kPa, not {pressure}")
         at = _vector("position", position)
-        x, normal, distance, fields = self.surface.locate(at, self.limits)
-        if distance > endoscope.reach:
-            raise QueryError(
-                "position",
-                f"{distance:.2f} mm from the accessible surface, "
-                f"at most {endoscope.reach} mm allowed",
-            )
         if radius is None:
             radius = endoscope.radius
         elif not endoscope.radius / 2 <= radius <= endoscope.radius:
             allowed = f"[{endoscope.radius / 2}, {endoscope.radius}] mm"
             raise QueryError("radius", f"must be in {allowed}, not {radius}")
         if direction is None:
-            towards, tilt = -normal, 0.0
+            towards = _INWARD
         else:
             towards = _vector("direction", direction)
-            length = math.sqrt(towards @ towards)
-            if length == 0:
+            if not towards.any():
                 raise QueryError("direction", "must not be the zero vector")
-            towards = towards / length
-            cosine = -float(towards @ normal)
-            if cosine <= 0:
-                raise QueryError("direction", "must point into the tissue")
-            tilt = math.degrees(math.acos(min(1.0, cosine)))
-        limit = pressure_limit(fields, normal, towards)
         if state is None:
             state = self._state
             state.forget()
-        outcome, memory = state.outcome, state.memory
-        answer(self.patches, x, normal, towards, pressure, radius, memory, state.scratch, outcome)
-        scalars = outcome.scalars
+        query(self._ground, state.bound, at, towards, pressure, radius, endoscope.reach)
+        outcome = state.outcome
+        scalars = outcome.scalars.tolist()
+        if scalars[DISTANCE] > endoscope.reach:
+            raise QueryError(
+                "position",
+                f"{scalars[DISTANCE]:.2f} mm from the accessible surface, "
+                f"at most {endoscope.reach} mm allowed",
+            )
+        if scalars[COSINE] <= 0:
+            raise QueryError("direction", "must point into the tissue")
+        return self._solution(state, pressure, radius, scalars, started)
+
+    def _solution(
+        self, state: State, pressure: float, radius: float, scalars: list[float], started: float
+    ) -> Solution:
+        outcome, endoscope = state.outcome, self.scene.endoscope
+        limit = scalars[LIMIT]
+        tilt = math.degrees(math.acos(min(1.0, scalars[COSINE])))
         out_of_range = tuple(
             name
             for name, outside in (
@@ -500,39 +559,42 @@ class Atlas:
             )
             if outside
         )
-        active = [s for s in range(MAX_ACTIVE) if outcome.weight[s] > 0]
+        numbers = state.memory.patch.tolist()
         patches = tuple(
-            (_number(int(memory.patch[s])), float(outcome.weight[s]), memory.wide[s].copy())
-            for s in active
+            (_number(numbers[slot]), weight, state.memory.wide[slot].copy())
+            for slot, weight in enumerate(outcome.weight.tolist())
+            if weight > 0
         )
-        cubature = sum(weight * float(self.models.errors[k]) for k, weight, _ in patches)
+        cubature = sum(weight * self._cubature[k] for k, weight, _ in patches)
+        displacement = outcome.displacement.copy()
         errors = self.estimator(
             pressure / limit,
             tilt / endoscope.max_tilt,
-            float(scalars[MISSED]),
+            scalars[MISSED],
             cubature,
-            float(np.linalg.norm(outcome.displacement)) / max(pressure, 1e-6),
+            math.hypot(*displacement.tolist()) / max(pressure, 1e-6),
         )
+        direction = outcome.direction.copy()
         return Solution(
-            contact_point=x,
-            normal=normal,
-            distance=distance,
-            direction=towards,
+            contact_point=outcome.point.copy(),
+            normal=outcome.normal.copy(),
+            distance=scalars[DISTANCE],
+            direction=direction,
             tilt=tilt,
-            missed=float(scalars[MISSED]),
+            missed=scalars[MISSED],
             cubature=cubature,
             pressure=pressure,
             radius=radius,
             pressure_limit=limit,
-            force=pressure * float(scalars[AREA]) * towards,
-            contact_displacement=outcome.displacement.copy(),
-            converged=bool(scalars[STATUS] == equilibrium.CONVERGED),
+            force=pressure * scalars[AREA] * direction,
+            contact_displacement=displacement,
+            converged=scalars[STATUS] == equilibrium.CONVERGED,
             iterations=int(scalars[ITERATIONS]),
             in_range=not out_of_range,
             out_of_range=out_of_range,
             error_displacement=errors[0],
             error_von_mises=errors[1],
-            min_jacobian=float(scalars[SMALLEST_J]),
+            min_jacobian=scalars[SMALLEST_J],
             patches=patches,
             solve_seconds=time.perf_counter() - started,
         )

@@ -18,7 +18,6 @@ import numpy as np
 CONVERGED, STALLED, EXHAUSTED = 0, 1, 2
 
 SUFFICIENT_DECREASE = 1e-4
-ROUND_OFF = 1e-12
 SMALLEST_STEP = 1e-6
 LARGEST_SHIFT = 1e4
 
@@ -38,7 +37,7 @@ def correct(system, residual, step):
     system.correct(residual, step)
 
 
-def newton(system, u, work, target, reuse, max_iterations, factorised):
+def newton(system, u, work, target, reuse, max_iterations, factorised, round_off=1e-12):
     """Find the equilibrium of ``system`` near ``u``, in place.
 
     Parameters
@@ -57,6 +56,8 @@ def newton(system, u, work, target, reuse, max_iterations, factorised):
     max_iterations : int
     factorised : bool
         Whether ``system`` still holds the factorised tangent of a state near ``u``.
+    round_off : float
+        Relative error with which the system knows its energy.
 
     Returns
     -------
@@ -65,27 +66,36 @@ def newton(system, u, work, target, reuse, max_iterations, factorised):
         ``EXHAUSTED`` (iterations used up).
     iterations : int
         Corrections made.
-    norm : float
-        Residual norm at ``u``.
+    energy : float
+        Potential at ``u``; ``work[0]`` holds the residual there.
     smallest : float
         Smallest det F at ``u``.
     """
+    energy, smallest = potential(system, u, work[0])
+    return descend(
+        system, u, work, energy, smallest, target, reuse, max_iterations, factorised, round_off
+    )
+
+
+def descend(
+    system, u, work, energy, smallest, target, reuse, max_iterations, factorised, round_off
+):
+    """As ``newton`` from a ``u`` whose potential is known and whose residual is in ``work[0]``."""
     residual, step, trial, trial_residual = work[0], work[1], work[2], work[3]
-    energy, smallest = potential(system, u, residual)
     if not smallest > 0:  # beyond an inverted element there is neither residual nor tangent
-        return STALLED, 0, math.inf, smallest
+        return STALLED, 0, energy, smallest
     norm = math.sqrt(np.dot(residual, residual))
     stale = not factorised
     iterations = 0
     while not norm <= target:
         if iterations == max_iterations:
-            return EXHAUSTED, iterations, norm, smallest
+            return EXHAUSTED, iterations, energy, smallest
         if stale:
             shift = 0.0
             while not factorise(system, u, shift):
                 shift = max(0.01, 4.0 * shift)
                 if shift > LARGEST_SHIFT:
-                    return STALLED, iterations, norm, smallest
+                    return STALLED, iterations, energy, smallest
         correct(system, residual, step)
         slope = np.dot(residual, step)
         length = 1.0
@@ -93,7 +103,7 @@ def newton(system, u, work, target, reuse, max_iterations, factorised):
             np.multiply(step, length, trial)
             np.add(trial, u, trial)
             trial_energy, trial_smallest = potential(system, trial, trial_residual)
-            allowed = SUFFICIENT_DECREASE * length * slope + ROUND_OFF * abs(energy)
+            allowed = SUFFICIENT_DECREASE * length * slope + round_off * abs(energy)
             if trial_energy - energy <= allowed:
                 break
             length *= 0.5
@@ -102,7 +112,7 @@ def newton(system, u, work, target, reuse, max_iterations, factorised):
         iterations += 1
         if length < SMALLEST_STEP:
             if stale:
-                return STALLED, iterations, norm, smallest
+                return STALLED, iterations, energy, smallest
             stale = True
             continue
         u[:] = trial
@@ -111,4 +121,4 @@ def newton(system, u, work, target, reuse, max_iterations, factorised):
         previous = norm
         norm = math.sqrt(np.dot(residual, residual))
         stale = length < 1.0 or norm > reuse * previous
-    return CONVERGED, iterations, norm, smallest
+    return CONVERGED, iterations, energy, smallest

@@ -6,23 +6,32 @@ query is not solved in all of it.  Its *narrow* space is chosen for the load at 
 
 * the leading modes of the patch,
 * the linear response to this very load, ``u_1 = B^T f``, and the second and third derivative of the
-  equilibrium along the load path, ``u_2 = -R''[u_1, u_1]`` and ``u_3 = -R'''[u_1, u_1, u_1] -
-  3 R''[u_1, u_2]`` (nonlinear load-dependent Ritz vectors; the rest stiffness is ``I``),
+  equilibrium along the load path, ``u_2`` and ``u_3`` (nonlinear load-dependent Ritz vectors),
+  which are forms of second and third degree in the load and polynomials in its place on the patch,
 * what the solution in these leaves unbalanced in the wide space, the residual
   ``r = B^T (R(u) - f)``.
 
 The equilibrium minimises the potential energy in the narrow space,
 
-    min_q  sum_c w_c W(I + G_c V q) - f . V q,
+    min_q  int W(I + G V q) dV - f . V q,
 
-summed over few *cubature points* ``c`` of positive weight ``w_c`` (Hernandez et al. 2017) with the
-gradients ``G_c`` (9, r) of the wide modes.  With all points and their own weights, and all modes,
-this is the Galerkin model; tissue law, load footprint and Newton's method are those of the full
-model.  The norm of the residual in the wide space, relative to the load's, measures what the narrow
-space misses.
+with ``G`` (9, r) the gradients of the wide modes.  Linear elasticity needs no integration: its
+energy is ``q . q / 2``, since the modes are orthonormal in it.  Only what ``W`` adds to the energy
+``W_0`` of linear elasticity is summed over few *cubature points* ``c`` of positive weight ``w_c``
+(Hernandez et al. 2017),
+
+    min_q  q . q / 2 + sum_c w_c (W - W_0)(G_c V q) - f . V q;
+
+that is small where the load is small, and lives near the contact, where the points are.  With all
+points and their own weights, and all modes, this is the Galerkin model; tissue law, load footprint
+and Newton's method are those of the full model.  The norm of the residual in the wide space,
+relative to the load's, measures what the narrow space misses.
 
 Between patch centres the answers of the nearest patches are blended, so that the answer is a
 continuous function of the contact point.  No array of mesh size is touched to solve a query.
+
+Points lie in *tiles* of ``LANES``: the nine components of a gradient or stress one after the other,
+``LANES`` points each, so that loops over the points of a tile compile to vector code.
 """
 
 from __future__ import annotations
@@ -36,7 +45,8 @@ from numba.extending import overload
 from numpy.typing import NDArray
 
 from shared import equilibrium, tissue
-from shared.endoscope import SurfaceQuadrature, footprint
+from shared.endoscope import SurfaceQuadrature, footprint, pressure_limit
+from shared.surface import locate
 
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
@@ -53,34 +63,214 @@ LOOSE = 0.15
 """The same before the space is enriched: near enough for the residual to show what is missing."""
 
 REUSE = 0.15
-"""A tangent costs about six residuals here, so a factorised one serves while it still contracts."""
+"""A tangent costs about three residuals here, so a factorised one serves while it contracts."""
 
 MAX_ITERATIONS = 30
 
+ROUND_OFF = 1e-6
+"""Of the energy: gradients are summed in single precision."""
 
 LEADING, PATH = 12, 3
 NARROW = LEADING + PATH + 1
-"""Modes of the narrow space: leading ones, derivatives along the load path, and the residual.  A
-constant, so that loops over it compile to whole vectors."""
+"""Modes of the narrow space: leading ones, derivatives along the load path, and the residual."""
+
+LANES = 16
+"""Points in a tile: two vectors of single precision, so that their latencies overlap."""
+
+TILE = 9 * LANES
+
+STATE = 13
+"""Numbers that describe the tangent at a point: F^-T and four moduli."""
+
+FAST = {"contract", "reassoc", "nsz"}
+
+
+# --- vector code ---------------------------------------------------------------------------------
+# Rows of numbers, four at a time: a vector that is read serves four products.
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def _superpose(rows, coefficients, out):
+    """``out = coefficients @ rows``: rows (4 k, n) int16 or float32, out (n,) float32."""
+    for i in range(len(out)):
+        out[i] = np.float32(0.0)
+    for j in range(0, len(rows), 4):
+        a, b = np.float32(coefficients[j]), np.float32(coefficients[j + 1])
+        c, d = np.float32(coefficients[j + 2]), np.float32(coefficients[j + 3])
+        p, q, r, s = rows[j], rows[j + 1], rows[j + 2], rows[j + 3]
+        for i in range(len(out)):
+            out[i] += (
+                a * np.float32(p[i]) + b * np.float32(q[i])
+                + c * np.float32(r[i]) + d * np.float32(s[i])
+            )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def _project(rows, vector, out):
+    """``out = rows @ vector``: rows (4 k, n) int16 or float32, vector (n,) float32."""
+    for j in range(0, len(rows), 4):
+        p, q, r, s = rows[j], rows[j + 1], rows[j + 2], rows[j + 3]
+        a = b = c = d = np.float32(0.0)
+        for i in range(len(vector)):
+            v = vector[i]
+            a += np.float32(p[i]) * v
+            b += np.float32(q[i]) * v
+            c += np.float32(r[i]) * v
+            d += np.float32(s[i]) * v
+        out[j], out[j + 1], out[j + 2], out[j + 3] = a, b, c, d
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def _narrow_gradients(rows, steps, vectors, out):
+    """Gradients of the narrow modes but the last: ``out[:LEADING + 3]``, in one pass over ``rows``.
+
+    rows (4 k, n) int16 in steps (4 k,); vectors (3, 4 k), steps included; out (NARROW, n).
+    """
+    for start in range(0, out.shape[1], 512):  # a block stays in the first-level cache
+        stop = min(start + 512, out.shape[1])
+        for j in range(LEADING):
+            row, target, step = rows[j, start:stop], out[j, start:stop], steps[j]
+            for i in range(len(target)):
+                target[i] = step * np.float32(row[i])
+        x, y = out[LEADING, start:stop], out[LEADING + 1, start:stop]
+        z = out[LEADING + 2, start:stop]
+        for i in range(len(x)):
+            x[i] = y[i] = z[i] = np.float32(0.0)
+        for j in range(0, len(rows), 4):
+            p, q = rows[j, start:stop], rows[j + 1, start:stop]
+            r, s = rows[j + 2, start:stop], rows[j + 3, start:stop]
+            xp, xq, xr, xs = vectors[0, j], vectors[0, j + 1], vectors[0, j + 2], vectors[0, j + 3]
+            yp, yq, yr, ys = vectors[1, j], vectors[1, j + 1], vectors[1, j + 2], vectors[1, j + 3]
+            zp, zq, zr, zs = vectors[2, j], vectors[2, j + 1], vectors[2, j + 2], vectors[2, j + 3]
+            for i in range(len(x)):
+                a, b = np.float32(p[i]), np.float32(q[i])
+                c, d = np.float32(r[i]), np.float32(s[i])
+                x[i] += xp * a + xq * b + xr * c + xs * d
+                y[i] += yp * a + yq * b + yr * c + ys * d
+                z[i] += zp * a + zq * b + zr * c + zs * d
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def nonlinear_stress(H, weights, mu, lam, J, trace, linear, P):
+    """What the stress adds to that of linear elasticity, times weight, at all points in tiles.
+
+    ``H`` (9 c,) is the displacement gradient.  Also det F, tr(F^T F) and the energy density of
+    linear elasticity, point by point.
+    """
+    for tile in range(len(weights) // LANES):
+        h, p = H[TILE * tile : TILE * (tile + 1)], P[TILE * tile : TILE * (tile + 1)]
+        at = LANES * tile
+        w, m, n = weights[at : at + LANES], mu[at : at + LANES], lam[at : at + LANES]
+        j, t, e = J[at : at + LANES], trace[at : at + LANES], linear[at : at + LANES]
+        for c in range(LANES):
+            h0, h1, h2 = float(h[c]), float(h[LANES + c]), float(h[2 * LANES + c])
+            h3, h4, h5 = float(h[3 * LANES + c]), float(h[4 * LANES + c]), float(h[5 * LANES + c])
+            h6, h7, h8 = float(h[6 * LANES + c]), float(h[7 * LANES + c]), float(h[8 * LANES + c])
+            e[c], l0, l1, l2, l3, l4, l5, l6, l7, l8 = tissue.rest_stress(
+                h0, h1, h2, h3, h4, h5, h6, h7, h8, m[c], n[c]
+            )
+            j[c], t[c], p0, p1, p2, p3, p4, p5, p6, p7, p8 = tissue.first_piola(
+                1.0 + h0, h1, h2, h3, 1.0 + h4, h5, h6, h7, 1.0 + h8, m[c], n[c]
+            )
+            p[c], p[LANES + c] = w[c] * (p0 - l0), w[c] * (p1 - l1)
+            p[2 * LANES + c], p[3 * LANES + c] = w[c] * (p2 - l2), w[c] * (p3 - l3)
+            p[4 * LANES + c], p[5 * LANES + c] = w[c] * (p4 - l4), w[c] * (p5 - l5)
+            p[6 * LANES + c], p[7 * LANES + c] = w[c] * (p6 - l6), w[c] * (p7 - l7)
+            p[8 * LANES + c] = w[c] * (p8 - l8)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def _linearise(H, weights, mu, lam, state):
+    """What ``_increments`` needs, in tiles of ``STATE`` components; moduli times weight."""
+    for tile in range(len(weights) // LANES):
+        h = H[TILE * tile : TILE * (tile + 1)]
+        s = state[STATE * LANES * tile : STATE * LANES * (tile + 1)]
+        at = LANES * tile
+        w, m, n = weights[at : at + LANES], mu[at : at + LANES], lam[at : at + LANES]
+        for c in range(LANES):
+            t0, t1, t2, t3, t4, t5, t6, t7, t8, geometric, bulk = tissue.linearise(
+                1.0 + h[c], h[LANES + c], h[2 * LANES + c],
+                h[3 * LANES + c], 1.0 + h[4 * LANES + c], h[5 * LANES + c],
+                h[6 * LANES + c], h[7 * LANES + c], 1.0 + h[8 * LANES + c],
+                m[c], n[c],
+            )  # fmt: skip
+            s[c], s[LANES + c], s[2 * LANES + c], s[3 * LANES + c] = t0, t1, t2, t3
+            s[4 * LANES + c], s[5 * LANES + c], s[6 * LANES + c] = t4, t5, t6
+            s[7 * LANES + c], s[8 * LANES + c] = t7, t8
+            s[9 * LANES + c], s[10 * LANES + c] = w[c] * geometric, w[c] * bulk
+            s[11 * LANES + c], s[12 * LANES + c] = w[c] * m[c], w[c] * n[c]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def _increments(state, gradients, out):
+    """Tangent less that at rest, times the gradient of every mode: (m, 9 c) in tiles."""
+    for tile in range(gradients.shape[1] // TILE):
+        s = state[STATE * LANES * tile : STATE * LANES * (tile + 1)]
+        for mode in range(len(gradients)):
+            h = gradients[mode, TILE * tile : TILE * (tile + 1)]
+            d = out[mode, TILE * tile : TILE * (tile + 1)]
+            for c in range(LANES):
+                h0, h1, h2 = h[c], h[LANES + c], h[2 * LANES + c]
+                h3, h4, h5 = h[3 * LANES + c], h[4 * LANES + c], h[5 * LANES + c]
+                h6, h7, h8 = h[6 * LANES + c], h[7 * LANES + c], h[8 * LANES + c]
+                mu, lam = s[11 * LANES + c], s[12 * LANES + c]
+                d0, d1, d2, d3, d4, d5, d6, d7, d8 = tissue.increment(
+                    s[c], s[LANES + c], s[2 * LANES + c],
+                    s[3 * LANES + c], s[4 * LANES + c], s[5 * LANES + c],
+                    s[6 * LANES + c], s[7 * LANES + c], s[8 * LANES + c],
+                    s[9 * LANES + c], s[10 * LANES + c], mu,
+                    h0, h1, h2, h3, h4, h5, h6, h7, h8,
+                )  # fmt: skip
+                _, l0, l1, l2, l3, l4, l5, l6, l7, l8 = tissue.rest_stress(
+                    h0, h1, h2, h3, h4, h5, h6, h7, h8, mu, lam
+                )
+                d[c], d[LANES + c], d[2 * LANES + c] = d0 - l0, d1 - l1, d2 - l2
+                d[3 * LANES + c], d[4 * LANES + c], d[5 * LANES + c] = d3 - l3, d4 - l4, d5 - l5
+                d[6 * LANES + c], d[7 * LANES + c], d[8 * LANES + c] = d6 - l6, d7 - l7, d8 - l8
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def _lower_products(A, B, K):
+    """Lower triangle of ``K = A B^T``: A, B (4 k, n) float32; some entries above it as well."""
+    for i in range(0, len(A), 2):
+        a, b = A[i], A[i + 1]
+        for k in range(0, i + 2, 4):
+            p, q, r, s = B[k], B[k + 1], B[k + 2], B[k + 3]
+            ap = aq = ar = a_s = bp = bq = br = bs = np.float32(0.0)
+            for n in range(len(a)):
+                x, y = a[n], b[n]
+                ap += x * p[n]
+                aq += x * q[n]
+                ar += x * r[n]
+                a_s += x * s[n]
+                bp += y * p[n]
+                bq += y * q[n]
+                br += y * r[n]
+                bs += y * s[n]
+            K[i, k], K[i, k + 1], K[i, k + 2], K[i, k + 3] = ap, aq, ar, a_s
+            K[i + 1, k], K[i + 1, k + 1], K[i + 1, k + 2], K[i + 1, k + 3] = bp, bq, br, bs
 
 
 # --- one local model as a system for shared.equilibrium ------------------------------------------
 
 
 class LocalSystem(NamedTuple):
-    """A patch under a load, with scratch memory for ``shared.equilibrium.newton``."""
+    """A patch under a load, with scratch memory for ``shared.equilibrium.descend``."""
 
-    gradients: Array  # (9 c, m) 1/mm, point by point; a column of zeros is a mode not in use
+    gradients: Field  # (m, 9 c) 1/mm in tiles; a row of zeros is a mode not in use
     weights: Array  # (c,) mm^3
     mu: Array  # (c,) kPa
     lam: Array  # (c,) kPa
     load: Array  # (m,)
-    F: Array  # (9 c,)
-    P: Array  # (9 c,)
-    AG: Array  # (9, m)
-    tangent: Array  # (m, m)
+    H: Field  # (9 c,) displacement gradient in tiles
+    P: Field  # (9 c,) in tiles, see nonlinear_stress
+    J: Array  # (c,)
+    trace: Array  # (c,)
+    linear: Array  # (c,)
+    state: Field  # (13 c,) in tiles, see _linearise
+    increments: Field  # (m, 9 c) in tiles
+    tangent: Array  # (m, m), lower triangle
     factor: Array  # (m, m) lower Cholesky factor
-    point: Array  # (10, 9): inverse of F, and the material tangent
 
 
 def _is_local_system(system: object) -> bool:
@@ -93,71 +283,37 @@ def _potential(system, u, residual):
         return None
 
     def potential(system, u, residual):
-        np.dot(system.gradients, u, system.F)
-        energy, smallest = 0.0, np.inf
-        Finv = system.point[0]
-        for c in range(len(system.weights)):
-            F = system.F[9 * c : 9 * c + 9]
-            P = system.P[9 * c : 9 * c + 9]
-            F[0] += 1.0
-            F[4] += 1.0
-            F[8] += 1.0
-            W, J = tissue.stress(F, system.mu[c], system.lam[c], Finv, P)
-            smallest = min(smallest, J)
-            if not J > 0.0:
-                return tissue.INVERTED, smallest
-            w = system.weights[c]
-            energy += w * W
-            for i in range(9):
-                P[i] *= w
-        np.dot(system.gradients.T, system.P, residual)
-        np.subtract(residual, system.load, residual)
-        return energy - np.dot(system.load, u), smallest
+        _superpose(system.gradients, u, system.H)
+        J, trace, linear = system.J, system.trace, system.linear
+        weights, mu, lam = system.weights, system.mu, system.lam
+        nonlinear_stress(system.H, weights, mu, lam, J, trace, linear, system.P)
+        smallest = J.min()
+        if not smallest > 0.0:
+            return tissue.INVERTED, smallest
+        energy = 0.0
+        for c in range(len(weights)):
+            energy += weights[c] * (tissue.energy(J[c], trace[c], mu[c], lam[c]) - linear[c])
+        _project(system.gradients, system.P, residual)
+        for i in range(len(u)):
+            residual[i] += u[i] - system.load[i]
+            energy += (0.5 * u[i] - system.load[i]) * u[i]
+        return energy, smallest
 
     return potential
 
 
-@overload(
-    equilibrium.factorise,
-    jit_options={"error_model": "numpy", "fastmath": {"contract"}},
-)
+@overload(equilibrium.factorise, jit_options={"error_model": "numpy"})
 def _factorise(system, u, shift):
     if not _is_local_system(system):
         return None
 
     def factorise(system, u, shift):
-        np.dot(system.gradients, u, system.F)
-        Finv, A, AG, K = system.point[0], system.point[1:10], system.AG, system.tangent
-        K[:] = 0.0
-        for c in range(len(system.weights)):
-            F = system.F[9 * c : 9 * c + 9]
-            F[0] += 1.0
-            F[4] += 1.0
-            F[8] += 1.0
-            tissue.tangent(F, system.mu[c], system.lam[c], Finv, A)
-            w = system.weights[c]
-            G = system.gradients[9 * c : 9 * c + 9]
-            for i in range(9):
-                a0, a1, a2 = w * A[i, 0], w * A[i, 1], w * A[i, 2]
-                a3, a4, a5 = w * A[i, 3], w * A[i, 4], w * A[i, 5]
-                a6, a7, a8 = w * A[i, 6], w * A[i, 7], w * A[i, 8]
-                for k in range(NARROW):
-                    AG[i, k] = (
-                        a0 * G[0, k] + a1 * G[1, k] + a2 * G[2, k]
-                        + a3 * G[3, k] + a4 * G[4, k] + a5 * G[5, k]
-                        + a6 * G[6, k] + a7 * G[7, k] + a8 * G[8, k]
-                    )  # fmt: skip
-            # the point's share of G^T A G while it is in the first-level cache
-            for i in range(NARROW):
-                g0, g1, g2 = G[0, i], G[1, i], G[2, i]
-                g3, g4, g5 = G[3, i], G[4, i], G[5, i]
-                g6, g7, g8 = G[6, i], G[7, i], G[8, i]
-                for k in range(NARROW):
-                    K[i, k] += (
-                        g0 * AG[0, k] + g1 * AG[1, k] + g2 * AG[2, k]
-                        + g3 * AG[3, k] + g4 * AG[4, k] + g5 * AG[5, k]
-                        + g6 * AG[6, k] + g7 * AG[7, k] + g8 * AG[8, k]
-                    )  # fmt: skip
+        _superpose(system.gradients, u, system.H)
+        _linearise(system.H, system.weights, system.mu, system.lam, system.state)
+        _increments(system.state, system.gradients, system.increments)
+        _lower_products(system.gradients, system.increments, system.tangent)
+        for i in range(len(u)):
+            system.tangent[i, i] += 1.0
         return _cholesky(system.tangent, shift, system.factor)
 
     return factorise
@@ -200,55 +356,55 @@ def _cholesky(K, shift, L):
         pivot = K[i, i] + shift
         for k in range(i):
             pivot -= L[i, k] * L[i, k]
-        if pivot == shift and K[i, i] == 0.0:
-            pivot = 1.0  # a mode not in use: held
         if not pivot > 0.0:
             return False
         L[i, i] = math.sqrt(pivot)
     return True
 
 
-newton = njit(equilibrium.newton, error_model="numpy", nogil=True, cache=True)
+descend = njit(equilibrium.descend, error_model="numpy", nogil=True, cache=True)
 
 
 # --- the atlas -----------------------------------------------------------------------------------
 
 
 class Patches(NamedTuple):
-    """All local models, one after the other; ``*_from[k] : *_from[k + 1]`` are patch k's rows."""
+    """All local models; ``*_from[k] : *_from[k + 1]`` are patch k's rows."""
 
-    centres: Array  # (p, 3) mm
+    centres: Array  # (3, p) mm
     frames: Array  # (p, 3, 3) rows: outward normal and two tangents at the centre
     pressures: Array  # (p,) kPa, scale of the load there
-    point_from: Ints  # (p + 1,)
-    gradients: Field  # (9 c, r) 1/mm
-    weights: Array  # (c,) mm^3
-    mu: Array  # (c,) kPa
-    lam: Array  # (c,) kPa
+    gradients: NDArray[np.int16]  # (p, r, 9 c) of the wide modes, in tiles
+    steps: Field  # (p, r) 1/mm, of the gradients
+    weights: Array  # (p, c) mm^3, 0 for a point that fills up a tile
+    mu: Array  # (p, c) kPa
+    lam: Array  # (p, c) kPa
     node_from: Ints  # (p + 1,)
-    modes: Field  # (s, 3, r) wide modes at the nodes that a footprint can load
+    modes: Field  # (s, 3 r) wide modes, axis by axis, at the nodes that a footprint can load
     face_from: Ints  # (p + 1,)
     face_points: Array  # (g, 3)
     face_normals: Array  # (g, 3)
     face_areas: Array  # (g,)
     face_nodes: NDArray[np.int32]  # (g, k), counted from the patch's first node
     face_shape: Array  # (g, k)
-    guess: Field  # (p, features, LEADING + PATH)
+    path: Field  # (p, PATH_FEATURES, r) second and third derivative along the load path
+    guess: Field  # (p, FEATURES, NARROW), the last column zero
     blend: float  # mm, excess distance over the nearest centre at which a patch fades out
 
 
-GUESS_POSITION = 6
-GUESS_LOAD = 31
-GUESS_FEATURES = GUESS_POSITION * GUESS_LOAD
+POSITION_FEATURES = 6
+SECOND_FEATURES = 6 * POSITION_FEATURES
+PATH_FEATURES = SECOND_FEATURES + 10 * POSITION_FEATURES
+FEATURES = PATH_FEATURES + 15 * POSITION_FEATURES
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def guess_features(frame, centre, x, load, out):
-    """Features of the first guess beyond the linear response.
+def load_features(frame, centre, x, load, out):
+    """Polynomials in a load and its place on a patch, (FEATURES,).
 
-    Monomials of degree 0-2 in the position along the surface (mm from the centre) times monomials
-    of degree 2-4 in the load (pressure times direction over the patch's pressure), both in its
-    frame.
+    Monomials of degree 2, 3, 4 in the load (pressure times direction over the patch's pressure)
+    times monomials of degree 0-2 in the position along the surface (mm from the centre), both in
+    the patch's frame.
     """
     s = t = 0.0
     for i in range(3):
@@ -268,7 +424,7 @@ def guess_features(frame, centre, x, load, out):
                 out[k + 3] = monomial * s * s
                 out[k + 4] = monomial * s * t
                 out[k + 5] = monomial * t * t
-                k += 6
+                k += POSITION_FEATURES
 
 
 class Memory(NamedTuple):
@@ -284,25 +440,29 @@ class Memory(NamedTuple):
 class Scratch(NamedTuple):
     """Working memory of one query."""
 
-    F: Array  # (9 most points,)
-    P: Array
-    H: Array  # (3, 9 most points) gradients of the path derivatives
-    AG: Array  # (9, m)
-    G: Array  # (9 most points, m) gradients of the narrow modes
+    gradients: Field  # (m, 9 c) of the narrow modes, in tiles
+    increments: Field  # (m, 9 c)
+    H: Field  # (9 c,)
+    P: Field  # (9 c,)
+    J: Array  # (c,)
+    trace: Array  # (c,)
+    linear: Array  # (c,)
+    state: Field  # (13 c,)
     vectors: Array  # (m - LEADING, r) narrow modes beyond the leading ones
-    single: Field  # (9 most points,)
+    stepped: Field  # (m - LEADING, r) times the steps of the wide gradients
     tangent: Array  # (m, m)
-    point: Array  # (10, 9)
     newton: Array  # (4, m)
     q: Array  # (m,)
+    guess: Field  # (m,)
     load: Array  # (m,)
-    overlap: Array  # (m,)
+    scaled_load: Array  # (3,)
+    unit_loads: Field  # (3 r,) of a unit pressure along each axis
     wide_load: Array  # (r,)
-    derivative: Array  # (r,)
-    wide_single: Field  # (r,)
-    features: Array
+    residual: Array  # (r,)
+    features: Array  # (FEATURES,)
     nodal: Array  # (most nodes of a patch,)
     distance: Array  # (p,)
+    surface: Array  # (triangles + 6,)
 
 
 class Outcome(NamedTuple):
@@ -310,11 +470,24 @@ class Outcome(NamedTuple):
 
     weight: Array  # (MAX_ACTIVE,), 0 for a slot not used
     scalars: Array  # (SCALARS,)
-    displacement: Array  # (3,) mean displacement under the footprint, weighted by pressure
+    displacement: Array  # (3,) mm, mean under the footprint, weighted by pressure
+    point: Array  # (3,) mm, contact point
+    normal: Array  # (3,) outward
+    direction: Array  # (3,) unit direction of the load
+    range: Array  # (7,) load range at the contact point
 
 
-STATUS, ITERATIONS, SMALLEST_J, AREA, MISSED = range(5)
-SCALARS = 5
+class Solver(NamedTuple):
+    """All that a query reads and writes."""
+
+    patches: Patches
+    memory: Memory
+    scratch: Scratch
+    outcome: Outcome
+
+
+STATUS, ITERATIONS, SMALLEST_J, AREA, MISSED, DISTANCE, COSINE, LIMIT = range(8)
+SCALARS = 8
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -324,15 +497,11 @@ def activate(patches, x, memory, distance, weight):
     A patch counts while its centre is less than ``blend`` farther than the nearest one; weights are
     cubic in that excess, so that they fade with zero slope.
     """
-    count = len(patches.centres)
-    nearest = np.inf
-    for k in range(count):
-        d = 0.0
-        for i in range(3):
-            d += (patches.centres[k, i] - x[i]) ** 2
-        distance[k] = d
-        nearest = min(nearest, d)
-    nearest = math.sqrt(nearest)
+    centres = patches.centres
+    for k in range(len(distance)):
+        a, b, c = centres[0, k] - x[0], centres[1, k] - x[1], centres[2, k] - x[2]
+        distance[k] = a * a + b * b + c * c
+    nearest = math.sqrt(distance.min())
     reach = (nearest + patches.blend) ** 2
     weight[:] = 0.0
     for slot in range(MAX_ACTIVE):
@@ -342,7 +511,7 @@ def activate(patches, x, memory, distance, weight):
                 weight[slot] = _fade((math.sqrt(distance[k]) - nearest) / patches.blend)
             else:
                 memory.patch[slot] = -1
-    for k in range(count):
+    for k in range(len(distance)):
         if distance[k] < reach:
             free, known = -1, False
             for slot in range(MAX_ACTIVE):
@@ -375,129 +544,90 @@ def _wide_load(patches, k, x, normal, direction, pressure, radius, scratch):
         patches.face_shape[a:b],
     )
     area = footprint(surface, x, normal, radius, nodal)
-    load = scratch.wide_load
-    load[:] = 0.0
+    unit = scratch.unit_loads
+    unit[:] = np.float32(0.0)
     for node in range(last - first):
-        force = pressure * nodal[node]
-        if force != 0.0:
-            fx, fy, fz = force * direction[0], force * direction[1], force * direction[2]
-            rows = patches.modes[first + node]
-            for j in range(len(load)):
-                load[j] += fx * rows[0, j] + fy * rows[1, j] + fz * rows[2, j]
+        if nodal[node] != 0.0:
+            weight, row = np.float32(nodal[node]), patches.modes[first + node]
+            for j in range(len(unit)):
+                unit[j] += weight * row[j]
+    load = scratch.wide_load
+    r = len(load)
+    for j in range(r):
+        load[j] = pressure * (
+            direction[0] * unit[j] + direction[1] * unit[r + j] + direction[2] * unit[2 * r + j]
+        )
     return area
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _gradient(G, vector, scratch, out):
-    """``out = G vector`` through single precision: (9 c, r) times (r,)."""
-    scratch.wide_single[:] = vector
-    single = scratch.single[: len(out)]
-    np.dot(G, scratch.wide_single, single)
-    out[:] = single
+def _append(number, steps, scratch):
+    """Orthonormalise ``scratch.vectors[number]`` against the narrow space: mode LEADING + number.
 
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _force(G, P, scratch, out):
-    """``out = G^T P``: (9 c, r) transposed times (9 c,)."""
-    single = scratch.single[: len(P)]
-    single[:] = P
-    np.dot(G.T, single, scratch.wide_single)
-    out[:] = scratch.wide_single
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _append(number, vector, gradient, G, vectors, scratch):
-    """Orthonormalise ``vector`` against the narrow space and add it as mode ``LEADING + number``.
-
-    ``gradient`` (9 c,) is its gradient.  What lies in the space already leaves a mode not in use.
-    Returns the norm of what does not.
+    What lies in the space already leaves a mode not in use, of zeros.  Returns the norm of what
+    does not.
     """
-    rows = len(gradient)
-    column = LEADING + number
-    overlap = scratch.overlap
-    overlap[:] = 0.0
-    overlap[:LEADING] = vector[:LEADING]
+    vectors, stepped = scratch.vectors, scratch.stepped
     target = vectors[number]
-    target[:] = vector
+    whole = math.sqrt(np.dot(target, target))
     target[:LEADING] = 0.0
-    whole = math.sqrt(np.dot(vector, vector))
     for _ in range(2):
         for j in range(number):
             product = np.dot(vectors[j], target)
-            overlap[LEADING + j] += product
             for i in range(len(target)):
                 target[i] -= product * vectors[j, i]
     norm = math.sqrt(np.dot(target, target))
-    if norm > 1e-6 * whole:
-        target /= norm
-        along = scratch.F[:rows]
-        np.dot(G, overlap, along)
-        for i in range(rows):
-            G[i, column] = (gradient[i] - along[i]) / norm
-    else:
-        target[:] = 0.0
-        G[:, column] = 0.0
-    scratch.load[column] = np.dot(target, scratch.wide_load)
+    scale = 1.0 / norm if norm > 1e-6 * whole else 0.0
+    for i in range(len(target)):
+        target[i] *= scale
+        stepped[number, i] = target[i] * steps[i]
+    scratch.load[LEADING + number] = np.dot(target, scratch.wide_load)
     return norm
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def path_stress(order, H, mu, lam, weights, P):
-    """Second or third derivative of the stress along the load path, times the points' weights.
-
-    H (>= 2, 9 c) holds the gradients of ``u_1`` and ``u_2``; P (9 c,) is overwritten.
-    """
-    for c in range(len(weights)):
-        i, j = 9 * c, 9 * c + 9
-        if order == 2:
-            tissue.second_derivative(H[0, i:j], mu[c], lam[c], P[i:j])
-        else:
-            tissue.third_derivative(H[0, i:j], H[1, i:j], mu[c], lam[c], P[i:j])
-        for n in range(i, j):
-            P[n] *= weights[c]
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _narrow_space(patches, k, G, vectors, scratch):
+def _narrow_space(patches, k, x, direction, pressure, scratch):
     """Set up the narrow space of patch k for ``scratch.wide_load``."""
-    a, b = patches.point_from[k], patches.point_from[k + 1]
-    rows = 9 * (b - a)
-    wide = patches.gradients[9 * a : 9 * b]
-    for i in range(rows):
-        for j in range(LEADING):
-            G[i, j] = wide[i, j]
-        for j in range(LEADING, G.shape[1]):
-            G[i, j] = 0.0
-    vectors[:] = 0.0
+    load = scratch.scaled_load
+    for i in range(3):
+        load[i] = direction[i] * pressure / patches.pressures[k]
+    load_features(patches.frames[k], patches.centres[:, k], x, load, scratch.features)
     scratch.load[:] = 0.0
     scratch.load[:LEADING] = scratch.wide_load[:LEADING]
-    P = scratch.P[:rows]
-    mu, lam, weights = patches.mu[a:b], patches.lam[a:b], patches.weights[a:b]
-    H = scratch.H[:, :rows]
-    _gradient(wide, scratch.wide_load, scratch, H[0])
-    _append(0, scratch.wide_load, H[0], G, vectors, scratch)
-    for order in range(2, PATH + 1):
-        path_stress(order, H, mu, lam, weights, P)
-        _force(wide, P, scratch, scratch.derivative)
-        np.negative(scratch.derivative, scratch.derivative)
-        _gradient(wide, scratch.derivative, scratch, H[order - 1])
-        _append(order - 1, scratch.derivative, H[order - 1], G, vectors, scratch)
+    first, second, third = scratch.vectors[0], scratch.vectors[1], scratch.vectors[2]
+    first[:] = scratch.wide_load
+    second[:] = 0.0
+    third[:] = 0.0
+    scratch.vectors[PATH] = 0.0
+    path = patches.path[k]
+    for f in range(SECOND_FEATURES):
+        feature = np.float32(scratch.features[f])
+        for i in range(len(second)):
+            second[i] += feature * path[f, i]
+    for f in range(SECOND_FEATURES, PATH_FEATURES):
+        feature = np.float32(scratch.features[f])
+        for i in range(len(third)):
+            third[i] += feature * path[f, i]
+    steps = patches.steps[k]
+    for number in range(PATH):
+        _append(number, steps, scratch)
+    _narrow_gradients(patches.gradients[k], steps, scratch.stepped, scratch.gradients)
+    scratch.gradients[NARROW - 1] = 0.0
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _first_guess(patches, k, x, direction, pressure, scratch):
+def _first_guess(table, scratch):
     """First guess in the narrow space, into ``scratch.q``: linear response and fitted remainder."""
     q = scratch.q
     q[:] = scratch.load
-    load = scratch.overlap[:3]
-    for i in range(3):
-        load[i] = direction[i] * pressure / patches.pressures[k]
-    guess_features(patches.frames[k], patches.centres[k], x, load, scratch.features)
-    table = patches.guess[k]
-    for f in range(GUESS_FEATURES):
-        value = scratch.features[f]
-        for j in range(table.shape[1]):
-            q[j] += value * table[f, j]
+    guess = scratch.guess
+    guess[:] = np.float32(0.0)
+    for f in range(FEATURES):
+        feature, row = np.float32(scratch.features[f]), table[f]
+        for j in range(NARROW):
+            guess[j] += feature * row[j]
+    for j in range(NARROW):
+        q[j] += guess[j]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -512,59 +642,66 @@ def _to_wide(q, vectors, wide):
 @njit(cache=True, error_model="numpy", nogil=True)
 def _solve_patch(patches, k, slot, warm, x, direction, pressure, memory, scratch, scalars):
     """Equilibrium of patch k under ``scratch.wide_load``; its answer goes to memory's slot."""
-    a, b = patches.point_from[k], patches.point_from[k + 1]
-    rows = 9 * (b - a)
-    wide_gradients = patches.gradients[9 * a : 9 * b]
-    G, vectors = scratch.G[:rows], scratch.vectors
-    _narrow_space(patches, k, G, vectors, scratch)
-    _first_guess(patches, k, x, direction, pressure, scratch)
-    q = scratch.q
+    _narrow_space(patches, k, x, direction, pressure, scratch)
+    _first_guess(patches.guess[k], scratch)
+    q, vectors, work = scratch.q, scratch.vectors, scratch.newton
     if warm:
         # the last answer differs from its guess much as this one will from its own
-        departure = scratch.derivative
+        departure = scratch.residual
         np.subtract(memory.wide[slot], memory.guess[slot], departure)
         _to_wide(q, vectors, memory.guess[slot])
         q[:LEADING] += departure[:LEADING]
-        for j in range(len(vectors)):
+        for j in range(PATH):
             q[LEADING + j] += np.dot(vectors[j], departure)
     else:
         _to_wide(q, vectors, memory.guess[slot])
     system = LocalSystem(
-        G,
-        patches.weights[a:b],
-        patches.mu[a:b],
-        patches.lam[a:b],
+        scratch.gradients,
+        patches.weights[k],
+        patches.mu[k],
+        patches.lam[k],
         scratch.load,
-        scratch.F[:rows],
-        scratch.P[:rows],
-        scratch.AG,
+        scratch.H,
+        scratch.P,
+        scratch.J,
+        scratch.trace,
+        scratch.linear,
+        scratch.state,
+        scratch.increments,
         scratch.tangent,
         memory.factor[slot],
-        scratch.point,
     )
     size = math.sqrt(np.dot(scratch.wide_load, scratch.wide_load))
     loose, target = max(LOOSE * size, 1e-12), max(TOLERANCE * size, 1e-12)
     factorised = warm and memory.factorised[slot] == 1
-    status, iterations, _, smallest = newton(
-        system, q, scratch.newton, loose, REUSE, MAX_ITERATIONS, factorised
+    energy, smallest = equilibrium.potential(system, q, work[0])
+    status, iterations, energy, smallest = descend(
+        system, q, work, energy, smallest, loose, REUSE, MAX_ITERATIONS, factorised, ROUND_OFF
     )
     if status != equilibrium.CONVERGED:
         # once more from rest: a guess can lie beyond a fold of the load path
         q[:] = 0.0
-        status, more, _, smallest = newton(
-            system, q, scratch.newton, loose, REUSE, MAX_ITERATIONS, False
+        energy, smallest = equilibrium.potential(system, q, work[0])
+        status, more, energy, smallest = descend(
+            system, q, work, energy, smallest, loose, REUSE, MAX_ITERATIONS, False, ROUND_OFF
         )
         iterations += more
     if status == equilibrium.CONVERGED:
-        # the residual of the wide space; system.P holds the weighted stress of the state
-        _force(wide_gradients, system.P, scratch, scratch.derivative)
-        np.subtract(scratch.derivative, scratch.wide_load, scratch.derivative)
-        H = scratch.H[2, :rows]
-        _gradient(wide_gradients, scratch.derivative, scratch, H)
-        missed = _append(PATH, scratch.derivative, H, G, vectors, scratch)
+        # the residual of the wide space; system.P is of the last state tried, q
+        gradients, steps, residual = patches.gradients[k], patches.steps[k], scratch.residual
+        _project(gradients, system.P, residual)
+        wide = memory.wide[slot]
+        _to_wide(q, vectors, wide)
+        for i in range(len(residual)):
+            residual[i] = residual[i] * steps[i] + wide[i] - scratch.wide_load[i]
+        vectors[PATH] = residual
+        missed = _append(PATH, steps, scratch)
+        _superpose(gradients, scratch.stepped[PATH], scratch.gradients[NARROW - 1])
+        work[0, NARROW - 1] = np.dot(vectors[PATH], residual)
         scalars[MISSED] = max(scalars[MISSED], missed / max(size, 1e-12))
-        status, more, _, smallest = newton(
-            system, q, scratch.newton, target, REUSE, MAX_ITERATIONS, factorised or iterations > 0
+        factorised = factorised or iterations > 0
+        status, more, energy, smallest = descend(
+            system, q, work, energy, smallest, target, REUSE, MAX_ITERATIONS, factorised, ROUND_OFF
         )
         iterations += more
     _to_wide(q, vectors, memory.wide[slot])
@@ -576,22 +713,8 @@ def _solve_patch(patches, k, slot, warm, x, direction, pressure, memory, scratch
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def answer(patches, x, normal, direction, pressure, radius, memory, scratch, outcome):
-    """Equilibrium of every active patch under a pressed footprint.
-
-    Parameters
-    ----------
-    patches : Patches
-    x, normal, direction : ndarray, shape (3,)
-        Contact point (mm), outward normal and unit direction of the load.
-    pressure, radius : float
-        kPa and mm.
-    memory : Memory
-        Starting point on entry; on return the answers of the slots that have weight.
-    scratch : Scratch
-    outcome : Outcome
-        Overwritten; the scalars are the worst of the active patches.
-    """
+def _answer(solver, x, normal, direction, pressure, radius):
+    patches, memory, scratch, outcome = solver
     activate(patches, x, memory, scratch.distance, outcome.weight)
     scalars = outcome.scalars
     scalars[:] = 0.0
@@ -610,17 +733,62 @@ def answer(patches, x, normal, direction, pressure, radius, memory, scratch, out
         scalars[AREA] = area
         _solve_patch(patches, k, slot, warm, x, direction, pressure, memory, scratch, scalars)
         if area > 0.0:
-            first = patches.node_from[k]
-            wide = memory.wide[slot]
-            for node in range(patches.node_from[k + 1] - first):
-                nodal = share * scratch.nodal[node] / area
-                if nodal != 0.0:
-                    for i in range(3):
-                        moved = 0.0
-                        row = patches.modes[first + node, i]
-                        for j in range(len(wide)):
-                            moved += row[j] * wide[j]
-                        outcome.displacement[i] += nodal * moved
+            wide, unit = memory.wide[slot], scratch.unit_loads
+            for i in range(3):
+                moved = 0.0
+                for j in range(len(wide)):
+                    moved += unit[len(wide) * i + j] * wide[j]
+                outcome.displacement[i] += share / area * moved
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def press(bound, x, normal, direction, pressure, radius):
+    """Equilibrium of every active patch under a pressed footprint.
+
+    Parameters
+    ----------
+    bound : Bound of Solver
+        Its memory is the starting point on entry; on return the answers of the slots that have
+        weight.  The outcome is overwritten; its scalars are the worst of the active patches.
+    x, normal, direction : ndarray, shape (3,)
+        Contact point (mm), outward normal and unit direction of the load.
+    pressure, radius : float
+        kPa and mm.
+    """
+    _answer(bound.content, x, normal, direction, pressure, radius)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def query(ground, bound, position, direction, pressure, radius, reach):
+    """Find the contact point nearest to ``position``, the load's range, and press there.
+
+    Parameters
+    ----------
+    ground : Bound of shared.surface.Ground
+        Values at its vertices: the load range.
+    bound : Bound of Solver
+    position : ndarray, shape (3,), mm
+    direction : ndarray, shape (3,)
+        Of any length; zero stands for the inward normal.
+    pressure, radius : float
+        kPa and mm.
+    reach : float, mm
+        A position farther from the surface, or a direction out of the tissue, is not solved: the
+        distance and the cosine in the outcome tell.
+    """
+    solver = bound.content
+    outcome = solver.outcome
+    x, normal, towards, scalars = outcome.point, outcome.normal, outcome.direction, outcome.scalars
+    distance = locate(ground.content, position, solver.scratch.surface, x, normal, outcome.range)
+    length = math.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
+    cosine = 0.0
+    for i in range(3):
+        towards[i] = direction[i] / length if length > 0.0 else -normal[i]
+        cosine -= towards[i] * normal[i]
+    if distance <= reach and cosine > 0.0:
+        _answer(solver, x, normal, towards, pressure, radius)
+    scalars[DISTANCE], scalars[COSINE] = distance, cosine
+    scalars[LIMIT] = pressure_limit(outcome.range, normal, towards)
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc"})

@@ -168,10 +168,10 @@ class Training(_Part):
     ritz_spacing: Positive = Field(description="of points whose Ritz vectors are taken, mm")
     patch_spacing: Positive = Field(description="of the centres of local models, mm")
     region_spacing: Positive = Field(description="of the regions that share a basis, mm")
-    modes: int = Field(ge=20, le=400, description="of a local model's wide space")
+    modes: int = Field(ge=20, le=400, multiple_of=4, description="of a local model's wide space")
     region_modes: int = Field(ge=4, le=2000, description="of a region")
     blend: Positive = Field(description="width over which neighbouring local models blend, mm")
-    cubature_points: int = Field(ge=8, le=5000, description="of a local model")
+    cubature_points: int = Field(ge=16, le=5000, multiple_of=16, description="of a local model")
     samples: int = Field(ge=20, description="full solutions that calibrate the error estimate")
 
 

@@ -26,38 +26,41 @@ class StressRecovery(NamedTuple):
     midsides: NDArray[np.int32]  # (k, 3) midside node and the corners either side of it
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc", "nsz"})
 def nodal_von_mises(mesh, u, out):
     """Write the von Mises stress (nodes,) kPa of the displacement ``u`` (nodes, 3) mm to ``out``.
 
     Never negative: extrapolation may undershoot near steep gradients, which is cut at zero.
     """
-    n = mesh.connectivity.shape[1]
-    F = np.empty((9, 8))
-    f, Finv, P, at_points = np.empty(9), np.empty(9), np.empty(9), np.empty(8)
+    connectivity = mesh.connectivity
+    nodes = connectivity.shape[1]
+    flat = mesh.gradients.reshape(len(connectivity), nodes * 24)
+    F, at_points = np.empty(72), np.empty(8)
+    extrapolation = mesh.extrapolation
     out[:] = 0.0
-    for e in range(len(mesh.connectivity)):
+    for e in range(len(connectivity)):
         F[:] = 0.0
-        for a in range(n):
-            node = mesh.connectivity[e, a]
-            for i in range(3):
-                ui = u[node, i]
-                for j in range(3):
-                    for q in range(8):
-                        F[3 * i + j, q] += ui * mesh.gradients[e, a, j, q]
+        for a in range(nodes):
+            node = connectivity[e, a]
+            x, y, z = u[node, 0], u[node, 1], u[node, 2]
+            gradients = flat[e, 24 * a : 24 * a + 24]
+            for k in range(24):
+                F[k] += x * gradients[k]
+                F[24 + k] += y * gradients[k]
+                F[48 + k] += z * gradients[k]
+        mu, lam = mesh.mu[e], mesh.lam[e]
         for q in range(8):
-            for i in range(9):
-                f[i] = F[i, q]
-            f[0] += 1.0
-            f[4] += 1.0
-            f[8] += 1.0
-            _, J = tissue.stress(f, mesh.mu[e], mesh.lam[e], Finv, P)
-            at_points[q] = tissue.von_mises(f, P, J)
+            at_points[q] = tissue.von_mises(
+                1.0 + F[q], F[8 + q], F[16 + q],
+                F[24 + q], 1.0 + F[32 + q], F[40 + q],
+                F[48 + q], F[56 + q], 1.0 + F[64 + q],
+                mu, lam,
+            )  # fmt: skip
         for corner in range(8):
             value = 0.0
             for q in range(8):
-                value += mesh.extrapolation[corner, q] * at_points[q]
-            out[mesh.connectivity[e, corner]] += max(value, 0.0)
+                value += extrapolation[corner, q] * at_points[q]
+            out[connectivity[e, corner]] += max(value, 0.0)
     for node in range(len(mesh.elements_at)):
         if mesh.elements_at[node] > 0.0:
             out[node] /= mesh.elements_at[node]

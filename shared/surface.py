@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -43,44 +44,75 @@ def _closest_on_triangle(p, a, b, c, weights):
     weights[0], weights[1], weights[2] = 1.0 - v - w, v, w
 
 
+class Ground(NamedTuple):
+    """A surface as compiled code sees it, with fields given at its vertices."""
+
+    vertices: Array  # (v, 3) mm
+    triangles: NDArray[np.int32]  # (t, 3)
+    normals: Array  # (v, 3)
+    centres: Array  # (3, t) mm
+    radii: Array  # (t,) mm, of balls that hold the triangles
+    values: Array  # (v, k)
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
-def _project(vertices, triangles, centres, radii, p, weights, trial):
-    """Nearest triangle and barycentric ``weights`` there; returns (triangle, distance)."""
-    best, nearest = np.inf, -1
-    for t in range(len(triangles)):
-        dx, dy, dz = p[0] - centres[t, 0], p[1] - centres[t, 1], p[2] - centres[t, 2]
+def _project(ground, p, squared, weights, trial):
+    """Nearest triangle and barycentric ``weights`` there; returns (triangle, distance).
+
+    ``squared`` (t,) is scratch: squared distances of the triangles' centres.
+    """
+    centres, radii = ground.centres, ground.radii
+    x, y, z = p[0], p[1], p[2]
+    for t in range(len(squared)):
+        dx, dy, dz = x - centres[0, t], y - centres[1, t], z - centres[2, t]
+        squared[t] = dx * dx + dy * dy + dz * dz
+    nearest = int(np.argmin(squared))
+    best = _distance(ground, p, nearest, weights)
+    for t in range(len(squared)):
         bound = best + radii[t]
-        if dx * dx + dy * dy + dz * dz >= bound * bound:
-            continue
-        a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
-        _closest_on_triangle(p, vertices[a], vertices[b], vertices[c], trial)
-        distance = 0.0
-        for i in range(3):
-            x = trial[0] * vertices[a, i] + trial[1] * vertices[b, i] + trial[2] * vertices[c, i]
-            distance += (p[i] - x) ** 2
-        distance = math.sqrt(distance)
-        if distance < best:
-            best, nearest = distance, t
-            weights[:] = trial
+        if squared[t] < bound * bound:
+            distance = _distance(ground, p, t, trial)
+            if distance < best:
+                best, nearest = distance, t
+                weights[:] = trial
     return nearest, best
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _locate(vertices, triangles, normals, centres, radii, values, p, x, normal, at):
-    """Write the projection of p, the normal and the values ``at`` it; return the distance."""
-    weights, trial = np.empty(3), np.empty(3)
-    t, distance = _project(vertices, triangles, centres, radii, p, weights, trial)
+def _distance(ground, p, t, weights):
+    """Distance of p from triangle t, and the barycentric coordinates of its nearest point."""
+    vertices = ground.vertices
+    a, b, c = ground.triangles[t, 0], ground.triangles[t, 1], ground.triangles[t, 2]
+    _closest_on_triangle(p, vertices[a], vertices[b], vertices[c], weights)
+    distance = 0.0
+    for i in range(3):
+        x = weights[0] * vertices[a, i] + weights[1] * vertices[b, i] + weights[2] * vertices[c, i]
+        distance += (p[i] - x) ** 2
+    return math.sqrt(distance)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def locate(ground, p, scratch, x, normal, at):
+    """Write the projection of p, the normal and the values ``at`` it; return the distance.
+
+    ``scratch`` (t + 6,) holds one value for each triangle and six more.
+    """
+    count = len(ground.radii)
+    weights, trial = scratch[count : count + 3], scratch[count + 3 :]
+    t, distance = _project(ground, p, scratch[:count], weights, trial)
     x[:] = 0.0
     normal[:] = 0.0
     at[:] = 0.0
     for corner in range(3):
-        v, w = triangles[t, corner], weights[corner]
+        v, w = ground.triangles[t, corner], weights[corner]
         for k in range(len(at)):
-            at[k] += w * values[v, k]
+            at[k] += w * ground.values[v, k]
         for i in range(3):
-            x[i] += w * vertices[v, i]
-            normal[i] += w * normals[v, i]
-    normal /= math.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
+            x[i] += w * ground.vertices[v, i]
+            normal[i] += w * ground.normals[v, i]
+    length = math.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
+    for i in range(3):
+        normal[i] /= length
     return distance
 
 
@@ -107,7 +139,7 @@ class Surface:
         corners = self.vertices[self.triangles]
         centres = corners.mean(axis=1)
         radii = np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
-        object.__setattr__(self, "_centres", centres)
+        object.__setattr__(self, "_centres", np.ascontiguousarray(centres.T))
         object.__setattr__(self, "_radii", radii)
 
     def project(self, position: Array) -> tuple[Array, Array, float]:
@@ -117,19 +149,15 @@ class Surface:
     def locate(self, position: Array, values: Array) -> tuple[Array, Array, float, Array]:
         """As ``project``, and the values (k,) there of fields given at the vertices, (v, k)."""
         x, normal, at = np.empty(3), np.empty(3), np.empty(values.shape[1])
-        distance = _locate(
-            self.vertices,
-            self.triangles,
-            self.normals,
-            self._centres,
-            self._radii,
-            values,
-            position,
-            x,
-            normal,
-            at,
-        )
+        scratch = np.empty(len(self.triangles) + 6)
+        distance = locate(self.ground(values), position, scratch, x, normal, at)
         return x, normal, distance, at
+
+    def ground(self, values: Array) -> Ground:
+        """For compiled code, with fields (v, k) given at the vertices."""
+        return Ground(
+            self.vertices, self.triangles, self.normals, self._centres, self._radii, values
+        )
 
     def rim(self) -> NDArray[np.int64]:
         """Vertices on the border of the surface: ends of edges that belong to one triangle."""

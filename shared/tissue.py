@@ -1,9 +1,9 @@
 """Constitutive laws of soft tissue at a material point, compiled.
 
-A law is three functions side by side: the stored energy with the first Piola-Kirchhoff stress,
-and the tangent.  A 3x3 tensor is a flat array of nine numbers in row-major order,
-``F[3 * i + J] = dx_i / dX_J``; the tangent is 9x9 in the same order.  The full and the reduced
-model call these very functions.
+A law gives the stored energy with the first Piola-Kirchhoff stress, and the tangent: as functions
+of arrays for the full model, point by point, and of scalars for the reduced one, many points at a
+time.  A 3x3 tensor is a flat array of nine numbers in row-major order,
+``F[3 * i + J] = dx_i / dX_J``; the tangent is 9x9 in the same order.
 
 FEAP's compressible Neo-Hookean law (Taylor, FEAP Theory Manual, finite elasticity)::
 
@@ -48,8 +48,46 @@ def inverse_and_jacobian(F, Finv):
     return J
 
 
+@njit(cache=True, error_model="numpy", forceinline=True)
+def first_piola(f0, f1, f2, f3, f4, f5, f6, f7, f8, mu, lam):
+    """The law in scalars, for loops over many points to become vector code.
+
+    Parameters
+    ----------
+    f0 ... f8 : float, dimensionless
+        Deformation gradient.
+    mu, lam : float, kPa
+
+    Returns
+    -------
+    J, trace : float
+        det F and tr(F^T F), of which ``energy`` is made.
+    p0 ... p8 : float, kPa
+        First Piola-Kirchhoff stress; without meaning where J <= 0.
+    """
+    c0, c1, c2 = f4 * f8 - f5 * f7, f5 * f6 - f3 * f8, f3 * f7 - f4 * f6
+    c3, c4, c5 = f2 * f7 - f1 * f8, f0 * f8 - f2 * f6, f1 * f6 - f0 * f7
+    c6, c7, c8 = f1 * f5 - f2 * f4, f2 * f3 - f0 * f5, f0 * f4 - f1 * f3
+    J = f0 * c0 + f1 * c1 + f2 * c2  # c = J F^-T
+    s = (0.5 * lam * (J * J - 1.0) - mu) / J
+    trace = f0 * f0 + f1 * f1 + f2 * f2 + f3 * f3 + f4 * f4 + f5 * f5 + f6 * f6 + f7 * f7 + f8 * f8
+    return (
+        J, trace,
+        mu * f0 + s * c0, mu * f1 + s * c1, mu * f2 + s * c2,
+        mu * f3 + s * c3, mu * f4 + s * c4, mu * f5 + s * c5,
+        mu * f6 + s * c6, mu * f7 + s * c7, mu * f8 + s * c8,
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def energy(J, trace, mu, lam):
+    """Energy density (kPa = mN mm / mm^3) at ``J > 0`` and ``tr(F^T F)``."""
+    log_J = math.log(J)
+    return 0.5 * mu * (trace - 3.0 - 2.0 * log_J) + 0.25 * lam * (J * J - 1.0 - 2.0 * log_J)
+
+
 @njit(cache=True, error_model="numpy")
-def stress(F, mu, lam, Finv, P):
+def stress(F, mu, lam, P):
     """First Piola-Kirchhoff stress and stored energy of the Neo-Hookean law.
 
     Parameters
@@ -58,26 +96,20 @@ def stress(F, mu, lam, Finv, P):
         Deformation gradient, row-major.
     mu, lam : float, kPa
         Lamé parameters.
-    Finv, P : ndarray, shape (9,), out
-        Inverse deformation gradient and stress P (kPa).  Untouched meaning when J <= 0.
+    P : ndarray, shape (9,), out, kPa
+        Without meaning when J <= 0.
 
     Returns
     -------
     W, J : float
-        Energy density (kPa = mN mm / mm^3; ``INVERTED`` if J <= 0) and det F.
+        Energy density (kPa; ``INVERTED`` if J <= 0) and det F.
     """
-    J = inverse_and_jacobian(F, Finv)
+    J, trace, P[0], P[1], P[2], P[3], P[4], P[5], P[6], P[7], P[8] = first_piola(
+        F[0], F[1], F[2], F[3], F[4], F[5], F[6], F[7], F[8], mu, lam
+    )
     if not J > 0.0:
         return INVERTED, J
-    log_J = math.log(J)
-    volumetric = 0.5 * lam * (J * J - 1.0) - mu
-    trace = -3.0
-    for i in range(3):
-        for j in range(3):
-            P[3 * i + j] = mu * F[3 * i + j] + volumetric * Finv[3 * j + i]
-            trace += F[3 * i + j] * F[3 * i + j]
-    W = 0.5 * mu * (trace - 2.0 * log_J) + 0.25 * lam * (J * J - 1.0 - 2.0 * log_J)
-    return W, J
+    return energy(J, trace, mu, lam), J
 
 
 @njit(cache=True, error_model="numpy")
@@ -113,69 +145,95 @@ def tangent(F, mu, lam, Finv, A):
     return J
 
 
-@njit(cache=True, error_model="numpy")
-def von_mises(F, P, J):
-    """Von Mises equivalent of the Cauchy stress ``sigma = P F^T / J`` (kPa)."""
-    s00 = (P[0] * F[0] + P[1] * F[1] + P[2] * F[2]) / J
-    s11 = (P[3] * F[3] + P[4] * F[4] + P[5] * F[5]) / J
-    s22 = (P[6] * F[6] + P[7] * F[7] + P[8] * F[8]) / J
-    s01 = (P[0] * F[3] + P[1] * F[4] + P[2] * F[5]) / J
-    s02 = (P[0] * F[6] + P[1] * F[7] + P[2] * F[8]) / J
-    s12 = (P[3] * F[6] + P[4] * F[7] + P[5] * F[8]) / J
-    normal = (s00 - s11) ** 2 + (s11 - s22) ** 2 + (s22 - s00) ** 2
-    return math.sqrt(0.5 * normal + 3.0 * (s01 * s01 + s02 * s02 + s12 * s12))
+@njit(cache=True, error_model="numpy", forceinline=True)
+def rest_stress(h0, h1, h2, h3, h4, h5, h6, h7, h8, mu, lam):
+    """Linear elasticity at rest: energy (kPa) and stress ``A(I) : H`` (nine floats, kPa)."""
+    trace = h0 + h4 + h8
+    s1, s2, s5 = h1 + h3, h2 + h6, h5 + h7
+    pressure = lam * trace
+    W = (h0 * h0 + h4 * h4 + h8 * h8) * mu + (
+        pressure * trace + mu * (s1 * s1 + s2 * s2 + s5 * s5)
+    ) / 2
+    two = mu + mu
+    return (
+        W,
+        two * h0 + pressure, mu * s1, mu * s2,
+        mu * s1, two * h4 + pressure, mu * s5,
+        mu * s2, mu * s5, two * h8 + pressure,
+    )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
-def second_derivative(H, mu, lam, P2):
-    """Second derivative of P at rest along ``F = I + s H``: ``P2 = D^2 P(I)[H, H]`` (kPa).
+@njit(cache=True, error_model="numpy", forceinline=True)
+def linearise(f0, f1, f2, f3, f4, f5, f6, f7, f8, mu, lam):
+    """What ``increment`` needs of a state: ``F^-T`` (t0 ... t8) and the moduli of its two terms.
 
-    H, P2 flat, shape (9,).  From the series of F^-1 and J^2 in s.
+    Returns
+    -------
+    t0 ... t8 : float, dimensionless
+    geometric, bulk : float, kPa
     """
-    a = H[0] + H[4] + H[8]
-    trace = 0.0  # tr H^2
-    for i in range(3):
-        for j in range(3):
-            trace += H[3 * i + j] * H[3 * j + i]
-    square = 2.0 * a * a - trace  # second coefficient of J^2
-    for i in range(3):
-        for j in range(3):
-            hh = 0.0  # (H H)_ji
-            for k in range(3):
-                hh += H[3 * j + k] * H[3 * k + i]
-            P2[3 * i + j] = -2.0 * mu * hh - 2.0 * lam * a * H[3 * j + i]
-        P2[4 * i] += lam * square
+    c0, c1, c2 = f4 * f8 - f5 * f7, f5 * f6 - f3 * f8, f3 * f7 - f4 * f6
+    J = f0 * c0 + f1 * c1 + f2 * c2
+    i = 1.0 / J
+    return (
+        c0 * i, c1 * i, c2 * i,
+        (f2 * f7 - f1 * f8) * i, (f0 * f8 - f2 * f6) * i, (f1 * f6 - f0 * f7) * i,
+        (f1 * f5 - f2 * f4) * i, (f2 * f3 - f0 * f5) * i, (f0 * f4 - f1 * f3) * i,
+        mu - 0.5 * lam * (J * J - 1.0), lam * J * J,
+    )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
-def third_derivative(H, H2, mu, lam, P3):
-    """Third derivative (kPa) of P at rest along ``F = I + s H + s^2 H2 / 2``.
+@njit(cache=True, error_model="numpy", forceinline=True)
+def increment(
+    t0, t1, t2, t3, t4, t5, t6, t7, t8, geometric, bulk, mu, h0, h1, h2, h3, h4, h5, h6, h7, h8
+):
+    """Tangent times a gradient, ``A : H`` (kPa, nine floats), without the tangent.
 
-    ``P3 = D^3 P(I)[H, H, H] + 3 D^2 P(I)[H, H2]``, all flat, shape (9,).
+    ``A : H = mu H + geometric T H^T T + bulk (T : H) T`` with ``T = F^-T``, in the precision of the
+    arguments; see ``linearise``.
     """
-    a = H[0] + H[4] + H[8]
-    b = H2[0] + H2[4] + H2[8]
-    trace, cross, cube = 0.0, 0.0, 0.0  # tr H^2, tr(H H2), tr H^3
-    for i in range(3):
-        for j in range(3):
-            square = 0.0  # (H H)_ij
-            for k in range(3):
-                square += H[3 * i + k] * H[3 * k + j]
-            P3[3 * j + i] = square
-            trace += square if i == j else 0.0
-            cube += square * H[3 * j + i]
-            cross += H[3 * i + j] * H2[3 * j + i]
-    log2, log3 = 0.5 * (b - trace), cube / 3.0 - 0.5 * cross
-    b1 = 2.0 * a
-    b2 = 2.0 * log2 + 2.0 * a * a
-    b3 = 2.0 * log3 + 4.0 * a * log2 + 4.0 / 3.0 * a * a * a
-    s = (P3[0], P3[1], P3[2], P3[3], P3[4], P3[5], P3[6], P3[7], P3[8])  # (H H)^T
-    for i in range(3):
-        for j in range(3):
-            x2 = s[3 * i + j] - 0.5 * H2[3 * j + i]  # coefficients of F^-T
-            x3 = 0.0
-            for k in range(3):
-                x3 -= s[3 * k + j] * H[3 * k + i]
-                x3 += 0.5 * (H[3 * j + k] * H2[3 * k + i] + H2[3 * j + k] * H[3 * k + i])
-            P3[3 * i + j] = 6.0 * (0.5 * lam * (b1 * x2 - b2 * H[3 * j + i]) - mu * x3)
-        P3[4 * i] += 3.0 * lam * b3
+    # X = T H^T
+    x00, x01, x02 = (
+        t0 * h0 + t1 * h1 + t2 * h2,
+        t0 * h3 + t1 * h4 + t2 * h5,
+        t0 * h6 + t1 * h7 + t2 * h8,
+    )
+    x10, x11, x12 = (
+        t3 * h0 + t4 * h1 + t5 * h2,
+        t3 * h3 + t4 * h4 + t5 * h5,
+        t3 * h6 + t4 * h7 + t5 * h8,
+    )
+    x20, x21, x22 = (
+        t6 * h0 + t7 * h1 + t8 * h2,
+        t6 * h3 + t7 * h4 + t8 * h5,
+        t6 * h6 + t7 * h7 + t8 * h8,
+    )
+    b = bulk * (x00 + x11 + x22)
+    x00, x01, x02 = geometric * x00 + b, geometric * x01, geometric * x02
+    x10, x11, x12 = geometric * x10, geometric * x11 + b, geometric * x12
+    x20, x21, x22 = geometric * x20, geometric * x21, geometric * x22 + b
+    return (
+        mu * h0 + x00 * t0 + x01 * t3 + x02 * t6,
+        mu * h1 + x00 * t1 + x01 * t4 + x02 * t7,
+        mu * h2 + x00 * t2 + x01 * t5 + x02 * t8,
+        mu * h3 + x10 * t0 + x11 * t3 + x12 * t6,
+        mu * h4 + x10 * t1 + x11 * t4 + x12 * t7,
+        mu * h5 + x10 * t2 + x11 * t5 + x12 * t8,
+        mu * h6 + x20 * t0 + x21 * t3 + x22 * t6,
+        mu * h7 + x20 * t1 + x21 * t4 + x22 * t7,
+        mu * h8 + x20 * t2 + x21 * t5 + x22 * t8,
+    )
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def von_mises(f0, f1, f2, f3, f4, f5, f6, f7, f8, mu, lam):
+    """Von Mises equivalent (kPa) of the Cauchy stress ``P F^T / J``; see ``first_piola``."""
+    J, _, p0, p1, p2, p3, p4, p5, p6, p7, p8 = first_piola(
+        f0, f1, f2, f3, f4, f5, f6, f7, f8, mu, lam
+    )
+    s00, s11 = p0 * f0 + p1 * f1 + p2 * f2, p3 * f3 + p4 * f4 + p5 * f5
+    s22, s01 = p6 * f6 + p7 * f7 + p8 * f8, p0 * f3 + p1 * f4 + p2 * f5
+    s02, s12 = p0 * f6 + p1 * f7 + p2 * f8, p3 * f6 + p4 * f7 + p5 * f8
+    a, b, c = s00 - s11, s11 - s22, s22 - s00
+    normal = a * a + b * b + c * c
+    return math.sqrt(0.5 * normal + 3.0 * (s01 * s01 + s02 * s02 + s12 * s12)) / abs(J)

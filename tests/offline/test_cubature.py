@@ -10,7 +10,7 @@ POINTS, EQUATIONS = 300, 20
 
 @pytest.fixture
 def equations(rng):
-    """Return equations (r, q) and their sums: random ones and, as in training, the volume."""
+    """Return equations (r, q) and their sums: random ones and the volume."""
     A = np.vstack([rng.standard_normal((EQUATIONS - 1, POINTS)), np.ones(POINTS)])
     return A, A.sum(axis=1)
 

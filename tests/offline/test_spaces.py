@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from offline.scenes import find_scene
-from offline.spaces import RITZ_VECTORS, energy_pod, local_modes, ritz_vectors
+from offline.spaces import RITZ_VECTORS, Footprint, energy_pod, local_modes, ritz_vectors
 from offline.workshop import Workshop
 
 PRESSURE = 2.0
@@ -49,6 +49,20 @@ def test_ritz_vectors_are_the_derivatives_of_the_equilibrium(
         found[3] = vectors[:, 9 + third]
     for order, vector in found.items():
         assert np.linalg.norm(vector - exact[order]) <= 3e-3 * np.linalg.norm(exact[order]), order
+
+
+def test_ritz_vectors_give_the_derivatives_along_any_load(workshop, rng):
+    point = np.array([4.0, 5.5, 8.0])
+    nodal, normal = workshop.unit_load(point)
+    footprint = Footprint(point, normal, PRESSURE)
+    free = workshop.model.free
+    loads = (nodal[:, None, None] * footprint.loads.T).reshape(-1, 3)[free]
+    found = ritz_vectors(workshop.model, loads)
+    load = PRESSURE * (-normal + 0.3 * rng.standard_normal(3))
+    second, third = footprint.path_derivatives(found, load[None])
+    exact = series(workshop, nodal[:, None] * load)
+    assert np.linalg.norm(second[0] / 2 - exact[2]) <= 3e-3 * np.linalg.norm(exact[2])
+    assert np.linalg.norm(third[0] / 6 - exact[3]) <= 1e-2 * np.linalg.norm(exact[3])
 
 
 def test_modes_are_orthonormal_in_the_energy_and_span_the_vectors(workshop, vectors):

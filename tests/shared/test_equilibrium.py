@@ -33,7 +33,10 @@ class System:
 def solve(system, start, target=1e-12, reuse=0.0, max_iterations=50, factorised=False):
     u = np.array(start, dtype=float)
     work = np.empty((4, len(u)))
-    return u, *newton(system, u, work, target, reuse, max_iterations, factorised)
+    status, iterations, _, smallest = newton(
+        system, u, work, target, reuse, max_iterations, factorised
+    )
+    return u, status, iterations, float(np.linalg.norm(work[0])), smallest
 
 
 def stiffening(force):

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from numba import njit
 
-from offline.patches import LocalTrainer, _weighted_stress
 from offline.workshop import Load, Workshop
 from shared import equilibrium
 from shared.artifact import read_artifact
 from shared.atlas import Atlas, assemble_patches
-from shared.reduced import NARROW, LocalSystem, _narrow_space
+from shared.reduced import NARROW, STATE, LocalSystem
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +40,7 @@ def galerkin(atlas, workshop):
         point_from=np.array([0, len(weights)]),
         points=np.arange(len(weights), dtype=np.int32),
         weights=weights,
+        path=models.path[:1],
         guess=models.guess[:1],
     )
 
@@ -59,19 +59,23 @@ def modes(galerkin):
 
 def local_system(patches, count):
     """The leading modes of a patch as a system without a load."""
-    rows = len(patches.gradients)
+    gradients = patches.gradients[0, :count] * patches.steps[0, :count, None]
+    points = patches.weights.shape[1]
     return LocalSystem(
-        gradients=np.ascontiguousarray(patches.gradients[:, :count], dtype=float),
-        weights=patches.weights,
-        mu=patches.mu,
-        lam=patches.lam,
+        gradients=gradients,
+        weights=patches.weights[0],
+        mu=patches.mu[0],
+        lam=patches.lam[0],
         load=np.zeros(count),
-        F=np.zeros(rows),
-        P=np.zeros(rows),
-        AG=np.zeros((9, count)),
+        H=np.zeros(9 * points, np.float32),
+        P=np.zeros(9 * points, np.float32),
+        J=np.zeros(points),
+        trace=np.zeros(points),
+        linear=np.zeros(points),
+        state=np.zeros(STATE * points, np.float32),
+        increments=np.zeros_like(gradients),
         tangent=np.zeros((count, count)),
         factor=np.zeros((count, count)),
-        point=np.zeros((11, 9)),
     )
 
 
@@ -112,10 +116,10 @@ def test_with_every_point_it_is_the_full_model_in_its_modes(patches, modes, work
     energy, smallest = potential(system, state, residual)
     expected_energy, expected_smallest = workshop.model.internal(modes @ state, force)
     expected = modes.T @ force
-    # gradients of the modes are kept in single precision
-    assert energy == pytest.approx(expected_energy, rel=1e-5)
-    assert smallest == pytest.approx(expected_smallest, rel=1e-5)
-    assert np.linalg.norm(residual - expected) <= 1e-5 * np.linalg.norm(expected)
+    # modes are stored in half precision, their gradients in 16 bits
+    assert energy == pytest.approx(expected_energy, rel=1e-3)
+    assert smallest == pytest.approx(expected_smallest, rel=1e-3)
+    assert np.linalg.norm(residual - expected) <= 1e-3 * np.linalg.norm(expected)
 
 
 def test_its_modes_are_orthonormal_in_the_energy_at_rest(modes, workshop):
@@ -128,14 +132,14 @@ def test_its_modes_are_orthonormal_in_the_energy_at_rest(modes, workshop):
 def test_tangent_is_the_derivative_of_the_residual(patches, state):
     system, u = local_system(patches, NARROW), state[:NARROW]
     assert factorise(system, u, 0.0)
-    step = 1e-3
+    step = 2e-2  # gradients are summed in single precision
     columns = []
     for unit in step * np.eye(NARROW):
         near = residual_of(system, u + unit) - residual_of(system, u - unit)
         far = residual_of(system, u + 2 * unit) - residual_of(system, u - 2 * unit)
         columns.append((8 * near - far) / (12 * step))
-    K = system.tangent
-    assert np.abs(np.stack(columns, axis=1) - K).max() <= 1e-6 * np.abs(K).max()
+    K = np.tril(system.tangent)
+    assert np.abs(np.tril(np.stack(columns, axis=1)) - K).max() <= 2e-5 * np.abs(K).max()
 
 
 def test_residual_is_the_derivative_of_the_potential(patches, state):
@@ -145,12 +149,13 @@ def test_residual_is_the_derivative_of_the_potential(patches, state):
         return potential(system, u + shift, scratch)[0]
 
     slopes = []
-    for unit in 1e-3 * np.eye(NARROW):
+    step = 2e-2
+    for unit in step * np.eye(NARROW):
         near = energy(unit) - energy(-unit)
         far = energy(2 * unit) - energy(-2 * unit)
-        slopes.append((8 * near - far) / (12 * 1e-3))
+        slopes.append((8 * near - far) / (12 * step))
     expected = residual_of(system, u)
-    assert np.abs(slopes - expected).max() <= 1e-6 * np.abs(expected).max()
+    assert np.abs(slopes - expected).max() <= 1e-5 * np.abs(expected).max()
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.5])
@@ -159,29 +164,8 @@ def test_correction_solves_with_the_tangent(patches, state, rng, shift):
     residual = rng.standard_normal(NARROW)
     assert factorise(system, state[:NARROW], shift)
     correct(system, residual, step)
-    np.testing.assert_allclose(
-        (system.tangent + shift * np.eye(NARROW)) @ step, -residual, rtol=0, atol=1e-10
-    )
-
-
-def test_its_path_derivatives_follow_the_equilibrium_to_third_order(atlas, galerkin):
-    trainer = LocalTrainer(atlas.body, galerkin, atlas.scene.endoscope.radius)
-    x, normal, _, fields = atlas.surface.locate(galerkin.centres[0], atlas.limits)
-    tilted = -normal + [0.3, -0.2, 0.0]
-    assert trainer.solve(x, normal, tilted / np.linalg.norm(tilted), fields[0])
-    patches, scratch = trainer.patches, trainer.state.scratch
-    _narrow_space(patches, 0, scratch.G, scratch.vectors, scratch)
-    H, P = scratch.H, np.empty(len(patches.gradients))
-
-    def out_of_balance(s):
-        F = s * H[0] + s**2 / 2 * H[1] + s**3 / 6 * H[2]
-        F.reshape(-1, 9)[:, [0, 4, 8]] += 1.0
-        assert _weighted_stress(F, patches.mu, patches.lam, patches.weights, P)
-        return np.linalg.norm(patches.gradients.T @ P - s * scratch.wide_load)
-
-    assert out_of_balance(0.25) <= 1e-2 * 0.25 * np.linalg.norm(scratch.wide_load)
-    orders = [np.log2(out_of_balance(s) / out_of_balance(s / 2)) for s in (0.5, 0.25)]
-    assert min(orders) > 3.5
+    K = np.tril(system.tangent) + np.tril(system.tangent, -1).T
+    np.testing.assert_allclose((K + shift * np.eye(NARROW)) @ step, -residual, rtol=0, atol=1e-10)
 
 
 # --- answers -------------------------------------------------------------------------------------
