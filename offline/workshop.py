@@ -24,8 +24,8 @@ from offline.spaces import Footprint, energy_pod, ritz_vectors
 from offline.surface_mesh import accessible_surface
 from shared.artifact import Artifact, read_artifact
 from shared.atlas import Body
-from shared.endoscope import SurfaceQuadrature, footprint
-from shared.quadrature import stress_recovery, surface_quadrature
+from shared.endoscope import footprint
+from shared.quadrature import stress_recovery
 from shared.scene import Scene, parse_scene
 from shared.stress import StressRecovery, nodal_von_mises
 from shared.surface import Surface
@@ -98,11 +98,6 @@ class Workshop:
         )
 
     @cached_property
-    def quadrature(self) -> SurfaceQuadrature:
-        """Integration points of the whole boundary."""
-        return surface_quadrature(self.mesh.nodes, self.mesh.faces)
-
-    @cached_property
     def body(self) -> Body:
         """Mesh and tissue as the reduced model sees them."""
         mesh, model = self.mesh, self.model
@@ -119,7 +114,7 @@ class Workshop:
     def unit_load(self, position: Array) -> tuple[Array, Array]:
         """Nodal weights (n,) mm^2 of a unit pressure at a surface point, and the normal there."""
         x, normal, _ = self.surface.project(position)
-        footprint(self.quadrature, x, normal, self.scene.endoscope.radius, self._nodal)
+        footprint(self.body.boundary, x, normal, self.scene.endoscope.radius, self._nodal)
         return self._nodal.copy(), normal
 
     def load_vector(self, load: Load) -> Array:
@@ -147,26 +142,38 @@ class Workshop:
     def load_range(self, position: Array) -> Array:
         """Load range at a surface point: fields (7,) of ``shared.endoscope.pressure_limit``.
 
-        The limit along the normal is where the tissue moves by the scene's indentation.
+        The limit along the normal is where the tissue moves by the scene's indentation, or beyond
+        which it has no equilibrium.
         """
         nodal, normal = self.unit_load(position)
         unit = np.einsum("n,ij->nij", nodal, np.eye(3)).reshape(-1, 3)[self.model.free]
-        C = unit.T @ self.model.solve_linear(unit) / nodal.sum()
+        linear = self.model.solve_linear(unit)
+        C = unit.T @ linear / nodal.sum()
         thickness = local_thickness(self.mesh, position[None], normal[None])[0]
         wanted = self.scene.load.max_indentation * thickness
-        pressure, start = 0.1 * self.scene.tissue.young, None
-        for _ in range(20):
+        pressure = wanted / np.linalg.norm((linear @ normal).reshape(-1, 3), axis=1).max()
+        start, exponent, last, low, high = None, 1.0, None, 0.0, np.inf
+        while high > 1.03 * low:
             try:
                 state = self.model.solve(-pressure * nodal[:, None] * normal, start)
             except NoEquilibrium:
-                pressure, start = 0.5 * pressure, None
+                high = pressure
+                pressure, start = (low + high) / 2, None
                 continue
             moved = np.linalg.norm(state.displacement, axis=1).max()
-            if abs(moved / wanted - 1) < 0.02:
-                break
-            factor = min(2.5, max(0.3, wanted / moved))
-            pressure, start = factor * pressure, factor * state.displacement
-        return np.array([pressure, *np.diag(C), C[0, 1], C[0, 2], C[1, 2]])
+            if moved < 1.02 * wanted:
+                low = pressure
+            if moved > 0.98 * wanted:
+                high = pressure
+            # displacement as a power of pressure, through the last two points
+            if last is not None:
+                exponent = np.log(moved / last[1]) / np.log(pressure / last[0])
+            last = pressure, moved
+            factor = np.clip((wanted / moved) ** (1 / np.clip(exponent, 0.4, 1.5)), 0.3, 2.5)
+            pressure, start = factor * pressure, wanted / moved * state.displacement
+            if not low < pressure < high:
+                pressure = (low + high) / 2
+        return np.array([low, *np.diag(C), C[0, 1], C[0, 2], C[1, 2]])
 
     def region(self, footprints: list[Footprint], modes: int) -> RegionResult:
         """Basis of a region and the Ritz vectors of footprints in it."""

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-import operator
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,13 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 from shared import equilibrium
 from shared.artifact import Artifact, ArtifactError, read_artifact
 from shared.bound import bind
-from shared.endoscope import LIMIT_FIELDS
+from shared.endoscope import LIMIT_FIELDS, SurfaceQuadrature
 from shared.errors import QueryError
 from shared.quadrature import stress_recovery, surface_quadrature, volume_quadrature
 from shared.reduced import (
-    AREA,
-    COSINE,
+    CUBATURE,
     DISTANCE,
+    ERROR_DISPLACEMENT,
+    ERROR_FEATURES,
+    ERROR_VON_MISES,
     FEATURES,
     ITERATIONS,
     LANES,
@@ -36,11 +37,13 @@ from shared.reduced import (
     STATE,
     STATUS,
     TILE,
+    TILT,
     Memory,
     Outcome,
     Patches,
     Scratch,
     Solver,
+    Terms,
     expand,
     query,
 )
@@ -55,6 +58,15 @@ Region = Literal["surface", "all"]
 
 _INWARD = np.zeros(3)
 """Direction that stands for the inward normal."""
+
+_WEIGHT = slice(0, MAX_ACTIVE)
+_POINT, _NORMAL, _DIRECTION, _FORCE, _DISPLACEMENT = (
+    slice(_WEIGHT.stop + 3 * i, _WEIGHT.stop + 3 * i + 3) for i in range(5)
+)
+_RANGE = slice(_DISPLACEMENT.stop, _DISPLACEMENT.stop + LIMIT_FIELDS)
+_FEATURES = slice(_RANGE.stop, _RANGE.stop + ERROR_FEATURES)
+_SCALARS = slice(_FEATURES.stop, None)
+"""Where the parts of an outcome lie in a state's record."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +88,16 @@ class Body:
     clamped: NDArray[np.bool_]
     mu: Array
     lam: Array
+
+    @cached_property
+    def gradients(self) -> Array:
+        """Gradients of the shape functions (e, 8, n, 3) at the quadrature points, 1/mm."""
+        return volume_quadrature(self.nodes, self.elements, 2)[0]
+
+    @cached_property
+    def boundary(self) -> SurfaceQuadrature:
+        """Integration points of the whole boundary."""
+        return surface_quadrature(self.nodes, self.faces)
 
 
 @dataclass(frozen=True)
@@ -130,9 +152,8 @@ class LocalModels:
 
 def assemble_patches(body: Body, models: LocalModels, radius: float) -> Patches:
     """Everything the compiled query needs; ``radius`` (mm) is the largest footprint allowed."""
-    gradients, _ = volume_quadrature(body.nodes, body.elements, 2)
+    gradients, surface = body.gradients, body.boundary
     per_element = gradients.shape[1]
-    surface = surface_quadrature(body.nodes, body.faces)
     bases = models.basis.reshape(*models.steps.shape, len(body.nodes), 3)
     count, r = len(models.centres), models.modes.shape[2]
     most = -(-int(np.diff(models.point_from).max()) // LANES) * LANES
@@ -208,11 +229,11 @@ class State:
     Parameters
     ----------
     patches : Patches
-    triangles : int
+    clusters : int
         Of the surface that is queried.
     """
 
-    def __init__(self, patches: Patches, triangles: int = 0) -> None:
+    def __init__(self, patches: Patches, clusters: int = 0) -> None:
         _, r, entries = patches.gradients.shape
         points = LANES * (entries // TILE)
         self.memory = Memory(
@@ -245,16 +266,20 @@ class State:
             features=np.zeros(FEATURES),
             nodal=np.zeros(int(np.diff(patches.node_from).max())),
             distance=np.zeros(patches.centres.shape[1]),
-            surface=np.zeros(triangles + 6),
+            surface=np.zeros(clusters + 6),
         )
+        # one array, so that an answer is kept by one copy
+        self.record = np.zeros(_SCALARS.start + SCALARS)
         self.outcome = Outcome(
-            weight=np.zeros(MAX_ACTIVE),
-            scalars=np.zeros(SCALARS),
-            displacement=np.zeros(3),
-            point=np.zeros(3),
-            normal=np.zeros(3),
-            direction=np.zeros(3),
-            range=np.zeros(LIMIT_FIELDS),
+            weight=self.record[_WEIGHT],
+            point=self.record[_POINT],
+            normal=self.record[_NORMAL],
+            direction=self.record[_DIRECTION],
+            force=self.record[_FORCE],
+            displacement=self.record[_DISPLACEMENT],
+            range=self.record[_RANGE],
+            features=self.record[_FEATURES],
+            scalars=self.record[_SCALARS],
         )
         self.bound = bind(Solver(patches, self.memory, self.scratch, self.outcome))
 
@@ -263,8 +288,7 @@ class State:
         self.memory.patch[:] = -1
 
 
-@dataclass(frozen=True, slots=True)
-class Solution:
+class Solution(NamedTuple):
     """Answer to one query.
 
     Attributes
@@ -301,6 +325,8 @@ class Solution:
         Estimated relative L2 errors against the full model, calibrated to cover 95 % of cases.
     min_jacobian : float
         Smallest det F among the cubature points.
+    features : ndarray, shape (ERROR_FEATURES,)
+        What the error estimate is made of.
     patches : tuple of (int, float, ndarray)
         Active patches: number, weight, answer (r,) in the wide space.
     solve_seconds : float
@@ -325,6 +351,7 @@ class Solution:
     error_displacement: float
     error_von_mises: float
     min_jacobian: float
+    features: Array
     patches: tuple[tuple[int, float, Array], ...]
     solve_seconds: float
 
@@ -333,32 +360,15 @@ class Solution:
 class Estimator:
     """Calibrated error estimate: ``log error = c . features``, one row per quantity.
 
-    Features: 1, tilt over the largest tilt, and the logs of the pressure over its limit, of the
-    residual missed, of the patch's cubature error and of the contact's displacement over pressure.
+    For the features see ``shared.reduced``.
     """
 
-    coefficients: Array  # (2, 6): displacement, von Mises
-    _rows: list[list[float]] = field(init=False, repr=False, compare=False)
+    coefficients: Array  # (2, ERROR_FEATURES): displacement, von Mises
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_rows", self.coefficients.tolist())
-
-    @staticmethod
-    def features(
-        load: float, tilt: float, missed: float, cubature: float, compliance: float
-    ) -> tuple[float, ...]:
-        """Feature vector of load and tilt fraction, residual, cubature error and mm/kPa."""
-        logs = (math.log(max(value, 1e-6)) for value in (load, missed, cubature, compliance))
-        return 1.0, tilt, *logs
-
-    def __call__(
-        self, load: float, tilt: float, missed: float, cubature: float, compliance: float
-    ) -> tuple[float, float]:
+    def __call__(self, features: Array) -> tuple[float, float]:
         """Estimated relative errors of displacement and von Mises stress."""
-        features = self.features(load, tilt, missed, cubature, compliance)
-        logs = (sum(map(operator.mul, row, features)) for row in self._rows)
-        displacement, von_mises = logs
-        return math.exp(displacement), math.exp(von_mises)
+        displacement, von_mises = np.exp(self.coefficients @ features).tolist()
+        return displacement, von_mises
 
 
 class Atlas:
@@ -399,9 +409,15 @@ class Atlas:
         self.models = models
         self.estimator = estimator
         self.patches = assemble_patches(body, models, scene.endoscope.radius)
-        self._ground = bind(surface.ground(limits))
+        terms = Terms(
+            ground=surface.ground(limits),
+            reach=scene.endoscope.reach,
+            max_tilt=scene.endoscope.max_tilt,
+            errors=models.errors,
+            coefficients=estimator.coefficients,
+        )
+        self._terms = bind(terms)
         self.surface_nodes, self.surface_triangles = boundary_triangles(body.faces)
-        self._cubature: list[float] = models.errors.tolist()
         self._recovery = stress_recovery(body.nodes, body.elements, body.mu, body.lam)
         self._full = np.zeros((len(body.nodes), 3))
         self._stress = np.zeros(len(body.nodes))
@@ -482,7 +498,7 @@ class Atlas:
 
     def new_state(self) -> State:
         """Working memory and warm start for one session or thread."""
-        return State(self.patches, len(self.surface.triangles))
+        return State(self.patches, self.surface.clusters)
 
     def solve(
         self,
@@ -531,70 +547,55 @@ class Atlas:
         if state is None:
             state = self._state
             state.forget()
-        query(self._ground, state.bound, at, towards, pressure, radius, endoscope.reach)
-        outcome = state.outcome
-        scalars = outcome.scalars.tolist()
-        if scalars[DISTANCE] > endoscope.reach:
+        query(self._terms, state.bound, at, towards, pressure, radius)
+        record = state.record.copy()
+        scalars = record[_SCALARS].tolist()
+        distance, tilt = scalars[DISTANCE], scalars[TILT]
+        if distance > endoscope.reach:
             raise QueryError(
                 "position",
-                f"{scalars[DISTANCE]:.2f} mm from the accessible surface, "
+                f"{distance:.2f} mm from the accessible surface, "
                 f"at most {endoscope.reach} mm allowed",
             )
-        if scalars[COSINE] <= 0:
+        if not tilt < 90.0:
             raise QueryError("direction", "must point into the tissue")
-        return self._solution(state, pressure, radius, scalars, started)
-
-    def _solution(
-        self, state: State, pressure: float, radius: float, scalars: list[float], started: float
-    ) -> Solution:
-        outcome, endoscope = state.outcome, self.scene.endoscope
         limit = scalars[LIMIT]
-        tilt = math.degrees(math.acos(min(1.0, scalars[COSINE])))
-        out_of_range = tuple(
-            name
-            for name, outside in (
-                ("pressure", pressure > limit * (1 + 1e-9)),
-                ("direction", tilt > endoscope.max_tilt + 1e-6),
-                ("radius", radius != endoscope.radius),
-            )
-            if outside
-        )
-        numbers = state.memory.patch.tolist()
+        out_of_range: tuple[str, ...] = ()
+        if pressure > limit * (1 + 1e-9):
+            out_of_range += ("pressure",)
+        if tilt > endoscope.max_tilt + 1e-6:
+            out_of_range += ("direction",)
+        if radius != endoscope.radius:
+            out_of_range += ("radius",)
+        memory, numbers = state.memory.wide, state.memory.patch.tolist()
         patches = tuple(
-            (_number(numbers[slot]), weight, state.memory.wide[slot].copy())
-            for slot, weight in enumerate(outcome.weight.tolist())
-            if weight > 0
+            [
+                (_number(numbers[slot]), weight, memory[slot].copy())
+                for slot, weight in enumerate(record[_WEIGHT].tolist())
+                if weight > 0
+            ]
         )
-        cubature = sum(weight * self._cubature[k] for k, weight, _ in patches)
-        displacement = outcome.displacement.copy()
-        errors = self.estimator(
-            pressure / limit,
-            tilt / endoscope.max_tilt,
-            scalars[MISSED],
-            cubature,
-            math.hypot(*displacement.tolist()) / max(pressure, 1e-6),
-        )
-        direction = outcome.direction.copy()
         return Solution(
-            contact_point=outcome.point.copy(),
-            normal=outcome.normal.copy(),
-            distance=scalars[DISTANCE],
-            direction=direction,
+            contact_point=record[_POINT],
+            normal=record[_NORMAL],
+            distance=distance,
+            direction=record[_DIRECTION],
             tilt=tilt,
             missed=scalars[MISSED],
-            cubature=cubature,
+            cubature=scalars[CUBATURE],
             pressure=pressure,
             radius=radius,
             pressure_limit=limit,
-            force=pressure * scalars[AREA] * direction,
-            contact_displacement=displacement,
+            force=record[_FORCE],
+            contact_displacement=record[_DISPLACEMENT],
             converged=scalars[STATUS] == equilibrium.CONVERGED,
             iterations=int(scalars[ITERATIONS]),
             in_range=not out_of_range,
             out_of_range=out_of_range,
-            error_displacement=errors[0],
-            error_von_mises=errors[1],
+            error_displacement=scalars[ERROR_DISPLACEMENT],
+            error_von_mises=scalars[ERROR_VON_MISES],
             min_jacobian=scalars[SMALLEST_J],
+            features=record[_FEATURES],
             patches=patches,
             solve_seconds=time.perf_counter() - started,
         )
@@ -640,6 +641,6 @@ def _vector(field: str, value: ArrayLike) -> Array:
         vector = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise QueryError(field, "must be three numbers") from error
-    if vector.shape != (3,) or not np.isfinite(vector).all():
+    if vector.shape != (3,) or not all(map(math.isfinite, vector.tolist())):
         raise QueryError(field, "must be three finite numbers")
     return vector

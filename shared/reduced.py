@@ -46,7 +46,7 @@ from numpy.typing import NDArray
 
 from shared import equilibrium, tissue
 from shared.endoscope import SurfaceQuadrature, footprint, pressure_limit
-from shared.surface import locate
+from shared.surface import Ground, locate
 
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
@@ -462,23 +462,44 @@ class Scratch(NamedTuple):
     features: Array  # (FEATURES,)
     nodal: Array  # (most nodes of a patch,)
     distance: Array  # (p,)
-    surface: Array  # (triangles + 6,)
+    surface: Array  # (clusters of triangles + 6,)
 
 
 class Outcome(NamedTuple):
-    """What a query writes: weights of the patches in memory's slots, scalars by the names below."""
+    """What a query writes."""
 
-    weight: Array  # (MAX_ACTIVE,), 0 for a slot not used
-    scalars: Array  # (SCALARS,)
-    displacement: Array  # (3,) mm, mean under the footprint, weighted by pressure
+    weight: Array  # (MAX_ACTIVE,) of the patches in memory's slots, 0 for a slot not used
     point: Array  # (3,) mm, contact point
     normal: Array  # (3,) outward
     direction: Array  # (3,) unit direction of the load
+    force: Array  # (3,) mN
+    displacement: Array  # (3,) mm, mean under the footprint, weighted by pressure
     range: Array  # (7,) load range at the contact point
+    features: Array  # (ERROR_FEATURES,) of the error estimate
+    scalars: Array  # (SCALARS,), by the names below
+
+
+ERROR_FEATURES = 11
+
+(
+    STATUS,
+    ITERATIONS,
+    SMALLEST_J,
+    AREA,
+    MISSED,
+    CUBATURE,
+    ENERGY,
+    DISTANCE,
+    TILT,
+    LIMIT,
+    ERROR_DISPLACEMENT,
+    ERROR_VON_MISES,
+) = range(12)
+SCALARS = 12
 
 
 class Solver(NamedTuple):
-    """All that a query reads and writes."""
+    """All that a query reads of the local models, and all that it writes."""
 
     patches: Patches
     memory: Memory
@@ -486,8 +507,14 @@ class Solver(NamedTuple):
     outcome: Outcome
 
 
-STATUS, ITERATIONS, SMALLEST_J, AREA, MISSED, DISTANCE, COSINE, LIMIT = range(8)
-SCALARS = 8
+class Terms(NamedTuple):
+    """Where and how hard may be pressed, and how far to trust the answer."""
+
+    ground: Ground  # values at its vertices: the load range
+    reach: float  # mm, farthest position from the surface
+    max_tilt: float  # degrees
+    errors: Array  # (p,) of the patches' cubature
+    coefficients: Array  # (2, ERROR_FEATURES): displacement, von Mises
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -708,6 +735,7 @@ def _solve_patch(patches, k, slot, warm, x, direction, pressure, memory, scratch
     memory.factorised[slot] = factorised or iterations > 0
     memory.patch[slot] = k if status == equilibrium.CONVERGED else -2 - k
     scalars[STATUS] = max(scalars[STATUS], float(status))
+    scalars[ENERGY] = max(scalars[ENERGY], math.sqrt(np.dot(q, q)))
     scalars[ITERATIONS] = max(scalars[ITERATIONS], float(iterations))
     scalars[SMALLEST_J] = min(scalars[SMALLEST_J], smallest)
 
@@ -759,36 +787,67 @@ def press(bound, x, normal, direction, pressure, radius):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def query(ground, bound, position, direction, pressure, radius, reach):
-    """Find the contact point nearest to ``position``, the load's range, and press there.
+def query(terms, bound, position, direction, pressure, radius):
+    """Find the contact point nearest to ``position``, press there, and estimate the error.
+
+    A position beyond reach, or a direction out of the tissue, is not solved: distance and tilt in
+    the outcome tell.
 
     Parameters
     ----------
-    ground : Bound of shared.surface.Ground
-        Values at its vertices: the load range.
+    terms : Bound of Terms
     bound : Bound of Solver
     position : ndarray, shape (3,), mm
     direction : ndarray, shape (3,)
         Of any length; zero stands for the inward normal.
     pressure, radius : float
         kPa and mm.
-    reach : float, mm
-        A position farther from the surface, or a direction out of the tissue, is not solved: the
-        distance and the cosine in the outcome tell.
     """
-    solver = bound.content
+    solver, terms = bound.content, terms.content
     outcome = solver.outcome
     x, normal, towards, scalars = outcome.point, outcome.normal, outcome.direction, outcome.scalars
-    distance = locate(ground.content, position, solver.scratch.surface, x, normal, outcome.range)
+    surface = solver.scratch.surface
+    distance = locate(terms.ground, position, surface, x, normal, outcome.range)
     length = math.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
     cosine = 0.0
     for i in range(3):
         towards[i] = direction[i] / length if length > 0.0 else -normal[i]
         cosine -= towards[i] * normal[i]
-    if distance <= reach and cosine > 0.0:
+    tilt = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
+    limit = pressure_limit(outcome.range, normal, towards)
+    if distance <= terms.reach and tilt < 90.0:
         _answer(solver, x, normal, towards, pressure, radius)
-    scalars[DISTANCE], scalars[COSINE] = distance, cosine
-    scalars[LIMIT] = pressure_limit(outcome.range, normal, towards)
+        _estimate(terms, solver, pressure / limit, tilt / terms.max_tilt, pressure)
+    scalars[DISTANCE], scalars[TILT], scalars[LIMIT] = distance, tilt, limit
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _estimate(terms, solver, load, tilt, pressure):
+    """Force and estimated errors of an answer: ``log error = c . features``.
+
+    The features: 1, tilt over the largest, smallest det F, the normal (where on the body), and the
+    logs of the pressure over its limit, of the residual missed, of the patch's cubature error, of
+    the contact's displacement over pressure (mm/kPa) and of the displacement in the energy norm.
+    """
+    outcome, patch = solver.outcome, solver.memory.patch
+    scalars, features = outcome.scalars, outcome.features
+    moved = cubature = 0.0
+    for i in range(3):
+        outcome.force[i] = pressure * scalars[AREA] * outcome.direction[i]
+        moved += outcome.displacement[i] ** 2
+    for slot in range(MAX_ACTIVE):
+        if outcome.weight[slot] > 0.0:
+            k = patch[slot]
+            cubature += outcome.weight[slot] * terms.errors[k if k >= 0 else -2 - k]
+    compliance = math.sqrt(moved) / max(pressure, 1e-6)
+    scalars[CUBATURE] = cubature
+    features[0], features[1], features[2] = 1.0, tilt, scalars[SMALLEST_J]
+    features[3:6] = outcome.normal
+    features[6], features[7] = math.log(max(load, 1e-6)), math.log(max(scalars[MISSED], 1e-6))
+    features[8], features[9] = math.log(max(cubature, 1e-6)), math.log(max(compliance, 1e-6))
+    features[10] = math.log(max(scalars[ENERGY], 1e-6))
+    scalars[ERROR_DISPLACEMENT] = math.exp(np.dot(terms.coefficients[0], features))
+    scalars[ERROR_VON_MISES] = math.exp(np.dot(terms.coefficients[1], features))
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc"})

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 Array = NDArray[np.float64]
 
@@ -48,33 +49,46 @@ class Ground(NamedTuple):
     """A surface as compiled code sees it, with fields given at its vertices."""
 
     vertices: Array  # (v, 3) mm
-    triangles: NDArray[np.int32]  # (t, 3)
+    triangles: NDArray[np.int32]  # (t, 3), neighbours next to each other
     normals: Array  # (v, 3)
-    centres: Array  # (3, t) mm
-    radii: Array  # (t,) mm, of balls that hold the triangles
+    first: NDArray[np.int64]  # (c + 1,) first triangle of each cluster
+    centres: Array  # (3, c) mm, of balls that hold the clusters
+    radii: Array  # (c,) mm
     values: Array  # (v, k)
+
+
+CLUSTER = 8
+"""Most triangles of a cluster."""
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _project(ground, p, squared, weights, trial):
     """Nearest triangle and barycentric ``weights`` there; returns (triangle, distance).
 
-    ``squared`` (t,) is scratch: squared distances of the triangles' centres.
+    ``squared`` (c,) is scratch: squared distances of the balls' centres.
     """
     centres, radii = ground.centres, ground.radii
     x, y, z = p[0], p[1], p[2]
-    for t in range(len(squared)):
-        dx, dy, dz = x - centres[0, t], y - centres[1, t], z - centres[2, t]
-        squared[t] = dx * dx + dy * dy + dz * dz
-    nearest = int(np.argmin(squared))
-    best = _distance(ground, p, nearest, weights)
-    for t in range(len(squared)):
-        bound = best + radii[t]
-        if squared[t] < bound * bound:
-            distance = _distance(ground, p, t, trial)
-            if distance < best:
-                best, nearest = distance, t
-                weights[:] = trial
+    for c in range(len(radii)):
+        dx, dy, dz = x - centres[0, c], y - centres[1, c], z - centres[2, c]
+        squared[c] = dx * dx + dy * dy + dz * dz
+    first = np.argmin(squared[: len(radii)])
+    nearest, best = _nearest_in(ground, p, first, 0, np.inf, weights, trial)
+    for c in range(len(radii)):
+        bound = best + radii[c]
+        if squared[c] < bound * bound and c != first:
+            nearest, best = _nearest_in(ground, p, c, nearest, best, weights, trial)
+    return nearest, best
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _nearest_in(ground, p, cluster, nearest, best, weights, trial):
+    """``nearest`` triangle and its distance ``best``, or those of a nearer one in the cluster."""
+    for t in range(ground.first[cluster], ground.first[cluster + 1]):
+        distance = _distance(ground, p, t, trial)
+        if distance < best:
+            nearest, best = t, distance
+            weights[:] = trial
     return nearest, best
 
 
@@ -95,7 +109,7 @@ def _distance(ground, p, t, weights):
 def locate(ground, p, scratch, x, normal, at):
     """Write the projection of p, the normal and the values ``at`` it; return the distance.
 
-    ``scratch`` (t + 6,) holds one value for each triangle and six more.
+    ``scratch`` (clusters + 6,) holds one value for each ball of triangles and six more.
     """
     count = len(ground.radii)
     weights, trial = scratch[count : count + 3], scratch[count + 3 :]
@@ -132,15 +146,26 @@ class Surface:
     vertices: Array
     triangles: NDArray[np.int32]
     normals: Array
+    _ordered: NDArray[np.int32] = field(init=False, repr=False)
+    _first: NDArray[np.int64] = field(init=False, repr=False)
     _centres: Array = field(init=False, repr=False)
     _radii: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        corners = self.vertices[self.triangles]
-        centres = corners.mean(axis=1)
-        radii = np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
+        tree = cKDTree(self.vertices[self.triangles].mean(axis=1), CLUSTER)
+        starts = np.array(_leaves(tree.tree))
+        ordered = np.ascontiguousarray(self.triangles[tree.indices])
+        corners = self.vertices[ordered]
+        low = np.minimum.reduceat(corners.min(axis=1), starts)
+        high = np.maximum.reduceat(corners.max(axis=1), starts)
+        centres = (low + high) / 2
+        first = np.append(starts, len(ordered))
+        own = np.repeat(centres, np.diff(first), axis=0)
+        reach = np.linalg.norm(corners - own[:, None], axis=2).max(axis=1)
+        object.__setattr__(self, "_ordered", ordered)
+        object.__setattr__(self, "_first", first)
         object.__setattr__(self, "_centres", np.ascontiguousarray(centres.T))
-        object.__setattr__(self, "_radii", radii)
+        object.__setattr__(self, "_radii", np.maximum.reduceat(reach, starts))
 
     def project(self, position: Array) -> tuple[Array, Array, float]:
         """Nearest surface point (mm), its outward unit normal and the distance (mm)."""
@@ -149,14 +174,25 @@ class Surface:
     def locate(self, position: Array, values: Array) -> tuple[Array, Array, float, Array]:
         """As ``project``, and the values (k,) there of fields given at the vertices, (v, k)."""
         x, normal, at = np.empty(3), np.empty(3), np.empty(values.shape[1])
-        scratch = np.empty(len(self.triangles) + 6)
+        scratch = np.empty(len(self._radii) + 6)
         distance = locate(self.ground(values), position, scratch, x, normal, at)
         return x, normal, distance, at
+
+    @property
+    def clusters(self) -> int:
+        """Number of balls that triangles are searched in."""
+        return len(self._radii)
 
     def ground(self, values: Array) -> Ground:
         """For compiled code, with fields (v, k) given at the vertices."""
         return Ground(
-            self.vertices, self.triangles, self.normals, self._centres, self._radii, values
+            self.vertices,
+            self._ordered,
+            self.normals,
+            self._first,
+            self._centres,
+            self._radii,
+            values,
         )
 
     def rim(self) -> NDArray[np.int64]:
@@ -164,6 +200,13 @@ class Surface:
         edges = np.sort(np.vstack([self.triangles[:, [i, (i + 1) % 3]] for i in range(3)]), axis=1)
         unique, count = np.unique(edges, axis=0, return_counts=True)
         return np.unique(unique[count == 1])
+
+
+def _leaves(node: Any) -> list[int]:
+    """First index of every leaf of a k-d tree, ascending."""
+    if node.lesser is None:
+        return [node.start_idx]
+    return _leaves(node.lesser) + _leaves(node.greater)
 
 
 def boundary_triangles(faces: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

@@ -90,6 +90,7 @@ class FakeAtlas:
             error_displacement=0.001,
             error_von_mises=0.002,
             min_jacobian=1.0 - 0.01 * pressure,
+            features=np.ones(1),
             patches=(),
             solve_seconds=time.perf_counter() - start,
         )
