@@ -46,6 +46,9 @@ PATH_LOADS, FITTED_TILT = 24, 45.0
 WIDE = 0.4
 """Weight of the forces in the wide space, relative to those that displace the answer."""
 
+WIDE_SKETCH = 24
+"""Random combinations that stand for the forces in the wide space; their errors add up alike."""
+
 EQUATIONS = 300
 """Combinations of the reduced internal force that cubature is fitted to."""
 
@@ -276,12 +279,14 @@ def _training_forces(
         if not trainer.solve(*random_load(scene, task, rng)):
             continue
         wide, load = trainer.wide, trainer.load_size
-        compliance = (trainer.narrow_compliance / np.linalg.norm(wide)).astype(np.float32)
+        compliance = trainer.narrow_compliance / np.linalg.norm(wide)
         departure = OFF_EQUILIBRIUM * np.abs(wide) * rng.standard_normal(len(wide))
         for state in (wide, wide + departure):
             force = _contributions(trainer.patches, gradients, state)
             if force is not None:
-                columns += [force @ compliance, force * np.float32(WIDE / load)]
+                wide_part = rng.standard_normal((len(wide), WIDE_SKETCH)) / np.sqrt(WIDE_SKETCH)
+                looks = np.hstack([compliance, WIDE / load * wide_part])
+                columns.append(force @ looks.astype(np.float32))
     return np.hstack(columns)
 
 

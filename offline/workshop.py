@@ -32,8 +32,8 @@ from shared.surface import Surface
 
 Array = NDArray[np.float64]
 
-POINTS_IN_BASIS = 100
-"""Footprints whose Ritz vectors make a region's basis; those of the others are projected on it."""
+POINTS_IN_BASIS = 50
+"""Footprints all of whose Ritz vectors make a region's basis; of others the linear ones do."""
 
 RESOLUTION = 2e-6
 """Displacement (mm) that a step of a stored mode amounts to where the mode is at work: a mode of
@@ -179,8 +179,9 @@ class Workshop:
         """Basis of a region and the Ritz vectors of footprints in it."""
         model = self.model
         vectors = np.stack([self._ritz(footprint) for footprint in footprints], axis=1)
-        stride = max(1, len(footprints) // POINTS_IN_BASIS)
-        basis, _ = energy_pod(model, vectors[:, ::stride].reshape(len(model.free), -1), modes)
+        linear, rest = vectors[:, :, :3], vectors[:, :: -(-len(footprints) // POINTS_IN_BASIS), 3:]
+        wanted = [part.reshape(len(model.free), -1) for part in (linear, rest)]
+        basis, _ = energy_pod(model, np.hstack(wanted), modes)
         vectors = vectors.reshape(len(model.free), -1)
         amplitude = np.sqrt(np.mean(((model.rest_stiffness @ basis).T @ vectors) ** 2, axis=1))
         largest = np.abs(basis).max(axis=0)

@@ -37,7 +37,7 @@ def correct(system, residual, step):
     system.correct(residual, step)
 
 
-def newton(system, u, work, target, reuse, max_iterations, factorised, round_off=1e-12):
+def newton(system, u, work, target, reuse, max_iterations, factorised, round_off=1e-9):
     """Find the equilibrium of ``system`` near ``u``, in place.
 
     Parameters
@@ -57,7 +57,8 @@ def newton(system, u, work, target, reuse, max_iterations, factorised, round_off
     factorised : bool
         Whether ``system`` still holds the factorised tangent of a state near ``u``.
     round_off : float
-        Relative error with which the system knows its energy.
+        Relative error with which the system knows its energy; where strains are small, it is a
+        difference of large numbers.
 
     Returns
     -------

@@ -84,6 +84,10 @@ STATE = 13
 
 FAST = {"contract", "reassoc", "nsz"}
 
+INNER = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "nogil": True, "cache": True}
+"""Of kernels that only kernels call: without the code that unpacks Python's arguments, of which
+there are many, they compile in half the time."""
+
 
 # --- vector code ---------------------------------------------------------------------------------
 # Rows of numbers, four at a time: a vector that is read serves four products.
@@ -362,7 +366,7 @@ def _cholesky(K, shift, L):
     return True
 
 
-descend = njit(equilibrium.descend, error_model="numpy", nogil=True, cache=True)
+descend = njit(equilibrium.descend, error_model="numpy", **INNER)
 
 
 # --- the atlas -----------------------------------------------------------------------------------
@@ -517,7 +521,7 @@ class Terms(NamedTuple):
     coefficients: Array  # (2, ERROR_FEATURES): displacement, von Mises
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(error_model="numpy", **INNER)
 def activate(patches, x, memory, distance, weight):
     """Choose the patches that answer at ``x`` and their weights; keep what memory has of them.
 
@@ -552,12 +556,12 @@ def activate(patches, x, memory, distance, weight):
     weight /= weight.sum()
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy", **INNER)
 def _fade(excess):
     return (1.0 - excess) ** 2 * (1.0 + 2.0 * excess)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(error_model="numpy", **INNER)
 def _wide_load(patches, k, x, normal, direction, pressure, radius, scratch):
     """Load of patch k in its wide space into ``scratch.wide_load``; returns force over pressure."""
     first, last = patches.node_from[k], patches.node_from[k + 1]
@@ -587,7 +591,7 @@ def _wide_load(patches, k, x, normal, direction, pressure, radius, scratch):
     return area
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(error_model="numpy", **INNER)
 def _append(number, steps, scratch):
     """Orthonormalise ``scratch.vectors[number]`` against the narrow space: mode LEADING + number.
 
@@ -612,7 +616,7 @@ def _append(number, steps, scratch):
     return norm
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(error_model="numpy", **INNER)
 def _narrow_space(patches, k, x, direction, pressure, scratch):
     """Set up the narrow space of patch k for ``scratch.wide_load``."""
     load = scratch.scaled_load
@@ -642,7 +646,7 @@ def _narrow_space(patches, k, x, direction, pressure, scratch):
     scratch.gradients[NARROW - 1] = 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(error_model="numpy", **INNER)
 def _first_guess(table, scratch):
     """First guess in the narrow space, into ``scratch.q``: linear response and fitted remainder."""
     q = scratch.q
@@ -657,7 +661,7 @@ def _first_guess(table, scratch):
         q[j] += guess[j]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(error_model="numpy", **INNER)
 def _to_wide(q, vectors, wide):
     wide[:] = 0.0
     wide[:LEADING] = q[:LEADING]
@@ -666,7 +670,7 @@ def _to_wide(q, vectors, wide):
             wide[i] += q[LEADING + j] * vectors[j, i]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(error_model="numpy", **INNER)
 def _solve_patch(patches, k, slot, warm, x, direction, pressure, memory, scratch, scalars):
     """Equilibrium of patch k under ``scratch.wide_load``; its answer goes to memory's slot."""
     _narrow_space(patches, k, x, direction, pressure, scratch)
@@ -740,7 +744,7 @@ def _solve_patch(patches, k, slot, warm, x, direction, pressure, memory, scratch
     scalars[SMALLEST_J] = min(scalars[SMALLEST_J], smallest)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(error_model="numpy", **INNER)
 def _answer(solver, x, normal, direction, pressure, radius):
     patches, memory, scratch, outcome = solver
     activate(patches, x, memory, scratch.distance, outcome.weight)
@@ -821,7 +825,7 @@ def query(terms, bound, position, direction, pressure, radius):
     scalars[DISTANCE], scalars[TILT], scalars[LIMIT] = distance, tilt, limit
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(error_model="numpy", **INNER)
 def _estimate(terms, solver, load, tilt, pressure):
     """Force and estimated errors of an answer: ``log error = c . features``.
 

@@ -44,7 +44,7 @@ region_spacing = 7.5
 modes = 64
 region_modes = 200
 blend = 0.2
-cubature_points = 100
+cubature_points = 96
 samples = 60
 """
 
