@@ -64,11 +64,12 @@ def answer(model: Model, request: SolveRequest, media_type: str, max_json_number
 
     fields = {}
     if request.region != "none":
+        displacement = atlas.displacement(solution)
         if "displacement" in request.outputs:
-            fields["displacement"] = atlas.displacement(solution, request.region)
+            nodes = atlas.surface_nodes if request.region == "surface" else slice(None)
+            fields["displacement"] = displacement[nodes]
         if "von_mises" in request.outputs:
-            known = fields.get("displacement") if request.region == "all" else None
-            fields["von_mises"] = atlas.von_mises(solution, request.region, known)
+            fields["von_mises"] = atlas.von_mises(solution, request.region, displacement)
     recovered = perf_counter_ns()
 
     head = describe(atlas.name, solution)

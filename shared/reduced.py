@@ -67,6 +67,9 @@ REUSE = 0.15
 
 MAX_ITERATIONS = 30
 
+MISSED_MOST = 0.03
+"""Residual in the wide space, relative to the load, that asks for one more mode."""
+
 ROUND_OFF = 1e-6
 """Of the energy: gradients are summed in single precision."""
 
@@ -83,10 +86,6 @@ STATE = 13
 """Numbers that describe the tangent at a point: F^-T and four moduli."""
 
 FAST = {"contract", "reassoc", "nsz"}
-
-INNER = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "nogil": True, "cache": True}
-"""Of kernels that only kernels call: without the code that unpacks Python's arguments, of which
-there are many, they compile in half the time."""
 
 
 # --- vector code ---------------------------------------------------------------------------------
@@ -366,7 +365,7 @@ def _cholesky(K, shift, L):
     return True
 
 
-descend = njit(equilibrium.descend, error_model="numpy", **INNER)
+descend = njit(equilibrium.descend, error_model="numpy", nogil=True, cache=True)
 
 
 # --- the atlas -----------------------------------------------------------------------------------
@@ -521,7 +520,7 @@ class Terms(NamedTuple):
     coefficients: Array  # (2, ERROR_FEATURES): displacement, von Mises
 
 
-@njit(error_model="numpy", **INNER)
+@njit(cache=True, error_model="numpy", nogil=True)
 def activate(patches, x, memory, distance, weight):
     """Choose the patches that answer at ``x`` and their weights; keep what memory has of them.
 
@@ -556,12 +555,12 @@ def activate(patches, x, memory, distance, weight):
     weight /= weight.sum()
 
 
-@njit(error_model="numpy", **INNER)
+@njit(cache=True, error_model="numpy", nogil=True)
 def _fade(excess):
     return (1.0 - excess) ** 2 * (1.0 + 2.0 * excess)
 
 
-@njit(error_model="numpy", **INNER)
+@njit(cache=True, error_model="numpy", nogil=True)
 def _wide_load(patches, k, x, normal, direction, pressure, radius, scratch):
     """Load of patch k in its wide space into ``scratch.wide_load``; returns force over pressure."""
     first, last = patches.node_from[k], patches.node_from[k + 1]
@@ -591,7 +590,7 @@ def _wide_load(patches, k, x, normal, direction, pressure, radius, scratch):
     return area
 
 
-@njit(error_model="numpy", **INNER)
+@njit(cache=True, error_model="numpy", nogil=True)
 def _append(number, steps, scratch):
     """Orthonormalise ``scratch.vectors[number]`` against the narrow space: mode LEADING + number.
 
@@ -616,7 +615,7 @@ def _append(number, steps, scratch):
     return norm
 
 
-@njit(error_model="numpy", **INNER)
+@njit(cache=True, error_model="numpy", nogil=True)
 def _narrow_space(patches, k, x, direction, pressure, scratch):
     """Set up the narrow space of patch k for ``scratch.wide_load``."""
     load = scratch.scaled_load
@@ -646,7 +645,7 @@ def _narrow_space(patches, k, x, direction, pressure, scratch):
     scratch.gradients[NARROW - 1] = 0.0
 
 
-@njit(error_model="numpy", **INNER)
+@njit(cache=True, error_model="numpy", nogil=True)
 def _first_guess(table, scratch):
     """First guess in the narrow space, into ``scratch.q``: linear response and fitted remainder."""
     q = scratch.q
@@ -661,7 +660,7 @@ def _first_guess(table, scratch):
         q[j] += guess[j]
 
 
-@njit(error_model="numpy", **INNER)
+@njit(cache=True, error_model="numpy", nogil=True)
 def _to_wide(q, vectors, wide):
     wide[:] = 0.0
     wide[:LEADING] = q[:LEADING]
@@ -670,7 +669,47 @@ def _to_wide(q, vectors, wide):
             wide[i] += q[LEADING + j] * vectors[j, i]
 
 
-@njit(error_model="numpy", **INNER)
+@njit(cache=True, error_model="numpy", nogil=True)
+def _enrich(patches, k, wide, scratch):
+    """Make the residual in the wide space the last mode of the narrow one.
+
+    For the state ``scratch.q`` and the stress there; ``wide`` is scratch.  Writes the residual of
+    the new mode beside those of the others and returns the norm of what the narrow space missed.
+    """
+    gradients, steps, residual = patches.gradients[k], patches.steps[k], scratch.residual
+    vectors = scratch.vectors
+    _project(gradients, scratch.P, residual)
+    _to_wide(scratch.q, vectors, wide)
+    for i in range(len(residual)):
+        residual[i] = residual[i] * steps[i] + wide[i] - scratch.wide_load[i]
+    vectors[PATH] = residual
+    missed = _append(PATH, steps, scratch)
+    _superpose(gradients, scratch.stepped[PATH], scratch.gradients[NARROW - 1])
+    scratch.newton[0, NARROW - 1] = np.dot(vectors[PATH], residual)
+    return missed
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _merge(scratch):
+    """Join the last two modes into the one that the state has of them, and free the last."""
+    q, vectors, gradients = scratch.q, scratch.vectors, scratch.gradients
+    length = math.hypot(q[NARROW - 2], q[NARROW - 1])
+    if length > 0.0:
+        a, b = q[NARROW - 2] / length, q[NARROW - 1] / length
+        for i in range(vectors.shape[1]):
+            vectors[PATH - 1, i] = a * vectors[PATH - 1, i] + b * vectors[PATH, i]
+        for i in range(gradients.shape[1]):
+            gradients[NARROW - 2, i] = (
+                np.float32(a) * gradients[NARROW - 2, i]
+                + np.float32(b) * (gradients[NARROW - 1, i])
+            )
+        residual = scratch.newton[0]
+        residual[NARROW - 2] = a * residual[NARROW - 2] + b * residual[NARROW - 1]
+        scratch.load[NARROW - 2] = np.dot(vectors[PATH - 1], scratch.wide_load)
+    q[NARROW - 2], q[NARROW - 1] = length, 0.0
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def _solve_patch(patches, k, slot, warm, x, direction, pressure, memory, scratch, scalars):
     """Equilibrium of patch k under ``scratch.wide_load``; its answer goes to memory's slot."""
     _narrow_space(patches, k, x, direction, pressure, scratch)
@@ -718,23 +757,23 @@ def _solve_patch(patches, k, slot, warm, x, direction, pressure, memory, scratch
         )
         iterations += more
     if status == equilibrium.CONVERGED:
-        # the residual of the wide space; system.P is of the last state tried, q
-        gradients, steps, residual = patches.gradients[k], patches.steps[k], scratch.residual
-        _project(gradients, system.P, residual)
-        wide = memory.wide[slot]
-        _to_wide(q, vectors, wide)
-        for i in range(len(residual)):
-            residual[i] = residual[i] * steps[i] + wide[i] - scratch.wide_load[i]
-        vectors[PATH] = residual
-        missed = _append(PATH, steps, scratch)
-        _superpose(gradients, scratch.stepped[PATH], scratch.gradients[NARROW - 1])
-        work[0, NARROW - 1] = np.dot(vectors[PATH], residual)
-        scalars[MISSED] = max(scalars[MISSED], missed / max(size, 1e-12))
+        missed = _enrich(patches, k, memory.wide[slot], scratch) / max(size, 1e-12)
+        scalars[MISSED] = max(scalars[MISSED], missed)
         factorised = factorised or iterations > 0
         status, more, energy, smallest = descend(
             system, q, work, energy, smallest, target, REUSE, MAX_ITERATIONS, factorised, ROUND_OFF
         )
         iterations += more
+        while missed > MISSED_MOST and status == equilibrium.CONVERGED:
+            _merge(scratch)
+            again = _enrich(patches, k, memory.wide[slot], scratch) / max(size, 1e-12)
+            if again > 0.8 * missed:
+                break
+            missed = again
+            status, more, energy, smallest = descend(
+                system, q, work, energy, smallest, target, REUSE, MAX_ITERATIONS, True, ROUND_OFF
+            )
+            iterations += more
     _to_wide(q, vectors, memory.wide[slot])
     memory.factorised[slot] = factorised or iterations > 0
     memory.patch[slot] = k if status == equilibrium.CONVERGED else -2 - k
@@ -744,7 +783,7 @@ def _solve_patch(patches, k, slot, warm, x, direction, pressure, memory, scratch
     scalars[SMALLEST_J] = min(scalars[SMALLEST_J], smallest)
 
 
-@njit(error_model="numpy", **INNER)
+@njit(cache=True, error_model="numpy", nogil=True)
 def _answer(solver, x, normal, direction, pressure, radius):
     patches, memory, scratch, outcome = solver
     activate(patches, x, memory, scratch.distance, outcome.weight)
@@ -825,7 +864,7 @@ def query(terms, bound, position, direction, pressure, radius):
     scalars[DISTANCE], scalars[TILT], scalars[LIMIT] = distance, tilt, limit
 
 
-@njit(error_model="numpy", **INNER)
+@njit(cache=True, error_model="numpy", nogil=True)
 def _estimate(terms, solver, load, tilt, pressure):
     """Force and estimated errors of an answer: ``log error = c . features``.
 
