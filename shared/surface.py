@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 Array = NDArray[np.float64]
 
@@ -152,14 +151,16 @@ class Surface:
     _radii: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        tree = cKDTree(self.vertices[self.triangles].mean(axis=1), CLUSTER)
-        starts = np.array(_leaves(tree.tree))
-        ordered = np.ascontiguousarray(self.triangles[tree.indices])
+        clusters = _clusters(
+            self.vertices[self.triangles].mean(axis=1), np.arange(len(self.triangles))
+        )
+        first = np.cumsum([0, *map(len, clusters)])
+        starts = first[:-1]
+        ordered = np.ascontiguousarray(self.triangles[np.concatenate(clusters)])
         corners = self.vertices[ordered]
         low = np.minimum.reduceat(corners.min(axis=1), starts)
         high = np.maximum.reduceat(corners.max(axis=1), starts)
         centres = (low + high) / 2
-        first = np.append(starts, len(ordered))
         own = np.repeat(centres, np.diff(first), axis=0)
         reach = np.linalg.norm(corners - own[:, None], axis=2).max(axis=1)
         object.__setattr__(self, "_ordered", ordered)
@@ -202,11 +203,14 @@ class Surface:
         return np.unique(unique[count == 1])
 
 
-def _leaves(node: Any) -> list[int]:
-    """First index of every leaf of a k-d tree, ascending."""
-    if node.lesser is None:
-        return [node.start_idx]
-    return _leaves(node.lesser) + _leaves(node.greater)
+def _clusters(centres: Array, members: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Triangles in groups of neighbours, halved across the longest side until small enough."""
+    if len(members) <= CLUSTER:
+        return [members]
+    extent = np.ptp(centres[members], axis=0)
+    members = members[np.argsort(centres[members, np.argmax(extent)], kind="stable")]
+    half = len(members) // 2
+    return _clusters(centres, members[:half]) + _clusters(centres, members[half:])
 
 
 def boundary_triangles(faces: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
