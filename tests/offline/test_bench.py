@@ -24,8 +24,6 @@ def test_every_kind_of_query_is_timed(artifact):
     assert list(report) == [*KINDS, "p95", "ratio"]
     assert list(report["p95"]) == KINDS
     assert all(0 < report[kind] <= report["p95"][kind] for kind in KINDS)
-    assert report["warm_us"] < report["cold_us"] < report["full_us"]
-    assert report["cold_us"] < report["fields_us"]
     assert report["ratio"] == report["full_us"] / report["cold_us"]
 
 
