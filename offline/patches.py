@@ -12,21 +12,26 @@ from offline.sampling import cone, tangents
 from offline.spaces import Footprint, local_modes
 from shared import equilibrium
 from shared.atlas import Body, LocalModels, State, assemble_patches
-from shared.endoscope import pressure_limit
+from shared.bound import bind
+from shared.endoscope import LIMIT_FIELDS, pressure_limit
 from shared.reduced import (
+    ERROR_FEATURES,
     FEATURES,
     LANES,
     LEADING,
+    NARROW,
     PATH,
     PATH_FEATURES,
     SECOND_FEATURES,
     STATUS,
     Patches,
+    Terms,
     load_features,
     nonlinear_stress,
-    press,
+    query,
 )
 from shared.scene import Scene
+from shared.surface import Surface
 
 Array = NDArray[np.float64]
 
@@ -109,18 +114,28 @@ class PatchResult:
 
 
 class LocalTrainer:
-    """A single-patch atlas that solves training loads."""
+    """A single-patch atlas that solves training loads, by the compiled query of the service."""
 
-    def __init__(self, body: Body, models: LocalModels, radius: float) -> None:
-        self.patches: Patches = assemble_patches(body, models, radius)
-        self.state = State(self.patches)
-        self.radius = radius
+    def __init__(self, scene: Scene, body: Body, surface: Surface, models: LocalModels) -> None:
+        self.radius = scene.endoscope.radius
+        self.patches: Patches = assemble_patches(body, models, self.radius)
+        self.state = State(self.patches, surface.clusters)
+        no_range = np.zeros((len(surface.vertices), LIMIT_FIELDS))
+        self.terms = bind(
+            Terms(
+                ground=surface.ground(no_range),
+                reach=scene.endoscope.reach,
+                max_tilt=scene.endoscope.max_tilt,
+                errors=models.errors,
+                coefficients=np.zeros((2, ERROR_FEATURES)),
+            )
+        )
 
-    def solve(self, x: Array, normal: Array, direction: Array, pressure: float) -> bool:
+    def solve(self, x: Array, direction: Array, pressure: float) -> bool:
         """Solve a load from rest; False if there is no equilibrium."""
         state = self.state
         state.forget()
-        press(state.bound, x, normal, direction, pressure, self.radius)
+        query(self.terms, state.bound, x, direction, pressure, self.radius)
         return bool(state.outcome.scalars[STATUS] == equilibrium.CONVERGED)
 
     @property
@@ -149,13 +164,40 @@ class LocalTrainer:
         return self.state.scratch.q[:n] - self.state.scratch.load[:n]
 
 
-def train_patch(scene: Scene, body: Body, weights: Array, task: PatchTask) -> PatchResult:
+def compile_query(scene: Scene, body: Body, surface: Surface) -> None:
+    """Compile what local models are trained and queried with, on a model of nothing."""
+    models = LocalModels(
+        basis=np.zeros((1, LANES, 3 * len(body.nodes)), np.int16),
+        steps=np.zeros((1, LANES), np.float32),
+        region=np.zeros(1, np.int32),
+        centres=surface.vertices[:1],
+        frames=np.eye(3)[None],
+        pressures=np.ones(1),
+        modes=np.zeros((1, LANES, NARROW), np.float32),
+        point_from=np.array([0, 1]),
+        points=np.zeros(1, np.int32),
+        weights=np.ones(1),
+        path=np.zeros((1, PATH_FEATURES, NARROW), np.float32),
+        guess=np.zeros((1, FEATURES, LEADING + PATH), np.float32),
+        errors=np.zeros(1),
+        extent=1.0,
+        blend=1.0,
+    )
+    trainer = LocalTrainer(scene, body, surface, models)
+    trainer.solve(surface.vertices[0], surface.normals[0], 0.0)
+
+
+def train_patch(
+    scene: Scene, body: Body, surface: Surface, weights: Array, task: PatchTask
+) -> PatchResult:
     """Train one patch.
 
     Parameters
     ----------
     scene : Scene
     body : Body
+    surface : Surface
+        Accessible.
     weights : ndarray, shape (quadrature points,), mm^3
     task : PatchTask
     """
@@ -184,7 +226,7 @@ def train_patch(scene: Scene, body: Body, weights: Array, task: PatchTask) -> Pa
         extent=task.extent,
         blend=task.blend,
     )
-    galerkin = LocalTrainer(body, models, scene.endoscope.radius)
+    galerkin = LocalTrainer(scene, body, surface, models)
     contributions = _training_forces(galerkin, scene, task, rng)[: len(weights)]
     points, chosen_weights, residual = _cubature(
         contributions, weights, settings.cubature_points, rng
@@ -195,7 +237,7 @@ def train_patch(scene: Scene, body: Body, weights: Array, task: PatchTask) -> Pa
         points=points.astype(np.int32),
         weights=chosen_weights,
     )
-    reduced = LocalTrainer(body, models, scene.endoscope.radius)
+    reduced = LocalTrainer(scene, body, surface, models)
     guess = _fit_guess(reduced, scene, task, frame, rng)
     error = _cubature_error(galerkin, reduced, scene, task, rng)
     return PatchResult(
@@ -255,12 +297,12 @@ def _cubature_error(
 
 def random_load(
     scene: Scene, task: PatchTask, rng: np.random.Generator
-) -> tuple[Array, Array, Array, float]:
-    """Contact point, normal, direction and pressure, denser towards large pressures."""
+) -> tuple[Array, Array, float]:
+    """Contact point, direction and pressure, denser towards large pressures."""
     i = rng.integers(len(task.contacts))
     direction = cone(task.normals[i], scene.endoscope.max_tilt, 1, rng)[0]
     limit = pressure_limit(task.ranges[i], task.normals[i], direction)
-    return task.contacts[i], task.normals[i], direction, limit * np.sqrt(rng.random())
+    return task.contacts[i], direction, limit * np.sqrt(rng.random())
 
 
 def _training_forces(
@@ -329,8 +371,8 @@ def _fit_guess(
     rows, targets = [], []
     features = np.zeros(FEATURES)
     for _ in range(GUESS_LOADS):
-        x, normal, direction, pressure = random_load(scene, task, rng)
-        if trainer.solve(x, normal, direction, pressure):
+        x, direction, pressure = random_load(scene, task, rng)
+        if trainer.solve(x, direction, pressure):
             load_features(frame, task.centre, x, direction * pressure / task.pressure, features)
             rows.append(features.copy())
             targets.append(trainer.beyond_linear)

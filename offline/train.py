@@ -41,7 +41,7 @@ from offline.scenes import find_scene
 from offline.spaces import Footprint
 from offline.validate import Comparison, compare, random_loads, summarise
 from offline.workers import Tasks, resume, worker_pool
-from offline.workshop import RegionResult, Workshop, open_workshop
+from offline.workshop import RegionResult, Workshop, open_workshop, run
 from shared.artifact import Dataset, write_artifact
 from shared.atlas import Atlas, Estimator, LocalModels
 from shared.reduced import ERROR_FEATURES, NARROW
@@ -134,7 +134,10 @@ class Pipeline:
 
     def run(self, path: Path) -> None:
         """Train and write the artifact."""
+        # beside the first stage, so that no worker waits for another's compiler
+        compiled = self.executor.submit(run, Workshop.compile_query)
         limits = self._load_range()
+        compiled.result()
         layout = self.layout()
         models = self.local_models(layout, limits)
         estimator, documents, rows = self._validate(models, limits)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from offline.full_model import Equilibrium, FullModel, NoEquilibrium
 from offline.mesh import Mesh, build_mesh, local_thickness
-from offline.patches import PatchResult, PatchTask, train_patch
+from offline.patches import PatchResult, PatchTask, compile_query, train_patch
 from offline.spaces import Footprint, energy_pod, ritz_vectors
 from offline.surface_mesh import accessible_surface
 from shared.artifact import Artifact, read_artifact
@@ -206,9 +206,13 @@ class Workshop:
         loads = (nodal[:, None, None] * footprint.loads.T).reshape(-1, 3)
         return ritz_vectors(self.model, loads[self.model.free])
 
+    def compile_query(self) -> None:
+        """Compile what ``patch`` runs."""
+        compile_query(self.scene, self.body, self.surface)
+
     def patch(self, task: PatchTask) -> PatchResult:
         """Train a local model."""
-        return train_patch(self.scene, self.body, self.model.weights.ravel(), task)
+        return train_patch(self.scene, self.body, self.surface, self.model.weights.ravel(), task)
 
     def sample(self, load: Load) -> NDArray[np.float32] | None:
         """Full displacement (n, 3) mm, None where there is no equilibrium."""

@@ -160,31 +160,32 @@ def assemble_patches(body: Body, models: LocalModels, radius: float) -> Patches:
     point_gradients = np.zeros((count, r, 9 * most), np.int16)
     steps = np.empty((count, r), np.float32)
     weights, mu, lam = (np.zeros((count, most)) for _ in range(3))
-    modes, rows = [], []
-    for k, centre in enumerate(models.centres):
-        region = models.region[k]
-        C = models.steps[region][:, None] * models.modes[k]
-        own = slice(models.point_from[k], models.point_from[k + 1])
-        element, q = np.divmod(models.points[own], per_element)
-        nodes, local = np.unique(body.elements[element], return_inverse=True)
-        V = np.tensordot(bases[region][:, nodes], C, (0, 0))[local.reshape(len(element), -1)]
-        G = _tiles(_mode_gradients(V, gradients[element, q]), most)
-        steps[k] = np.maximum(np.abs(G).max(axis=1), 1e-30) / np.iinfo(np.int16).max
-        point_gradients[k] = np.rint(G / steps[k, :, None])
-        weights[k, : len(element)] = models.weights[own]
-        mu[k, : len(element)], lam[k, : len(element)] = body.mu[element], body.lam[element]
-        near = np.flatnonzero(
-            np.sum((surface.points - centre) ** 2, axis=1) < (models.extent + radius) ** 2
-        )
-        nodes, local = np.unique(surface.nodes[near], return_inverse=True)
-        loaded = bases[region][:, nodes]
-        modes.append(np.tensordot(loaded, C, (0, 0)))
-        rows.append((near, local.reshape(len(near), -1)))
+    modes: list[Field] = [np.empty(0, np.float32)] * count
+    rows: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = [(np.empty(0, int),) * 2] * count
+    for region, steps_of_region in enumerate(models.steps):
+        # one row of memory to a node, so that gathering nodes reads rows
+        basis = np.ascontiguousarray(np.moveaxis(bases[region], 0, -1)).astype(np.float32)
+        for k in np.flatnonzero(models.region == region):
+            own = slice(models.point_from[k], models.point_from[k + 1])
+            element, q = np.divmod(models.points[own], per_element)
+            nodes, local = np.unique(body.elements[element], return_inverse=True)
+            C = steps_of_region[:, None] * models.modes[k]
+            V = _rows(basis, nodes, C)[local.reshape(len(element), -1)]
+            G = _tiles(_mode_gradients(V, gradients[element, q]), most)
+            steps[k] = np.maximum(np.abs(G).max(axis=1), 1e-30) / np.iinfo(np.int16).max
+            point_gradients[k] = np.rint(G / steps[k, :, None])
+            weights[k, : len(element)] = models.weights[own]
+            mu[k, : len(element)], lam[k, : len(element)] = body.mu[element], body.lam[element]
+            reach = models.extent + radius
+            near = np.flatnonzero(np.sum((surface.points - models.centres[k]) ** 2, 1) < reach**2)
+            nodes, local = np.unique(surface.nodes[near], return_inverse=True)
+            modes[k] = _rows(basis, nodes, C)
+            rows[k] = near, local.reshape(len(near), -1)
     near = np.concatenate([r[0] for r in rows])
     return Patches(
         centres=np.ascontiguousarray(models.centres.T),
         frames=models.frames,
-        pressures=models.pressures,
+        pressures=np.ascontiguousarray(models.pressures),
         gradients=point_gradients,
         steps=steps,
         weights=weights,
@@ -202,6 +203,11 @@ def assemble_patches(body: Body, models: LocalModels, radius: float) -> Patches:
         guess=np.pad(models.guess, ((0, 0), (0, 0), (0, NARROW - models.guess.shape[2]))),
         blend=models.blend,
     )
+
+
+def _rows(basis: Field, nodes: NDArray[np.int32], C: Field) -> Field:
+    """Rows (k, 3, m) of modes ``basis @ C`` at some nodes; basis (n, 3, M), C (M, m)."""
+    return (basis[nodes].reshape(-1, len(C)) @ C).reshape(len(nodes), 3, -1)
 
 
 def _mode_gradients(V: Field, gradients: Array) -> Field:

@@ -709,7 +709,7 @@ def _merge(scratch):
     q[NARROW - 2], q[NARROW - 1] = length, 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(inline="always")
 def _solve_patch(patches, k, slot, warm, x, direction, pressure, memory, scratch, scalars):
     """Equilibrium of patch k under ``scratch.wide_load``; its answer goes to memory's slot."""
     _narrow_space(patches, k, x, direction, pressure, scratch)
@@ -741,41 +741,40 @@ def _solve_patch(patches, k, slot, warm, x, direction, pressure, memory, scratch
         scratch.tangent,
         memory.factor[slot],
     )
-    size = math.sqrt(np.dot(scratch.wide_load, scratch.wide_load))
-    loose, target = max(LOOSE * size, 1e-12), max(TOLERANCE * size, 1e-12)
-    factorised = warm and memory.factorised[slot] == 1
-    energy, smallest = equilibrium.potential(system, q, work[0])
-    status, iterations, energy, smallest = descend(
-        system, q, work, energy, smallest, loose, REUSE, MAX_ITERATIONS, factorised, ROUND_OFF
-    )
-    if status != equilibrium.CONVERGED:
-        # once more from rest: a guess can lie beyond a fold of the load path
-        q[:] = 0.0
+    size = max(math.sqrt(np.dot(scratch.wide_load, scratch.wide_load)), 1e-9)
+    status, iterations, energy, smallest = equilibrium.STALLED, 0, 0.0, 0.0
+    for attempt in range(2):
+        if attempt == 1:  # once more from rest: a guess can lie beyond a fold of the load path
+            q[:] = 0.0
+            memory.factorised[slot] = 0
         energy, smallest = equilibrium.potential(system, q, work[0])
         status, more, energy, smallest = descend(
-            system, q, work, energy, smallest, loose, REUSE, MAX_ITERATIONS, False, ROUND_OFF
-        )
+            system, q, work, energy, smallest, LOOSE * size, REUSE, MAX_ITERATIONS,
+            memory.factorised[slot] == 1, ROUND_OFF,
+        )  # fmt: skip
         iterations += more
-    if status == equilibrium.CONVERGED:
-        missed = _enrich(patches, k, memory.wide[slot], scratch) / max(size, 1e-12)
+        if status == equilibrium.CONVERGED:
+            break
+    missed = np.inf
+    while status == equilibrium.CONVERGED:
+        again = _enrich(patches, k, memory.wide[slot], scratch) / size
+        if again > 0.8 * missed:
+            break
+        missed = again
         scalars[MISSED] = max(scalars[MISSED], missed)
-        factorised = factorised or iterations > 0
+        if iterations > 0:
+            memory.factorised[slot] = 1
         status, more, energy, smallest = descend(
-            system, q, work, energy, smallest, target, REUSE, MAX_ITERATIONS, factorised, ROUND_OFF
-        )
+            system, q, work, energy, smallest, TOLERANCE * size, REUSE, MAX_ITERATIONS,
+            memory.factorised[slot] == 1, ROUND_OFF,
+        )  # fmt: skip
         iterations += more
-        while missed > MISSED_MOST and status == equilibrium.CONVERGED:
-            _merge(scratch)
-            again = _enrich(patches, k, memory.wide[slot], scratch) / max(size, 1e-12)
-            if again > 0.8 * missed:
-                break
-            missed = again
-            status, more, energy, smallest = descend(
-                system, q, work, energy, smallest, target, REUSE, MAX_ITERATIONS, True, ROUND_OFF
-            )
-            iterations += more
+        if missed <= MISSED_MOST:
+            break
+        _merge(scratch)
     _to_wide(q, vectors, memory.wide[slot])
-    memory.factorised[slot] = factorised or iterations > 0
+    if iterations > 0:
+        memory.factorised[slot] = 1
     memory.patch[slot] = k if status == equilibrium.CONVERGED else -2 - k
     scalars[STATUS] = max(scalars[STATUS], float(status))
     scalars[ENERGY] = max(scalars[ENERGY], math.sqrt(np.dot(q, q)))
@@ -783,9 +782,11 @@ def _solve_patch(patches, k, slot, warm, x, direction, pressure, memory, scratch
     scalars[SMALLEST_J] = min(scalars[SMALLEST_J], smallest)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(inline="always")
 def _answer(solver, x, normal, direction, pressure, radius):
-    patches, memory, scratch, outcome = solver
+    patches, memory, scratch, outcome = (
+        solver.patches, solver.memory, solver.scratch, solver.outcome,
+    )  # fmt: skip
     activate(patches, x, memory, scratch.distance, outcome.weight)
     scalars = outcome.scalars
     scalars[:] = 0.0
@@ -813,24 +814,7 @@ def _answer(solver, x, normal, direction, pressure, radius):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def press(bound, x, normal, direction, pressure, radius):
-    """Equilibrium of every active patch under a pressed footprint.
-
-    Parameters
-    ----------
-    bound : Bound of Solver
-        Its memory is the starting point on entry; on return the answers of the slots that have
-        weight.  The outcome is overwritten; its scalars are the worst of the active patches.
-    x, normal, direction : ndarray, shape (3,)
-        Contact point (mm), outward normal and unit direction of the load.
-    pressure, radius : float
-        kPa and mm.
-    """
-    _answer(bound.content, x, normal, direction, pressure, radius)
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def query(terms, bound, position, direction, pressure, radius):
+def query(terms, solver, position, direction, pressure, radius):
     """Find the contact point nearest to ``position``, press there, and estimate the error.
 
     A position beyond reach, or a direction out of the tissue, is not solved: distance and tilt in
@@ -839,14 +823,15 @@ def query(terms, bound, position, direction, pressure, radius):
     Parameters
     ----------
     terms : Bound of Terms
-    bound : Bound of Solver
+    solver : Bound of Solver
+        Its memory is the starting point on entry; on return the answers of the slots that have
+        weight.  The outcome is overwritten; its scalars are the worst of the active patches.
     position : ndarray, shape (3,), mm
     direction : ndarray, shape (3,)
         Of any length; zero stands for the inward normal.
     pressure, radius : float
         kPa and mm.
     """
-    solver, terms = bound.content, terms.content
     outcome = solver.outcome
     x, normal, towards, scalars = outcome.point, outcome.normal, outcome.direction, outcome.scalars
     surface = solver.scratch.surface
@@ -860,7 +845,7 @@ def query(terms, bound, position, direction, pressure, radius):
     limit = pressure_limit(outcome.range, normal, towards)
     if distance <= terms.reach and tilt < 90.0:
         _answer(solver, x, normal, towards, pressure, radius)
-        _estimate(terms, solver, pressure / limit, tilt / terms.max_tilt, pressure)
+        _estimate(terms, solver, pressure / limit, tilt / max(terms.max_tilt, 1.0), pressure)
     scalars[DISTANCE], scalars[TILT], scalars[LIMIT] = distance, tilt, limit
 
 

@@ -193,7 +193,7 @@ class Surface:
             self._first,
             self._centres,
             self._radii,
-            values,
+            np.ascontiguousarray(values),
         )
 
     def rim(self) -> NDArray[np.int64]:

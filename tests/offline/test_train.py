@@ -11,7 +11,10 @@ import h5py
 import numpy as np
 import pytest
 
+from offline.workshop import Workshop
+from shared.artifact import read_artifact
 from shared.atlas import Atlas
+from shared.reduced import query
 
 STAGES = ("load range", "Ritz vectors", "local models", "full solutions")
 
@@ -88,3 +91,17 @@ def test_a_resumed_run_makes_the_artifact_of_an_undisturbed_one(resumed, artifac
 def test_nothing_is_left_beside_the_artifact(resumed):
     path = resumed[0]
     assert sorted(file.name for file in path.parent.iterdir()) == ["quick", "quick.h5"]
+
+
+def test_one_compilation_serves_training_and_queries(artifact):
+    atlas = Atlas.load(artifact)
+    workshop = Workshop.of_artifact(read_artifact(artifact))
+    workshop.compile_query()
+    atlas.solve(atlas.surface.vertices[0], 0.1)
+    by_columns = np.asfortranarray(atlas.limits)
+    other = Atlas(
+        atlas.name, atlas.scene, {}, atlas.body, atlas.surface, by_columns, atlas.models,
+        atlas.estimator,
+    )  # fmt: skip
+    other.solve(atlas.surface.vertices[0], 0.1)
+    assert len(query.signatures) == 1
