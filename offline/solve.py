@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offline.full_model import NoEquilibrium
-from offline.validate import relative
+from offline.norms import relative
 from offline.vtu import write_vtu
 from offline.workshop import Load, Workshop
 from shared.answer import describe

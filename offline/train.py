@@ -12,10 +12,11 @@ from __future__ import annotations
 
 import platform
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -25,10 +26,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 from scipy.spatial import cKDTree
+from scipy.special import betaincinv
+from tqdm import tqdm
 
 from offline.checkpoint import Checkpoint, content_key
+from offline.choose import LADDER, Trial, TrialResult, choose
 from offline.mesh import mesh_quality
-from offline.patches import PatchResult, PatchTask
+from offline.patches import PatchResult, PatchTask, RegionResult
 from offline.sampling import (
     area,
     centred_points,
@@ -41,20 +45,28 @@ from offline.scenes import find_scene
 from offline.spaces import Footprint
 from offline.validate import Comparison, compare, random_loads, summarise
 from offline.workers import Tasks, resume, worker_pool
-from offline.workshop import RegionResult, Workshop, open_workshop, run
+from offline.workshop import Workshop, open_workshop, run
 from shared.artifact import Dataset, write_artifact
 from shared.atlas import Atlas, Estimator, LocalModels
 from shared.reduced import ERROR_FEATURES, NARROW
-from shared.scene import Scene
+from shared.scene import Scene, Size, Tolerance
 
 Array = NDArray[np.float64]
 
 ARTIFACTS = Path("artifacts")
 
+RITZ_SPACING = 0.455
+"""Of the footprints whose Ritz vectors are taken, in units of the patch spacing."""
+
 RITZ_REACH = 0.8
 """How far from its centre a local model learns from footprints, in units of the patch spacing."""
 
+BATCH, LEAST = 60, 180
+"""Full solutions between two looks at whether they suffice, and the least that calibrate."""
+
 CONTACTS_PER_PATCH = 400
+
+TRIAL_PATCHES = 8
 COVERAGE = 0.97
 """Share of known loads whose errors the estimate must cover: above 95 %, for unseen ones to be."""
 
@@ -100,6 +112,7 @@ class Layout:
     contacts : ndarray, shape (c, 3), mm
     contacts_of_patch : list of ndarray
     extent : float, mm
+    size : Size
     """
 
     centres: Array
@@ -110,6 +123,7 @@ class Layout:
     contacts: Array
     contacts_of_patch: list[NDArray[np.int64]]
     extent: float
+    size: Size
 
 
 class Pipeline:
@@ -138,10 +152,20 @@ class Pipeline:
         compiled = self.executor.submit(run, Workshop.compile_query)
         limits = self._load_range()
         compiled.result()
-        layout = self.layout()
+        choice = None
+        size = self.scene.training.size
+        if size is None:
+            choice = choose(
+                self.scene.tolerance, self.scene.budget, lambda size: self._trial(size, limits)
+            )
+            size = choice.size
+            tqdm.write(f"size: {size}\n{choice.why}", file=sys.stderr)
+        layout = self.layout(size)
         models = self.local_models(layout, limits)
         estimator, documents, rows = self._validate(models, limits)
         documents["training"] |= {"layout": self._describe(layout, models)}
+        if choice is not None:
+            documents["training"]["choice"] = choice.document
         self._write(path, models, limits, estimator, documents)
         report = path.parent / path.stem / "report"
         report.mkdir(parents=True, exist_ok=True)
@@ -168,16 +192,35 @@ class Pipeline:
         at_vertices[:, 0] = np.exp(at_vertices[:, 0])
         return at_vertices
 
-    def layout(self) -> Layout:
+    def _trial(self, size: Size, limits: Array) -> Trial:
+        """Try a size on patches spread over the surface."""
+        layout = self.layout(size)
+        rng = np.random.default_rng([self.scene.seed, 4])
+        places = spread_points(self.surface, min(TRIAL_PATCHES, len(layout.centres)), rng)
+        chosen = np.unique(cKDTree(layout.centres).query(places)[1])
+        footprints = self._footprints(layout, limits)
+        tasks = {
+            f"trial-{LADDER.index(size)}-{k}": (
+                Workshop.trial, self._patch_task(layout, footprints, limits, int(k)),
+            )
+            for k in chosen
+        }  # fmt: skip
+        title = f"trying {size.modes} modes"
+        found = self._stage(title, tasks, asdict)
+        return Trial.of(size, [TrialResult(**found[name]) for name in tasks])
+
+    def layout(self, size: Size) -> Layout:
         """Place patches, regions and Ritz vectors."""
         settings, surface = self.scene.training, self.surface
         rng = np.random.default_rng([self.scene.seed, 2])
-        centres = centred_points(surface, spacing_count(surface, settings.patch_spacing), rng)
+        centres = centred_points(surface, spacing_count(surface, size.patch_spacing), rng)
         normals = np.array([surface.project(x)[1] for x in centres])
         seeds = centred_points(surface, spacing_count(surface, settings.region_spacing), rng)
         region = cKDTree(seeds).query(centres)[1].astype(np.int32)
         region = np.unique(region, return_inverse=True)[1].astype(np.int32)
-        ritz = spread_points(surface, spacing_count(surface, settings.ritz_spacing), rng)
+        ritz = spread_points(
+            surface, spacing_count(surface, RITZ_SPACING * size.patch_spacing), rng
+        )
         contacts = np.vstack(
             [surface.vertices, random_points(surface, CONTACTS_PER_PATCH * len(centres), rng)]
         )
@@ -191,10 +234,11 @@ class Pipeline:
             normals=normals,
             region=region,
             ritz=ritz,
-            ritz_of_patch=neighbours(ritz, centres, RITZ_REACH * settings.patch_spacing),
+            ritz_of_patch=neighbours(ritz, centres, RITZ_REACH * size.patch_spacing),
             contacts=contacts,
             contacts_of_patch=contacts_of_patch,
             extent=1.02 * near.max() + settings.blend,
+            size=size,
         )
 
     def _regions(
@@ -208,7 +252,7 @@ class Pipeline:
             tasks[f"region-{r}"] = (
                 Workshop.region,
                 [footprints[i] for i in used],
-                self.scene.training.region_modes,
+                layout.size.region_modes,
             )
             members.append({int(i): place for place, i in enumerate(used)})
         found = self._stage("Ritz vectors", tasks, asdict)
@@ -225,36 +269,37 @@ class Pipeline:
             found.append(Footprint(x, normal, float(fields[0])))
         return found
 
+    def _patch_task(
+        self, layout: Layout, footprints: Sequence[Footprint], limits: Array, k: int
+    ) -> PatchTask:
+        """Where patch k is, and the loads it answers."""
+        contacts = layout.contacts[layout.contacts_of_patch[k]]
+        return PatchTask(
+            centre=layout.centres[k],
+            normal=layout.normals[k],
+            pressure=float(self._range_at(layout.centres[[k]], limits)[0, 0]),
+            footprints=[footprints[i] for i in layout.ritz_of_patch[k]],
+            contacts=contacts,
+            normals=np.array([self.surface.project(x)[1] for x in contacts]),
+            ranges=self._range_at(contacts, limits),
+            extent=layout.extent,
+            blend=self.scene.training.blend,
+            size=layout.size,
+            seed=self.scene.seed + k,
+        )
+
     def local_models(self, layout: Layout, limits: Array) -> LocalModels:
         """Stages 2 and 3."""
         footprints = self._footprints(layout, limits)
         regions = self._regions(layout, footprints)
-        ranges = self._range_at(layout.contacts, limits)
-        contact_normals = np.array([self.surface.project(x)[1] for x in layout.contacts])
-        pressures = self._range_at(layout.centres, limits)[:, 0]
         tasks = {}
         for k in range(len(layout.centres)):
             result, places = regions[layout.region[k]]
             chosen = [places[int(i)] for i in layout.ritz_of_patch[k]]
-            hits = layout.contacts_of_patch[k]
             tasks[f"patch-{k}"] = (
                 Workshop.patch,
-                PatchTask(
-                    centre=layout.centres[k],
-                    normal=layout.normals[k],
-                    pressure=float(pressures[k]),
-                    basis=result.basis,
-                    steps=result.steps,
-                    orthonormal=result.orthonormal,
-                    ritz=result.ritz[chosen],
-                    footprints=[footprints[i] for i in layout.ritz_of_patch[k]],
-                    contacts=layout.contacts[hits],
-                    normals=contact_normals[hits],
-                    ranges=ranges[hits],
-                    extent=layout.extent,
-                    blend=self.scene.training.blend,
-                    seed=self.scene.seed + k,
-                ),
+                replace(result, ritz=result.ritz[chosen]),
+                self._patch_task(layout, footprints, limits, k),
             )
         found = self._stage("local models", tasks, asdict)
         results = [PatchResult(**found[name]) for name in tasks]
@@ -264,7 +309,7 @@ class Pipeline:
             region=layout.region,
             centres=layout.centres,
             frames=np.stack([r.frame for r in results]),
-            pressures=pressures,
+            pressures=self._range_at(layout.centres, limits)[:, 0],
             modes=np.stack([r.modes for r in results]).astype(np.float32),
             point_from=np.concatenate([[0], np.cumsum([len(r.points) for r in results])]),
             points=np.concatenate([r.points for r in results]),
@@ -283,21 +328,22 @@ class Pipeline:
 
         What validation says of the estimate is of one calibrated on the other half of the loads.
         """
-        count = self.scene.training.samples
         rng = np.random.default_rng([self.scene.seed, 3])
-        loads = random_loads(self.workshop.surface, limits, self.scene, 2 * count, rng)
-        tasks = {f"sample-{i}": (Workshop.sample, load) for i, load in enumerate(loads)}
-        found = self._stage(
-            "full solutions",
-            tasks,
-            lambda u: {"displacement": np.empty(0) if u is None else u},
-        )
+        count = self.scene.training.samples
+        loads = random_loads(self.workshop.surface, limits, self.scene, count, rng)
         atlas = self._atlas(models, limits, Estimator(np.zeros((2, ERROR_FEATURES))), {})
-        rows = [
-            compare(self.workshop, atlas, load, found[name]["displacement"])
-            for name, load in zip(tasks, loads, strict=True)
-            if found[name]["displacement"].size
-        ]
+        rows: list[Comparison] = []
+        for start in range(0, count, BATCH):
+            batch = {f"sample-{start + i}": load for i, load in enumerate(loads[start:][:BATCH])}
+            tasks = {name: (Workshop.sample, load) for name, load in batch.items()}
+            found = self._stage("full solutions", tasks, lambda u: {"u": [] if u is None else u})
+            rows += [
+                compare(self.workshop, atlas, load, found[name]["u"])
+                for name, load in batch.items()
+                if found[name]["u"].size
+            ]
+            if len(rows) >= LEAST and _accurate(rows, self.scene.tolerance):
+                break
         for half, other in ((rows[::2], rows[1::2]), (rows[1::2], rows[::2])):
             estimator = calibrate(other)
             for row in half:
@@ -324,7 +370,8 @@ class Pipeline:
         """Run the tasks that are not in the checkpoint yet; return all results by name."""
         started = time.perf_counter()
         results = resume(title, self.executor, self.checkpoint, tasks, pack)
-        self.seconds[title] = round(time.perf_counter() - started, 2)
+        seconds = self.seconds.get(title, 0.0) + time.perf_counter() - started
+        self.seconds[title] = round(seconds, 2)
         return results
 
     def _describe(self, layout: Layout, models: LocalModels) -> dict[str, Any]:
@@ -419,6 +466,17 @@ class Pipeline:
         }
         documents["provenance"]["wall_seconds"] = round(sum(self.seconds.values()), 1)
         write_artifact(path, self.scene.text, documents, datasets)
+
+
+def _accurate(rows: Sequence[Comparison], tolerance: Tolerance) -> bool:
+    """Whether 95 % of all loads are within tolerance, with as much confidence (Clopper-Pearson)."""
+    missed = sum(
+        not row.converged
+        or row.displacement > tolerance.displacement
+        or row.von_mises > tolerance.von_mises
+        for row in rows
+    )
+    return bool(betaincinv(missed + 1, len(rows) - missed, 0.95) <= 0.05)
 
 
 def calibrate(rows: Sequence[Comparison]) -> Estimator:

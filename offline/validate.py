@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from offline.norms import relative, statistics
 from offline.sampling import cone, random_points
 from offline.workers import completed, worker_pool
 from offline.workshop import Load, Workshop, open_artifact
@@ -153,12 +154,6 @@ def random_loads(
     return loads
 
 
-def relative(approximation: Array, reference: Array) -> float:
-    """Relative L2 error; 0 where there is nothing to approximate."""
-    scale = np.linalg.norm(reference)
-    return float(np.linalg.norm(approximation - reference) / scale) if scale else 0.0
-
-
 def compare(workshop: Workshop, atlas: Atlas, load: Load, reference: Array) -> Comparison:
     """Answer a load with the reduced model and compare with the full ``reference`` (n, 3) mm."""
     solution = atlas.solve(load.position, load.pressure, load.direction)
@@ -188,15 +183,6 @@ def compare(workshop: Workshop, atlas: Atlas, load: Load, reference: Array) -> C
         estimated_displacement=solution.error_displacement,
         estimated_von_mises=solution.error_von_mises,
     )
-
-
-def statistics(errors: Sequence[float]) -> dict[str, float]:
-    """Mean, 95th percentile and maximum."""
-    return {
-        "mean": float(np.mean(errors)),
-        "p95": float(np.percentile(errors, 95)),
-        "max": float(np.max(errors)),
-    }
 
 
 def summarise(rows: Sequence[Comparison]) -> dict[str, Any]:

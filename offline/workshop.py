@@ -9,6 +9,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -17,9 +18,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from offline.choose import TrialResult
 from offline.full_model import Equilibrium, FullModel, NoEquilibrium
 from offline.mesh import Mesh, build_mesh, local_thickness
-from offline.patches import PatchResult, PatchTask, compile_query, train_patch
+from offline.norms import relative
+from offline.patches import (
+    PatchResult,
+    PatchTask,
+    RegionResult,
+    compile_query,
+    local_trainer,
+    random_load,
+    train_patch,
+)
 from offline.spaces import Footprint, energy_pod, ritz_vectors
 from offline.surface_mesh import accessible_surface
 from shared.artifact import Artifact, read_artifact
@@ -35,6 +46,11 @@ Array = NDArray[np.float64]
 POINTS_IN_BASIS = 50
 """Footprints all of whose Ritz vectors make a region's basis; of others the linear ones do."""
 
+TRIAL = 7
+"""Sets the random numbers of a trial apart from those of training."""
+
+TRIAL_LOADS = 10
+
 RESOLUTION = 2e-6
 """Displacement (mm) that a step of a stored mode amounts to where the mode is at work: a mode of
 small amplitude is stored in coarse steps, which compress well."""
@@ -47,29 +63,6 @@ class Load:
     position: Array
     direction: Array
     pressure: float
-
-
-@dataclass(frozen=True)
-class RegionResult:
-    """Basis of a region, (M, 3 n) int16 in steps (M,), and what patches learn from.
-
-    ``orthonormal`` (M, M) holds, as columns in the basis, modes orthonormal in the energy of the
-    rest state; ``ritz`` (k, M, 19) are Ritz vectors in those.
-    """
-
-    basis: NDArray[np.int16]
-    steps: NDArray[np.float32]
-    orthonormal: NDArray[np.float32]
-    ritz: NDArray[np.float32]
-
-    def truncate(self, modes: int) -> RegionResult:
-        """The leading modes; ``orthonormal`` is triangular, so its leading block stays right."""
-        return RegionResult(
-            self.basis[:modes],
-            self.steps[:modes],
-            self.orthonormal[:modes, :modes],
-            self.ritz[:, :modes],
-        )
 
 
 class Workshop:
@@ -210,9 +203,40 @@ class Workshop:
         """Compile what ``patch`` runs."""
         compile_query(self.scene, self.body, self.surface)
 
-    def patch(self, task: PatchTask) -> PatchResult:
+    def patch(self, region: RegionResult, task: PatchTask) -> PatchResult:
         """Train a local model."""
-        return train_patch(self.scene, self.body, self.surface, self.model.weights.ravel(), task)
+        weights = self.model.weights.ravel()
+        return train_patch(self.scene, self.body, self.surface, weights, region, task)
+
+    def trial(self, task: PatchTask) -> TrialResult:
+        """Train a local model by itself and judge it on loads it has not seen."""
+        region = self.region(task.footprints, task.size.region_modes)
+        result = self.patch(region, task)
+        trainer = local_trainer(self.scene, self.body, self.surface, region, task, result)
+        rng = np.random.default_rng([task.seed, TRIAL])
+        displacement: list[float] = []
+        von_mises: list[float] = []
+        seconds: list[float] = []
+        while len(seconds) < TRIAL_LOADS:
+            load = Load(*random_load(self.scene, task, rng))
+            reference = self.sample(load)
+            if reference is None:
+                continue
+            started = time.perf_counter()
+            converged = trainer.solve(load.position, load.direction, load.pressure)
+            seconds.append(time.perf_counter() - started)
+            errors = np.inf, np.inf
+            if converged:
+                errors = self.errors(trainer.displacement, reference.astype(float))
+            displacement.append(errors[0])
+            von_mises.append(errors[1])
+        return TrialResult(np.array(displacement), np.array(von_mises), float(np.median(seconds)))
+
+    def errors(self, displacement: Array, reference: Array) -> tuple[float, float]:
+        """Relative errors of displacement and of von Mises stress beyond the clamped layer."""
+        kept = self.beyond_clamped_layer
+        stresses = [self.von_mises(u)[kept] for u in (displacement, reference)]
+        return relative(displacement, reference), relative(*stresses)
 
     def sample(self, load: Load) -> NDArray[np.float32] | None:
         """Full displacement (n, 3) mm, None where there is no equilibrium."""

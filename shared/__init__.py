@@ -5,6 +5,8 @@ import os
 import sys
 from pathlib import Path
 
+KERNELS = ("shared", "offline", "offline/methods")
+
 
 def _kernel_cache() -> None:
     """Give compiled kernels a cache of their own for every state of the sources.
@@ -14,7 +16,9 @@ def _kernel_cache() -> None:
     """
     packages = Path(__file__).parents[1]
     digest = hashlib.sha256()
-    for source in sorted([*packages.glob("shared/*.py"), *packages.glob("offline/*.py")]):
+    for source in sorted(
+        source for folder in KERNELS for source in (packages / folder).glob("*.py")
+    ):
         digest.update(source.read_bytes())
     cache = Path(__file__).parent / "__pycache__"
     if os.access(cache if cache.exists() else cache.parent, os.W_OK):

@@ -161,18 +161,25 @@ class Budget(_Part):
     query: Positive = Field(description="time for one cold query, s")
 
 
+class Size(_Part):
+    """How large a reduced model is."""
+
+    patch_spacing: Positive = Field(description="of the centres of local models, mm")
+    modes: int = Field(ge=20, le=400, multiple_of=4, description="of a local model's wide space")
+    cubature_points: int = Field(ge=16, le=5000, multiple_of=16, description="of a local model")
+    region_modes: int = Field(ge=4, le=2000, description="of a region")
+
+
 class Training(_Part):
     """How the reduced model is trained."""
 
     limit_spacing: Positive = Field(description="of points where the largest pressure is found, mm")
-    ritz_spacing: Positive = Field(description="of points whose Ritz vectors are taken, mm")
-    patch_spacing: Positive = Field(description="of the centres of local models, mm")
     region_spacing: Positive = Field(description="of the regions that share a basis, mm")
-    modes: int = Field(ge=20, le=400, multiple_of=4, description="of a local model's wide space")
-    region_modes: int = Field(ge=4, le=2000, description="of a region")
     blend: Positive = Field(description="width over which neighbouring local models blend, mm")
-    cubature_points: int = Field(ge=16, le=5000, multiple_of=16, description="of a local model")
-    samples: int = Field(ge=20, description="full solutions that calibrate the error estimate")
+    samples: int = Field(ge=60, description="full solutions that validate and calibrate, at most")
+    size: Size | None = Field(
+        None, description="of the reduced model; if absent, the smallest that meets the tolerance"
+    )
 
 
 class Scene(_Part):

@@ -27,8 +27,9 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from offline.checkpoint import Checkpoint, content_key
 from offline.full_model import FullModel
+from offline.norms import relative, statistics
 from offline.spaces import energy_pod
-from offline.validate import random_loads, relative, statistics, unseen_loads
+from offline.validate import random_loads, unseen_loads
 from offline.workers import resume, worker_pool
 from offline.workshop import Load, Workshop, open_artifact
 from shared import equilibrium

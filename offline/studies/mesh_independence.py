@@ -18,8 +18,10 @@ from offline.scenes import find_scene
 from offline.train import Pipeline
 from offline.workshop import Workshop
 from shared.atlas import Atlas
+from shared.scene import Size
 
-SPACING = {"patch_spacing": 9.0, "ritz_spacing": 3.0, "region_spacing": 30.0, "region_modes": 150}
+SIZE = Size(patch_spacing=9.0, modes=64, cubature_points=128, region_modes=150)
+REGION_SPACING = 30.0  # mm
 PRESSURE = 1.0  # kPa
 
 
@@ -36,13 +38,13 @@ class _Inline(ThreadPoolExecutor):
 
 def _sparse_atlas(name: str, checkpoint: Checkpoint) -> Atlas:
     scene = find_scene(name)
-    training = scene.training.model_copy(update=SPACING)
+    training = scene.training.model_copy(update={"region_spacing": REGION_SPACING})
     scene = scene.model_copy(update={"training": training})
     pipeline = Pipeline(scene, None, checkpoint)  # type: ignore[arg-type]
     pipeline.executor = _Inline(pipeline.workshop)
     limits = np.zeros((len(pipeline.surface.vertices), 7))
     limits[:, 0], limits[:, 1:4] = PRESSURE, 1.0
-    layout = pipeline.layout()
+    layout = pipeline.layout(SIZE)
     return pipeline.untested_atlas(limits, layout)
 
 

@@ -4,7 +4,8 @@ import json
 import numpy as np
 import pytest
 
-from offline.validate import random_loads, relative, unseen_loads, validate
+from offline.norms import relative
+from offline.validate import random_loads, unseen_loads, validate
 from shared.atlas import Atlas
 
 QUERIES = 12

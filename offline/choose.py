@@ -1,0 +1,152 @@
+"""How large a reduced model must be: the smallest that meets the scene's tolerance.
+
+Sizes are tried on a few patches spread over the surface, each trained by itself and judged on loads
+that it has not seen, until the smallest of the ladder is found that is good enough.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offline.norms import statistics
+from shared.scene import Budget, Size, Tolerance
+
+Array = NDArray[np.float64]
+
+LADDER = (
+    Size(patch_spacing=3.2, modes=24, cubature_points=64, region_modes=120),
+    Size(patch_spacing=2.6, modes=32, cubature_points=80, region_modes=150),
+    Size(patch_spacing=2.2, modes=44, cubature_points=96, region_modes=190),
+    Size(patch_spacing=1.8, modes=64, cubature_points=128, region_modes=246),
+    Size(patch_spacing=1.5, modes=80, cubature_points=176, region_modes=300),
+)
+"""Sizes from the smallest to the largest; each next one has about two thirds of the error."""
+
+MARGIN = 0.8
+"""Share of the tolerance that the 95th percentile of a trial's errors may reach."""
+
+WORST = 3.0
+"""Multiple of the tolerance that its largest error may reach."""
+
+
+@dataclass(frozen=True)
+class TrialResult:
+    """One patch on loads it has not seen: relative errors (k,) and median time of a solve, s."""
+
+    displacement: Array
+    von_mises: Array
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A size on all the patches it was tried on."""
+
+    size: Size
+    displacement: dict[str, float]
+    von_mises: dict[str, float]
+    loads: int
+    solve_us: float
+
+    @classmethod
+    def of(cls, size: Size, results: list[TrialResult]) -> Trial:
+        """Gather the results of the patches."""
+        displacement = np.concatenate([r.displacement for r in results])
+        return cls(
+            size,
+            statistics(displacement),
+            statistics(np.concatenate([r.von_mises for r in results])),
+            len(displacement),
+            1e6 * float(np.median([r.seconds for r in results])),
+        )
+
+    def meets(self, tolerance: Tolerance) -> bool:
+        """Whether errors are within tolerance, with a margin."""
+        return all(
+            errors["p95"] <= MARGIN * allowed and errors["max"] <= WORST * allowed
+            for errors, allowed in (
+                (self.displacement, tolerance.displacement),
+                (self.von_mises, tolerance.von_mises),
+            )
+        )
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """What an artifact keeps of it."""
+        return {
+            "size": self.size.model_dump(),
+            "displacement": self.displacement,
+            "von_mises": self.von_mises,
+            "loads": self.loads,
+            "solve_us": round(self.solve_us, 1),
+        }
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A chosen size, the trials from the smallest to the largest, and why in words."""
+
+    size: Size
+    trials: list[Trial]
+    why: str
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """What an artifact keeps of it."""
+        return {"why": self.why, "tried": [trial.document for trial in self.trials]}
+
+
+def choose(tolerance: Tolerance, budget: Budget, attempt: Callable[[Size], Trial]) -> Choice:
+    """Find the smallest size of the ladder that meets the tolerance, by bisection.
+
+    Parameters
+    ----------
+    tolerance : Tolerance
+    budget : Budget
+        A size over it is chosen all the same, and the reason says so.
+    attempt : callable
+        Tries a size.
+    """
+    trials: dict[int, Trial] = {}
+    low, high = 0, len(LADDER) - 1
+    while low < high:
+        middle = (low + high) // 2
+        trials[middle] = attempt(LADDER[middle])
+        if trials[middle].meets(tolerance):
+            high = middle
+        else:
+            low = middle + 1
+    if low not in trials:  # the largest: nothing smaller will do
+        trials[low] = attempt(LADDER[low])
+    tried = [trials[i] for i in sorted(trials)]
+    return Choice(LADDER[low], tried, _reason(tolerance, budget, trials[low], tried))
+
+
+def _reason(tolerance: Tolerance, budget: Budget, chosen: Trial, tried: list[Trial]) -> str:
+    if chosen.meets(tolerance):
+        why = f"the smallest of {len(LADDER)} sizes that meets the tolerance: {_errors(chosen)}"
+    else:
+        why = (
+            f"no size meets the tolerance of {tolerance.displacement:.2%} and "
+            f"{tolerance.von_mises:.2%}; this is the most accurate: {_errors(chosen)}"
+        )
+    allowed = 1e6 * budget.query
+    if chosen.solve_us > allowed:
+        why += f"; it takes {chosen.solve_us:.0f} µs to solve, over the budget of {allowed:.0f} µs"
+        within = [trial for trial in tried if trial.solve_us <= allowed]
+        if within:
+            best = within[-1]
+            why += f"; the best within it: {_errors(best)} in {best.solve_us:.0f} µs"
+    return why
+
+
+def _errors(trial: Trial) -> str:
+    return (
+        f"95th percentile of errors on {trial.loads} trial loads "
+        f"{trial.displacement['p95']:.2%} displacement, {trial.von_mises['p95']:.2%} von Mises"
+    )
