@@ -31,7 +31,7 @@ def stiffening(workshop: Workshop, mesh: Tetrahedra, body: Elastic) -> float:
         wanted = np.zeros(load.size)
         free = workshop.model.free
         wanted[free] = workshop.model.solve_linear(load.ravel()[free])
-        force = np.ascontiguousarray((mesh.to_scene.T @ load)[: mesh.free].T)
+        force = np.ascontiguousarray((mesh.carrier.T @ load)[: mesh.free].T)
         body.stencil.solve(force, RESIDUAL, own.size, step)
         own[:, : mesh.free] = step
         found = mesh.displacement(own).ravel()

@@ -33,7 +33,7 @@ from shared.tissue import lame
 
 Array = NDArray[np.float64]
 
-TOLERANCE = 1e-2
+TOLERANCE = 3e-3
 """Residual of an answer relative to its load."""
 
 POISSON = 0.25

@@ -13,12 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_matrix, diags
+from scipy.sparse.linalg import splu
 
 from offline.mesh import Mesh
 from offline.methods.method import Case
 from offline.workshop import Workshop
-from shared.elements import HEX_CORNERS, hexahedron, shape
+from shared.elements import HEX_CORNERS, gauss, hexahedron, quadrilateral, shape
 from shared.errors import PalpateError
 from shared.scene import Extrusion, Scene
 
@@ -38,6 +39,12 @@ EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 SAME = 1e-9
 """Coordinates in the unit cube that differ by less are equal."""
 
+GAUSS = 8
+"""Points a side of a face at which it is integrated: the lattice's functions have kinks."""
+
+NEGLIGIBLE = 1e-5
+"""Share of a force too small to be carried over."""
+
 
 @dataclass(frozen=True)
 class Tetrahedra:
@@ -54,7 +61,10 @@ class Tetrahedra:
     free : int
         How many of the nodes are.
     to_scene : csr_matrix, shape (n, m)
-        Interpolates nodal values; its transpose carries forces over, which then do the same work.
+        Interpolates nodal values.
+    carrier : csr_matrix, shape (n, m)
+        Its transpose carries forces over: those on the surface as the traction they stand for, for
+        which forces on a few nodes of a finer mesh are no substitute.
     """
 
     nodes: Array
@@ -62,6 +72,7 @@ class Tetrahedra:
     mirrored: Ints
     free: int
     to_scene: csr_matrix
+    carrier: csr_matrix
 
     @classmethod
     def of(cls, workshop: Workshop, divisions: Divisions) -> Tetrahedra:
@@ -70,7 +81,7 @@ class Tetrahedra:
         Raises
         ------
         PalpateError
-            If the lattice is so coarse that a tetrahedron is inside out.
+            If the map turns a tetrahedron inside out.
         """
         mesh, own = workshop.mesh, lattice(workshop.scene)
         nodes, clamped = _mapped(mesh, own, _grid(divisions) / np.array(divisions))
@@ -80,8 +91,16 @@ class Tetrahedra:
         order = np.lexsort((-np.bincount(edges_of(elements).ravel()), clamped))
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
-        to_scene = _interpolation(mesh, own, divisions)[:, order]
-        return cls(nodes[order], rank[elements], rank[mirrored], int(np.sum(~clamped)), to_scene)
+        at = _coordinates(mesh, own)
+        to_scene = _interpolation(at, divisions)[:, order]
+        return cls(
+            nodes[order],
+            rank[elements],
+            rank[mirrored],
+            int(np.sum(~clamped)),
+            to_scene,
+            _carrier(mesh, at, divisions, order, to_scene),
+        )
 
     @property
     def both_cuts(self) -> Ints:
@@ -96,7 +115,7 @@ class Tetrahedra:
     def load(self, case: Case, out: Array) -> None:
         """Write the nodal forces (3, m) mN that a case amounts to."""
         out[:] = 0.0
-        matrix = self.to_scene
+        matrix = self.carrier
         _carry(matrix.indptr, matrix.indices, matrix.data, case.nodes, case.forces, out)
 
     def displacement(self, own: Array) -> Array:
@@ -176,21 +195,56 @@ def _mapped(mesh: Mesh, own: Divisions, at: Array) -> tuple[Array, NDArray[np.bo
     return np.einsum("qa,qai->qi", N, mesh.nodes[elements]), clamped
 
 
-def _interpolation(mesh: Mesh, own: Divisions, divisions: Divisions) -> csr_matrix:
-    """Interpolate trilinearly from a lattice to a scene's nodes: ``Tetrahedra.to_scene``."""
+def _coordinates(mesh: Mesh, own: Divisions) -> Array:
+    """Coordinates (n, 3) in the unit cube of a scene's nodes."""
     reference = hexahedron(mesh.elements.shape[1])
     cells = np.moveaxis(np.indices(own), 0, -1).reshape(-1, 3)
     at = np.empty((len(mesh.nodes), 3))
     at[mesh.elements] = (cells[:, None] + (reference + 1) / 2) / own
-    held, local = _located(at, divisions)
+    return at
+
+
+def _interpolation(at: Array, divisions: Divisions) -> csr_matrix:
+    """Matrix (q, m) that interpolates a lattice trilinearly at points (q, 3) of the unit cube."""
+    cells, local = _located(at, divisions)
     N, _ = shape(HEX_CORNERS, local)
     N[abs(N) < SAME] = 0.0
     rows = np.repeat(np.arange(len(at)), 8)
-    columns = _corners(held, divisions).ravel()
+    columns = _corners(cells, divisions).ravel()
     size = len(at), int(np.prod(np.array(divisions) + 1))
     matrix = csr_matrix((N.ravel(), (rows, columns)), size)
     matrix.eliminate_zeros()
     return matrix
+
+
+def _carrier(
+    mesh: Mesh, at: Array, divisions: Divisions, order: Ints, to_scene: csr_matrix
+) -> csr_matrix:
+    """``Tetrahedra.carrier``, on the surface ``M^-1 B`` with a lattice's nodes in a given order.
+
+    ``M`` holds the integrals over the surface of products of the scene's shape functions, so that
+    its inverse turns forces to tractions; ``B`` those of the scene's with the lattice's.
+    """
+    points, weights = gauss(GAUSS, 2)
+    N, dN = shape(quadrilateral(mesh.faces.shape[1]), points)
+    tangents = np.einsum("fai,qaj->fqij", mesh.nodes[mesh.faces], dN)
+    area = np.linalg.norm(np.cross(tangents[..., 0], tangents[..., 1]), axis=2) * weights
+    surface, local = np.unique(mesh.faces, return_inverse=True)
+    local = local.reshape(mesh.faces.shape)
+    rows = np.repeat(local[:, None], len(points), axis=1).ravel()
+    columns = np.repeat(np.arange(area.size), local.shape[1])
+    size = len(surface), area.size
+    values = csr_matrix((np.tile(N, (len(local), 1)).ravel(), (rows, columns)), size)
+    weighted = values @ diags(area.ravel())
+    where = np.einsum("qa,fai->fqi", N, at[mesh.faces]).reshape(-1, 3)
+    B = weighted @ _interpolation(where, divisions)[:, order]
+    carried = splu((weighted @ values.T).tocsc()).solve(B.toarray())
+    carried[abs(carried) < NEGLIGIBLE] = 0.0
+    inner = np.ones(len(mesh.nodes))
+    inner[surface] = 0.0
+    spread = csr_matrix((np.ones(len(surface)), (surface, np.arange(len(surface)))))
+    spread.resize(len(inner), len(surface))
+    return (diags(inner) @ to_scene + spread @ csr_matrix(carried)).tocsr()
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
