@@ -27,16 +27,13 @@ from numpy.typing import NDArray
 
 from offline.methods.calibration import stiffening
 from offline.methods.method import Answer, Case
-from offline.methods.relaxation import Elastic, Ints, Stencil, relax
+from offline.methods.relaxation import TOLERANCE, Elastic, Ints, Stencil, relax
 from offline.methods.tetrahedra import Divisions, Tetrahedra, gradients
 from offline.workshop import Workshop
 from shared.tissue import lame
 
 Array = NDArray[np.float64]
 Law = Literal["linear", "st-venant-kirchhoff"]
-
-TOLERANCE = 1e-2
-"""Residual of an answer relative to its load."""
 
 POISSON = 0.25
 """Poisson's ratio with which linear tetrahedra come nearest to nearly incompressible tissue."""

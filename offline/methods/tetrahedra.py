@@ -232,7 +232,7 @@ def _carrier(
     surface, local = np.unique(mesh.faces, return_inverse=True)
     local = local.reshape(mesh.faces.shape)
     rows = np.repeat(local[:, None], len(points), axis=1).ravel()
-    columns = np.repeat(np.arange(area.size), local.shape[1])
+    columns = np.repeat(np.arange(area.size), mesh.faces.shape[1])
     size = len(surface), area.size
     values = csr_matrix((np.tile(N, (len(local), 1)).ravel(), (rows, columns)), size)
     weighted = values @ diags(area.ravel())
