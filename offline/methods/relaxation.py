@@ -26,8 +26,8 @@ Single = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 TOLERANCE = 3e-3
-"""Residual, relative to the load, of an answer: on the turbinate its displacement is then within 1 %
-in the median, 2 % at the 95th percentile, of that at rest; the models are off by ten times more."""
+"""Residual relative to the load: on the turbinate, displacements are then within 1 % in the median,
+2 % at the 95th percentile, of those at rest; the models themselves are off by ten times more."""
 
 MAX_STEPS = 100
 MAX_ITERATIONS = 20_000
