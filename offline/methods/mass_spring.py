@@ -1,0 +1,261 @@
+"""Mass-spring systems, their springs identified from linear elasticity.
+
+The springs join the corners of every cell along its edges and along both diagonals of each face,
+which are the edges of its two cuts into tetrahedra.  Their stiffnesses are identified after Lloyd,
+Szekely & Harders (IEEE TVCG 13, 2007), who choose those whose linearised stiffness matrix is
+nearest to that of the finite element model, ``min || K - sum_s k_s b_s b_s^T ||`` in the Frobenius
+norm with ``b_s`` (3 m,) the elongation of a spring by nodal displacements.  They do so for one
+element at a time, and regular ones have closed forms: ``2 sqrt(2) / 25 E l`` for a tetrahedron of
+edge ``l``.  Here it is done for the assembled matrix of linear tetrahedra, the mean of the two
+cuts, and with ``k_s >= 0`` for stability: in elements as flat as the turbinate's, stiffnesses added
+up from elements are negative in places, and cut off at zero they leave a body that is much too soft
+in some directions, with three times the error.
+
+A limit of the method, whatever its springs: a network of central forces obeys Cauchy's relation,
+``lambda = mu``, so that its Poisson's ratio is 1/4.  The network is therefore identified from
+tissue of that ratio; tissue of .45, which gives way sideways, it cannot be.  What can be made up
+for is the overall stiffness, by a factor that gives small loads the full model's answer in the
+mean.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix, csr_matrix
+
+from offline.methods.calibration import stiffening
+from offline.methods.method import Answer, Case
+from offline.methods.relaxation import TOLERANCE, Ints, Stencil, relax
+from offline.methods.tetrahedra import Divisions, Tetrahedra, edges_of, gradients
+from offline.workshop import Workshop
+from shared.tissue import lame
+
+Array = NDArray[np.float64]
+
+POISSON = 0.25
+"""Poisson's ratio of every network of springs."""
+
+FORCING = 0.1
+"""See ``offline.methods.relaxation.Elastic``."""
+
+SWEEPS, STALL = 2000, 1e-4
+"""Most sweeps of the identification; it ends at this change, relative to the stiffest spring."""
+
+
+class MassSpring:
+    """Mass-spring system in a scene's body.
+
+    Parameters
+    ----------
+    workshop : Workshop
+    divisions : tuple of 3 int
+        Cells along the axes of the scene's lattice; see ``offline.methods.tetrahedra``.
+    young : float, optional
+        kPa; if absent, such that small loads get the full model's answer in the mean.
+    tolerance : float
+        Residual of an answer relative to its load.
+    """
+
+    family = "mass-spring"
+
+    def __init__(
+        self,
+        workshop: Workshop,
+        divisions: Divisions,
+        young: float | None = None,
+        tolerance: float = TOLERANCE,
+    ) -> None:
+        self.mesh = Tetrahedra.of(workshop, divisions)
+        self.tolerance = tolerance
+        tissue = workshop.scene.tissue.young
+        springs = Springs.identified(self.mesh, tissue if young is None else young)
+        if young is None:
+            springs = springs.stiffened(stiffening(workshop, self.mesh, springs))
+        self.body = springs
+        self.unknowns = 3 * self.mesh.free
+        self.label = f"{len(springs.ends)} springs"
+        self._load = np.zeros((3, len(self.mesh.nodes)))
+
+    def solve(self, case: Case) -> Answer:
+        """Relax from rest."""
+        self.mesh.load(case, self._load)
+        rest = relax(self.body, self._load, self.tolerance)
+        return Answer(rest.displacement, rest.converged, rest.converged, rest.iterations)
+
+    def displacement(self, answer: Answer) -> Array:
+        """Nodal displacement (n, 3) mm."""
+        return self.mesh.displacement(answer.state)
+
+
+class Springs:
+    """Linear springs between points, at large displacements.
+
+    Parameters
+    ----------
+    points : ndarray, shape (m, 3), mm
+        Free ones first.
+    free : int
+    ends : ndarray, shape (s, 2), int
+        Points that a spring joins, each pair once.
+    stiffness : ndarray, shape (s,), mN/mm
+    """
+
+    forcing = FORCING
+
+    def __init__(self, points: Array, free: int, ends: Ints, stiffness: Array) -> None:
+        self.points, self.ends, self.stiffness = points, ends, stiffness
+        self.stencil = Stencil(ends, len(points), free)
+        self._ends = ends.astype(np.int32)
+        self._vectors = points[ends[:, 1]] - points[ends[:, 0]]
+        self._lengths = np.linalg.norm(self._vectors, axis=1)
+        self._ranks = np.stack(
+            [self.stencil.ranks(ends), self.stencil.ranks(ends[:, ::-1])], axis=1
+        )
+
+    @classmethod
+    def identified(cls, mesh: Tetrahedra, young: float) -> Springs:
+        """Springs that come nearest to linear elastic tissue of a Young's modulus, kPa."""
+        ends = edges_of(mesh.both_cuts)
+        return cls(mesh.nodes, mesh.free, ends, identify(mesh.nodes, mesh.both_cuts, ends, young))
+
+    def stiffened(self, factor: float) -> Springs:
+        """The same with all springs stiffer by a factor."""
+        return Springs(self.points, self.stencil.free, self.ends, factor * self.stiffness)
+
+    def internal(self, displacement: Array, force: Array) -> float:
+        """Internal force; see ``offline.methods.relaxation.Elastic``."""
+        force[:] = 0.0
+        springs = self._ends, self._vectors, self._lengths, self.stiffness
+        return _internal(*springs, displacement, force)
+
+    def linearise(self, displacement: Array) -> None:
+        """Tangent; see ``offline.methods.relaxation.Elastic``."""
+        tensors = self.stencil.tensors
+        tensors[:] = 0.0
+        springs = self._ends, self._vectors, self._lengths, self.stiffness
+        _tangent(*springs, displacement, self._ranks, tensors)
+        self.stencil.prepare()
+
+
+def identify(points: Array, elements: Ints, ends: Ints, young: float) -> Array:
+    """Spring stiffnesses nearest to the stiffness matrix of linear tetrahedra.
+
+    Parameters
+    ----------
+    points : ndarray, shape (m, 3), mm
+    elements : ndarray, shape (t, 4), int
+        Two tetrahedra wherever there is tissue: each counts half.
+    ends : ndarray, shape (s, 2), int
+        Edges of the elements.
+    young : float, kPa
+
+    Returns
+    -------
+    stiffness : ndarray, shape (s,), mN/mm
+        Not negative.
+
+    Notes
+    -----
+    The normal equations are ``sum_t (b_s . b_t)^2 k_t = b_s . K b_s``.
+    """
+    along = points[ends[:, 1]] - points[ends[:, 0]]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    rows = np.repeat(np.arange(len(ends)), 6)
+    columns = (3 * ends[:, :, None] + np.arange(3)).ravel()
+    values = np.stack([-along, along], axis=1).ravel()
+    elongation = csr_matrix((values, (rows, columns)), (len(ends), points.size))
+    normal = (elongation @ elongation.T).power(2).tocsr()
+    stiffness = 0.5 * linear_stiffness(points, elements, young)
+    wanted = np.asarray((elongation @ stiffness).multiply(elongation).sum(axis=1)).ravel()
+    return _nonnegative(normal.indptr, normal.indices, normal.data, normal.diagonal(), wanted)
+
+
+def linear_stiffness(points: Array, elements: Ints, young: float) -> csr_matrix:
+    """Stiffness matrix (3 m, 3 m) mN/mm of linear tetrahedra with the springs' Poisson's ratio."""
+    mu, lam = lame(young, POISSON)
+    g, volume = gradients(points, elements)
+    dot = np.einsum("tai,tbi->tab", g, g)
+    blocks = (
+        lam * np.einsum("t,tai,tbj->taibj", volume, g, g)
+        + mu * np.einsum("t,taj,tbi->taibj", volume, g, g)
+        + mu * np.einsum("t,tab,ij->taibj", volume, dot, np.eye(3))
+    )
+    dofs = (3 * elements[:, :, None] + np.arange(3)).reshape(len(elements), 12)
+    rows, columns = np.repeat(dofs, 12, axis=1).ravel(), np.tile(dofs, (1, 12)).ravel()
+    return coo_matrix((blocks.ravel(), (rows, columns)), (points.size, points.size)).tocsr()
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _nonnegative(indptr, indices, data, diagonal, wanted):
+    """Least squares with nonnegative unknowns by projected Gauss-Seidel on the normal equations."""
+    x = np.zeros(len(wanted))
+    for _ in range(SWEEPS):
+        change = 0.0
+        for i in range(len(x)):
+            gradient = -wanted[i]
+            for p in range(indptr[i], indptr[i + 1]):
+                gradient += data[p] * x[indices[p]]
+            new = max(0.0, x[i] - gradient / diagonal[i])
+            change = max(change, abs(new - x[i]))
+            x[i] = new
+        if change <= STALL * x.max():
+            break
+    return x
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _internal(ends, vectors, lengths, stiffness, u, force):
+    """Add the springs' force at ``u`` (3, m) to ``force`` (3, m); return the energy.
+
+    The elongation is computed from ``|v + w|^2 - |v|^2 = w . (2 v + w)``, free of cancellation.
+    """
+    energy = 0.0
+    for s in range(len(ends)):
+        a, b = ends[s, 0], ends[s, 1]
+        v0, v1, v2 = vectors[s, 0], vectors[s, 1], vectors[s, 2]
+        w0, w1, w2 = u[0, b] - u[0, a], u[1, b] - u[1, a], u[2, b] - u[2, a]
+        x0, x1, x2 = v0 + w0, v1 + w1, v2 + w2
+        length = np.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
+        longer = (w0 * (v0 + x0) + w1 * (v1 + x1) + w2 * (v2 + x2)) / (length + lengths[s])
+        energy += 0.5 * stiffness[s] * longer * longer
+        tension = stiffness[s] * longer / length
+        f0, f1, f2 = tension * x0, tension * x1, tension * x2
+        force[0, a] -= f0
+        force[1, a] -= f1
+        force[2, a] -= f2
+        force[0, b] += f0
+        force[1, b] += f1
+        force[2, b] += f2
+    return energy
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _tangent(ends, vectors, lengths, stiffness, u, ranks, tensors):
+    """Add the springs' tangent at ``u`` (3, m) to a stencil's tensors; ranks (s, 2).
+
+    ``k (n n^T + max(0, 1 - L / l) (I - n n^T))``: what a compressed spring takes from the stiffness
+    across it is left out, which keeps the tangent definite (Choi & Ko, SIGGRAPH 2002).
+    """
+    x = np.empty(3)
+    for s in range(len(ends)):
+        a, b = ends[s, 0], ends[s, 1]
+        square = 0.0
+        for i in range(3):
+            x[i] = vectors[s, i] + u[i, b] - u[i, a]
+            square += x[i] * x[i]
+        across = stiffness[s] * max(0.0, 1.0 - lengths[s] / np.sqrt(square))
+        along = (stiffness[s] - across) / square
+        for i in range(3):
+            for j in range(3):
+                value = along * x[i] * x[j]
+                if i == j:
+                    value += across
+                if a < tensors.shape[2]:
+                    tensors[0, 3 * i + j, a] += value
+                if b < tensors.shape[2]:
+                    tensors[0, 3 * i + j, b] += value
+                if ranks[s, 0] >= 0:
+                    tensors[ranks[s, 0], 3 * i + j, a] -= value
+                    tensors[ranks[s, 1], 3 * i + j, b] -= value

@@ -1,0 +1,368 @@
+"""Relaxation: what surgical trainers do to bring a mesh of points to rest under a load.
+
+Trainers step a damped motion, explicitly or, since Baraff & Witkin (SIGGRAPH 1998), implicitly with
+conjugate gradients, until it comes to rest.  Where it rests depends on neither mass nor damping, so
+here they are left out: an implicit step of infinite length is Newton's, whose linear system
+preconditioned conjugate gradients solve only as well as it deserves (Dembo, Eisenstat & Steihaug
+1982; Nocedal & Wright, Numerical Optimization, algorithm 7.1), and the potential decides how much
+of the step is taken.  Nothing is factorised but 3 x 3 blocks.
+
+Points are numbered with the free ones first; vectors over points are (3, ...), axis by axis, and
+the tangent is one 3 x 3 tensor for each point and each of its neighbours: first neighbours of all
+points, then second ones, and so on, so that vector instructions take many points at a time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Single = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+TOLERANCE = 3e-3
+"""Residual relative to the load: on the turbinate, displacements are then within 1 % in the median,
+2 % at the 95th percentile, of those at rest; the models themselves are off by ten times more."""
+
+MAX_STEPS = 100
+MAX_ITERATIONS = 20_000
+"""Of conjugate gradients, over all steps."""
+
+SUFFICIENT_DECREASE = 1e-4
+SMALLEST_STEP = 1e-4
+ROUND_OFF = 1e-12
+"""Relative error with which a potential is known."""
+
+
+@dataclass(frozen=True)
+class Rest:
+    """Where a relaxation ended.
+
+    Attributes
+    ----------
+    displacement : ndarray, shape (3, m), mm
+        Of all points; clamped ones stay.
+    residual : float
+        Relative to the load, both in the Euclidean norm of the free points' forces.
+    converged : bool
+    iterations : int
+        Of conjugate gradients.
+    """
+
+    displacement: Array
+    residual: float
+    converged: bool
+    iterations: int
+
+
+class Elastic(Protocol):
+    """A body of points that can be relaxed.
+
+    Attributes
+    ----------
+    stencil : Stencil
+        Holds the tangent.
+    forcing : float
+        By how much conjugate gradients lower the residual before the tangent is taken anew.
+    """
+
+    stencil: Stencil
+    forcing: float
+
+    def internal(self, displacement: Array, force: Array) -> float:
+        """Write the internal force (3, m) mN of a displacement (3, m) mm; return energy, mN mm."""
+        ...
+
+    def linearise(self, displacement: Array) -> None:
+        """Bring the stencil's tangent up to a displacement (3, m) mm."""
+        ...
+
+
+class Stencil:
+    """Tangent stiffness (mN/mm) of f free points, kept by neighbours, and its linear solver.
+
+    Parameters
+    ----------
+    edges : ndarray, shape (e, 2), int
+        Pairs of points that act on each other, each once.
+    points, free : int
+        Points m, and how many of them, from the first, are free.
+
+    Attributes
+    ----------
+    neighbours : ndarray, shape (w, f), uint32
+        Row 0: the point itself.
+    lengths : ndarray, shape (w,), int
+        How many of the points, from the first, a row concerns: few where the points with many
+        neighbours come first.
+    tensors : ndarray, shape (w, 9, f), float32
+        One 3 x 3 tensor, row-major, for each of those.
+    """
+
+    def __init__(self, edges: Ints, points: int, free: int) -> None:
+        self.points, self.free = points, free
+        ends = np.concatenate([edges, edges[:, ::-1]])
+        ends = ends[np.all(ends < free, axis=1)]
+        ends = ends[np.lexsort((ends[:, 1], ends[:, 0]))]
+        row = ends[:, 0]
+        rank = 1 + np.arange(len(row)) - np.searchsorted(row, row)
+        width = 1 + int(rank.max(initial=0))
+        self.neighbours = np.tile(np.arange(free, dtype=np.uint32), (width, 1))
+        self.neighbours[rank, row] = ends[:, 1]
+        self.lengths = np.full(width, free)
+        for w in range(1, width):
+            self.lengths[w] = 1 + row[rank == w].max()
+        self.tensors = np.zeros((width, 9, free), np.float32)
+        self._keys, self._ranks = row * points + ends[:, 1], rank
+        self._inverse = np.zeros((9, free), np.float32)
+        self._work = np.zeros((5, 3, free), np.float32)
+        self._double = np.zeros((3, 3, free))
+
+    def ranks(self, pairs: Ints) -> NDArray[np.int32]:
+        """Row of ``neighbours`` (k,) where each point of pairs (k, 2) keeps its partner.
+
+        -1 where one of the two is clamped; 0 for a free point with itself.
+        """
+        a, b = pairs.T
+        at = np.searchsorted(self._keys, a * self.points + b)
+        rank = np.append(self._ranks, 0)[at]
+        rank[a == b] = 0
+        rank[(a >= self.free) | (b >= self.free)] = -1
+        return rank.astype(np.int32)
+
+    def prepare(self) -> None:
+        """Invert the diagonal tensors, which precondition the solver; after every new tangent."""
+        invert_diagonal(self.tensors[0], self._inverse)
+
+    def apply(self, displacement: Array, force: Array) -> float:
+        """Write the tangent times a displacement (3, m) to the free points of a force (3, m).
+
+        Returns
+        -------
+        energy : float, mN mm
+            Half of the work they do.
+        """
+        x, y, near = self._double
+        x[:] = displacement[:, : self.free]
+        product(self.neighbours, self.lengths, self.tensors, x, y, near)
+        force[:, : self.free] = y
+        return 0.5 * float(np.vdot(x, y))
+
+    def solve(self, load: Array, fraction: float, most: int, out: Array) -> int:
+        """Solve for a displacement by conjugate gradients.
+
+        Parameters
+        ----------
+        load : ndarray, shape (3, f), mN
+        fraction : float
+            Of the load that may be left as residual.
+        most : int
+            Iterations.
+        out : ndarray, shape (3, f), mm, out
+            A descent direction even where the tangent is not definite.
+
+        Returns
+        -------
+        iterations : int
+        """
+        return conjugate_gradients(
+            self.neighbours,
+            self.lengths,
+            self.tensors,
+            self._inverse,
+            load,
+            fraction,
+            most,
+            out,
+            self._work,
+        )
+
+
+def relax(body: Elastic, load: Array, tolerance: float) -> Rest:
+    """Bring a body to rest under a dead load, from no displacement.
+
+    Parameters
+    ----------
+    body : Elastic
+    load : ndarray, shape (3, m), mN
+    tolerance : float
+        Residual at which the body counts as at rest; see ``Rest``.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _relax(body, load, tolerance)
+
+
+def _relax(body: Elastic, load: Array, tolerance: float) -> Rest:
+    free = body.stencil.free
+    u, trial, step = np.zeros_like(load), np.zeros_like(load), np.zeros((3, free))
+    force, trial_force = np.zeros_like(load), np.zeros_like(load)
+    scale = float(np.linalg.norm(load[:, :free]))
+    potential, norm, iterations = 0.0, scale, 0
+    residual = load[:, :free].copy()
+    for _ in range(MAX_STEPS):
+        if not norm > tolerance * scale:
+            break
+        body.linearise(u)
+        fraction = max(body.forcing, 0.5 * tolerance * scale / norm)
+        most = MAX_ITERATIONS - iterations
+        iterations += body.stencil.solve(residual, fraction, most, step)
+        slope, length = float(np.vdot(residual, step)), 1.0
+        while length > SMALLEST_STEP:
+            np.multiply(step, length, out=trial[:, :free])
+            trial += u
+            trial_potential = body.internal(trial, trial_force) - float(np.vdot(load, trial))
+            allowed = ROUND_OFF * abs(potential) - SUFFICIENT_DECREASE * length * slope
+            if trial_potential - potential <= allowed:
+                break
+            length *= 0.5
+        else:
+            break
+        u, trial, force, trial_force = trial, u, trial_force, force
+        potential = trial_potential
+        np.subtract(load[:, :free], force[:, :free], out=residual)
+        norm = float(np.linalg.norm(residual))
+    left = norm / scale if scale else 0.0
+    return Rest(u, left, left <= tolerance, iterations)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def product(neighbours, lengths, tensors, x, y, near):
+    """Write ``y``, the tangent times ``x`` (both (3, f)), with scratch ``near`` (3, f).
+
+    The other arguments are those of ``Stencil``.
+    """
+    y[:] = 0.0
+    for w in range(len(lengths)):
+        for axis in range(3):
+            _take(lengths[w], neighbours[w], x[axis], near[axis])
+        for axis in range(3):
+            rows = tensors[w, 3 * axis], tensors[w, 3 * axis + 1], tensors[w, 3 * axis + 2]
+            _add_row(lengths[w], rows, near[0], near[1], near[2], y[axis])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _take(count, indices, x, out):
+    for i in range(count):
+        out[i] = x[indices[i]]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _add_row(count, rows, x0, x1, x2, y):
+    a, b, c = rows
+    for i in range(count):
+        y[i] += a[i] * x0[i] + b[i] * x1[i] + c[i] * x2[i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def invert_diagonal(tensors, inverse):
+    """Invert symmetric tensors (9, f); one that is not positive definite counts by its trace."""
+    for i in range(tensors.shape[1]):
+        a, b, c = tensors[0, i], tensors[1, i], tensors[2, i]
+        d, e, f = tensors[4, i], tensors[5, i], tensors[8, i]
+        c0, c1, c2 = d * f - e * e, c * e - b * f, b * e - c * d
+        det = a * c0 + b * c1 + c * c2
+        if a > 0.0 and a * d - b * b > 0.0 and det > 0.0:
+            inverse[0, i], inverse[1, i], inverse[2, i] = c0 / det, c1 / det, c2 / det
+            inverse[3, i], inverse[4, i] = c1 / det, (a * f - c * c) / det
+            inverse[5, i] = (b * c - a * e) / det
+            inverse[6, i], inverse[7, i], inverse[8, i] = (
+                c2 / det,
+                inverse[5, i],
+                (a * d - b * b) / det,
+            )
+        else:
+            inverse[:, i] = 0.0
+            inverse[0, i] = inverse[4, i] = inverse[8, i] = 3.0 / (abs(a) + abs(d) + abs(f))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _precondition(inverse, r, z):
+    """Write ``z = inverse r`` and return ``r . z``; ``inverse`` (9, f), the others (3, f)."""
+    total = np.float32(0.0)
+    r0, r1, r2, z0, z1, z2 = r[0], r[1], r[2], z[0], z[1], z[2]
+    t0, t1, t2, t4, t5, t8 = inverse[0], inverse[1], inverse[2], inverse[4], inverse[5], inverse[8]
+    for i in range(r.shape[1]):
+        a, b, c = r0[i], r1[i], r2[i]
+        x = t0[i] * a + t1[i] * b + t2[i] * c
+        y = t1[i] * a + t4[i] * b + t5[i] * c
+        z_ = t2[i] * a + t5[i] * b + t8[i] * c
+        z0[i], z1[i], z2[i] = x, y, z_
+        total += a * x + b * y + c * z_
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _dot(x, y):
+    total = np.float32(0.0)
+    for axis in range(3):
+        a, b = x[axis], y[axis]
+        for i in range(len(a)):
+            total += a[i] * b[i]
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _add(factor, x, y):
+    """``y += factor x`` of (3, f)."""
+    for axis in range(3):
+        a, b = x[axis], y[axis]
+        for i in range(len(a)):
+            b[i] += factor * a[i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _turn(factor, z, p):
+    """``p = z + factor p`` of (3, f)."""
+    for axis in range(3):
+        a, b = z[axis], p[axis]
+        for i in range(len(a)):
+            b[i] = a[i] + factor * b[i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def conjugate_gradients(neighbours, lengths, tensors, inverse, load, fraction, most, out, work):
+    """Preconditioned conjugate gradients; see ``Stencil.solve``.  Work (5, 3, f) is float32."""
+    r, z, p, q, near = work[0], work[1], work[2], work[3], work[4]
+    scale = 0.0
+    for axis in range(3):
+        for i in range(load.shape[1]):
+            scale = max(scale, abs(load[axis, i]))
+    out[:] = 0.0
+    if not scale > 0.0:
+        return 0
+    for axis in range(3):
+        for i in range(load.shape[1]):
+            r[axis, i] = load[axis, i] / scale
+    p[:] = 0.0
+    target = fraction * fraction * _dot(r, r)
+    rho, before = _precondition(inverse, r, z), np.float32(1.0)
+    for iteration in range(most):
+        _turn(rho / before if iteration else np.float32(0.0), z, p)
+        product(neighbours, lengths, tensors, p, q, near)
+        curvature = _dot(p, q)
+        if not curvature > 0.0:
+            if iteration == 0:
+                _add_scaled(scale, p, out)
+            return iteration + 1
+        alpha = rho / curvature
+        _add_scaled(scale * alpha, p, out)
+        _add(-alpha, q, r)
+        if not _dot(r, r) > target:
+            return iteration + 1
+        before = rho
+        rho = _precondition(inverse, r, z)
+    return most
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _add_scaled(factor, x, y):
+    """``y += factor x`` of (3, f), single to double."""
+    for axis in range(3):
+        a, b = x[axis], y[axis]
+        for i in range(len(a)):
+            b[i] += factor * a[i]
