@@ -12,7 +12,8 @@ keeps Newton's method from running away.
 
 With ``p = k`` the fit interpolates.  With more dofs than modes it is one of least squares (gappy
 POD: Everson & Sirovich 1995), the known cure for the noise that interpolation amplifies
-(Peherstorfer, Drmac & Gugercin 2020); the tangent stays unsymmetric.
+(Peherstorfer, Drmac & Gugercin 2020).  The tangent stays unsymmetric, so it fails a little less
+often, no more; what cures that is a cubature of positive weights (``offline.methods.cubatures``).
 """
 
 from __future__ import annotations

@@ -28,14 +28,19 @@ def galerkin(training, basis):
     return Galerkin("", "", training.model, basis, Cubature.full(training.model))
 
 
-def test_with_every_dof_sampled_it_is_galerkin_s_method(training, basis, galerkin, queries):
+@pytest.fixture(scope="module")
+def complete(training, basis):
+    """Return the method with every dof sampled: Galerkin's, with plain Newton."""
     every = np.eye(len(training.model.free))
     samples = Samples(np.arange(len(every)), every)
-    method = Deim("", "", training.model, basis, every, samples)
-    assert len(method.points) == training.model.weights.size
+    return Deim("", "", training.model, basis, every, samples)
+
+
+def test_with_every_dof_sampled_it_is_galerkin_s_method(training, complete, galerkin, queries):
+    assert len(complete.points) == training.model.weights.size
     for load, _ in queries:
         case = Case.of(training.workshop, load)
-        found, exact = method.solve(case), galerkin.solve(case)
+        found, exact = complete.solve(case), galerkin.solve(case)
         assert found.converged
         off = np.linalg.norm(found.state - exact.state)
         assert off <= 3e-4 * np.linalg.norm(exact.state)
@@ -68,7 +73,7 @@ def test_displacements_that_invert_an_element_are_left_out(training, modes):
 
 
 def test_beyond_its_range_it_fails_where_galerkin_does_not_and_fits_fail_less(
-    training, basis, modes, galerkin
+    training, basis, modes, complete, galerkin
 ):
     model, cases = training.model, []
     for load in unseen_loads(training.atlas, 40, 1):
@@ -79,8 +84,9 @@ def test_beyond_its_range_it_fails_where_galerkin_does_not_and_fits_fail_less(
     )
     found = [
         sum(method.solve(case).converged for case in cases)
-        for method in (interpolated, fitted, galerkin)
+        for method in (interpolated, fitted, complete, galerkin)
     ]
     assert found == sorted(found)
-    assert found[0] < 35
-    assert found[2] == len(cases)
+    # plain Newton is not to blame: of a complete sum it loses next to nothing
+    assert found[1] < 0.9 * found[2]
+    assert found[3] == len(cases)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from offline.full_model import FullModel
+from offline.methods.catalogue import build
 from offline.methods.galerkin import (
     TOLERANCE,
     Cubature,
@@ -15,6 +16,7 @@ from offline.methods.galerkin import (
 from offline.methods.method import Case
 from offline.spaces import energy_pod
 from offline.studies.baselines import solve_galerkin
+from offline.validate import relative
 from offline.workshop import Load
 from shared.reduced import LANES
 
@@ -82,6 +84,16 @@ def test_a_small_load_is_answered_linearly(workshop, training, queries):
     answer = galerkin(model, basis).solve(Case.of(workshop, soft))
     q = basis.T @ workshop.load_vector(soft).ravel()[model.free]
     assert np.linalg.norm(answer.state[:10] - q) <= 1e-3 * np.linalg.norm(q)
+
+
+def test_the_first_ritz_vector_is_exact_in_the_limit_of_small_loads(workshop, training, queries):
+    method, load, errors = build("ritz-at-hand", 1, training), queries[0][0], []
+    for fraction in (0.04, 0.02):
+        soft = Load(load.position, load.direction, fraction * load.pressure)
+        exact = workshop.solve(soft).displacement
+        errors.append(relative(method.displacement(method.solve(Case.of(workshop, soft))), exact))
+    assert errors[0] < 0.02
+    assert errors[0] / errors[1] == pytest.approx(2, rel=0.1)
 
 
 def test_a_basis_at_hand_may_come_smaller_than_the_last(workshop, training, queries):
