@@ -37,7 +37,7 @@ class Case:
     @classmethod
     def of(cls, workshop: Workshop, *contacts: Load) -> Case:
         """Case of one or more pressed footprints on a scene's body."""
-        total = sum(workshop.load_vector(contact) for contact in contacts)
+        total = np.sum([workshop.load_vector(contact) for contact in contacts], axis=0)
         nodes = np.flatnonzero(np.any(total != 0.0, axis=1))
         return cls(contacts, nodes, total[nodes])
 

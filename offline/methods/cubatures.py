@@ -1,0 +1,123 @@
+"""Empirical cubatures of a reduced model: which quadrature points are summed, with what weight.
+
+- by point (ECM: Hernandez, Caicedo & Ferrer 2017): few points of positive weight;
+- by element (ECSW: Farhat, Avery, Chapman & Cortial 2014): few elements, whose points all get the
+  element's weight.
+
+Both reproduce, over training states, what the tissue law adds to the force of linear elasticity.
+The states are equilibria of the reduced model *and* random departures from them.  In equilibrium
+the internal force is the load, whatever the tissue does: points fitted to nothing else answer for
+the load and leave the tangent, and so the next Newton step, to chance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offline.cubature import compress, nonnegative
+from offline.methods.galerkin import Cubature, ReducedModel
+from offline.methods.method import Case
+from shared.reduced import LANES, nonlinear_stress
+
+Array = NDArray[np.float64]
+
+OFF_EQUILIBRIUM = 0.1
+"""Size of a departure from equilibrium, relative to each mode's part in the state."""
+
+LOOKS = 16
+"""Random combinations that stand for the modes' forces in one state; their errors add up alike."""
+
+EQUATIONS = 2
+"""Equations that are kept per cubature point, or element, allowed."""
+
+
+@dataclass(frozen=True)
+class PointForces:
+    """What every quadrature point adds to the sums that a cubature is to reproduce.
+
+    Attributes
+    ----------
+    contributions : ndarray, shape (points, sums), float32
+        Of the reduced model's full cubature.
+    weights : ndarray, shape (points,), mm^3
+    per_element : int
+    """
+
+    contributions: NDArray[np.float32]
+    weights: Array
+    per_element: int
+
+    def by_point(self, most: int, rng: np.random.Generator) -> Cubature:
+        """At most so many points, each with a weight of its own."""
+        chosen, factors = _fit(self.contributions, most, rng)
+        return Cubature(chosen, factors * self.weights[chosen])
+
+    def by_element(self, most: int, rng: np.random.Generator) -> Cubature:
+        """All points of at most so many elements, their weights times one factor per element."""
+        sums = self.contributions.reshape(-1, self.per_element, self.contributions.shape[1])
+        elements, factors = _fit(sums.sum(axis=1), most, rng)
+        points = (self.per_element * elements[:, None] + np.arange(self.per_element)).ravel()
+        return Cubature(points, np.repeat(factors, self.per_element) * self.weights[points])
+
+
+def point_forces(
+    reduced: ReducedModel, per_element: int, cases: Iterable[Case], rng: np.random.Generator
+) -> PointForces:
+    """Forces at every point in and off the equilibria of cases.
+
+    They are weighted with the square root of the compliance at equilibrium, relative to the
+    answer: an error in their sum is then a relative error of displacement in the energy norm.
+
+    Parameters
+    ----------
+    reduced : ReducedModel
+        With its basis and the full cubature.
+    per_element : int
+        Quadrature points of an element.
+    cases : iterable of Case
+        Those without an equilibrium teach nothing.
+    rng : numpy.random.Generator
+    """
+    columns = []
+    for case in cases:
+        if not reduced.solve(case)[0]:
+            continue
+        q = reduced.content.q.copy()
+        L = np.tril(reduced.content.system.factor)
+        departure = OFF_EQUILIBRIUM * np.abs(q) * rng.standard_normal(len(q))
+        for state in (q, q + departure):
+            looks = np.linalg.solve(L.T, rng.standard_normal((len(q), LOOKS)))
+            looks /= np.sqrt(LOOKS) * np.linalg.norm(q)
+            forces = _contributions(reduced, state, looks)
+            if forces is not None:
+                columns.append(forces)
+    count = len(reduced.points)
+    weights = reduced.content.system.weights[:count]
+    return PointForces(np.hstack(columns)[:count], weights, per_element)
+
+
+def _contributions(
+    reduced: ReducedModel, q: Array, looks: NDArray[np.floating]
+) -> NDArray[np.float32] | None:
+    """Nonlinear forces (c, k) along ``looks`` (m, k) at coordinates q; None beyond inversion."""
+    system = reduced.content.system
+    H = q.astype(np.float32) @ system.gradients
+    P, (J, trace, linear) = np.empty_like(H), np.empty((3, len(system.weights)))
+    nonlinear_stress(H, system.weights, system.mu, system.lam, J, trace, linear, P)
+    if not J.min() > 0.0:
+        return None
+    work = (looks.T.astype(np.float32) @ system.gradients) * P
+    tiles = work.reshape(len(work), -1, 9, LANES).sum(axis=2)
+    return np.ascontiguousarray(tiles.reshape(len(work), -1).T)
+
+
+def _fit(
+    contributions: NDArray[np.float32], most: int, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], Array]:
+    """Few rows and the positive factors with which they make up the sums of all."""
+    size = min(EQUATIONS * most, *contributions.shape)
+    return nonnegative(*compress(contributions, size, rng), most)

@@ -1,0 +1,182 @@
+"""Discrete empirical interpolation of the internal force (Chaturantabut & Sorensen 2010).
+
+Theory.  What the tissue law adds to the force of linear elasticity, ``N(u) = R(u) - K u``, is
+approximated by force modes ``U`` (free dofs, k), fitted to its values at ``p`` sampled dofs ``P``:
+
+    V^T N(V q)  ~  V^T U (P^T U)^+ P^T N(V q)  =  W^T N(V q).
+
+``W`` (free dofs, m) has rows only at sampled dofs, so only elements that touch those are summed: it
+is a Petrov-Galerkin method with the test functions ``W``.  They are not the trial functions ``V``:
+the tangent ``I + W^T N'(V q) V`` is unsymmetric, there is no potential to descend, and nothing
+keeps Newton's method from running away.
+
+With ``p = k`` the fit interpolates.  With more dofs than modes it is one of least squares (gappy
+POD: Everson & Sirovich 1995), the known cure for the noise that interpolation amplifies
+(Peherstorfer, Drmac & Gugercin 2020).  The tangent stays unsymmetric, so it fails a little less
+often, no more; what cures that is a cubature of positive weights (``offline.methods.cubatures``).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from offline.full_model import FullModel
+from offline.methods.galerkin import (
+    MAX_ITERATIONS,
+    TOLERANCE,
+    Content,
+    Cubature,
+    ReducedModel,
+    point_gradients,
+    reduce_load,
+)
+from offline.methods.method import Answer, Case
+from shared.bound import bind
+from shared.reduced import _increments, _linearise, _project, _superpose, nonlinear_stress
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Where the internal force is sampled, and what its values there are worth.
+
+    Attributes
+    ----------
+    dofs : ndarray, shape (p,), int
+        Rows of the force modes, in the order chosen.
+    fit : ndarray, shape (k, p)
+        Coefficients of the force modes per sampled value, ``(P^T U)^+``.
+    """
+
+    dofs: NDArray[np.int64]
+    fit: NDArray[np.floating]
+
+
+def force_modes(model: FullModel, displacements: Array, size: int) -> Array:
+    """Main directions (free dofs, <= size) of ``N(u)`` at displacements (k, free dofs) mm.
+
+    Displacements that invert an element are left out.
+    """
+    forces, force = [], np.zeros(3 * len(model.mesh.nodes))
+    full = np.zeros_like(force)
+    for u in displacements:
+        full[model.free] = u
+        if model.internal(full, force)[1] > 0.0:
+            forces.append(force[model.free] - model.rest_stiffness @ u)
+    U, amplitudes, _ = np.linalg.svd(np.stack(forces, axis=1), full_matrices=False)
+    return U[:, : min(size, int((amplitudes > 1e-12 * amplitudes[0]).sum()))]
+
+
+def sample(modes: Array, per_mode: int) -> Samples:
+    """Greedy choice of dofs: for each force mode in turn, where those before it fit it worst.
+
+    Parameters
+    ----------
+    modes : ndarray, shape (free dofs, k)
+        Orthonormal.
+    per_mode : int
+        Dofs for each mode; 1 is the discrete empirical interpolation.
+    """
+    chosen: list[int] = []
+    for k in range(modes.shape[1]):
+        fit = np.linalg.pinv(modes[chosen, :k])
+        missed = np.abs(modes[:, k] - modes[:, :k] @ (fit @ modes[chosen, k]))
+        missed[chosen] = -1.0
+        chosen += np.argsort(-missed, kind="stable")[:per_mode].tolist()
+    dofs = np.unique(chosen)
+    return Samples(dofs, np.linalg.pinv(modes[dofs]))
+
+
+class _Content(NamedTuple):
+    trial: Content
+    test: NDArray[np.float32]  # (m, 9 c) gradients of the test functions, in tiles
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _newton(bound, nodes, forces):
+    """Plain Newton's method from rest: (converged, iterations), and ``q``."""
+    content = bound.content
+    test, q, work = content.test, content.trial.q, content.trial.newton
+    s = content.trial.system
+    reduce_load(content.trial.modes, nodes, forces, s.load)
+    q[:] = s.load
+    residual = work[0]
+    target = max(TOLERANCE * math.sqrt(np.dot(s.load, s.load)), 1e-12)
+    for iteration in range(1, MAX_ITERATIONS):
+        _superpose(s.gradients, q, s.H)
+        nonlinear_stress(s.H, s.weights, s.mu, s.lam, s.J, s.trace, s.linear, s.P)
+        if not s.J.min() > 0.0:
+            return False, iteration
+        _project(test, s.P, residual)
+        for i in range(len(q)):
+            residual[i] += q[i] - s.load[i]
+        if math.sqrt(np.dot(residual, residual)) <= target:
+            return True, iteration
+        _linearise(s.H, s.weights, s.mu, s.lam, s.state)
+        _increments(s.state, s.gradients, s.increments)
+        s.tangent[:] = np.dot(test, s.increments.T)
+        for i in range(len(q)):
+            s.tangent[i, i] += 1.0
+        q -= np.linalg.solve(s.tangent, residual)
+    return False, MAX_ITERATIONS
+
+
+class Deim:
+    """Interpolated internal force in a basis for the whole surface; ``offline.methods.method``.
+
+    Parameters
+    ----------
+    family, label : str
+    model : FullModel
+    basis : ndarray, shape (free dofs, m), mm
+        Orthonormal in the energy at rest.
+    modes : ndarray, shape (free dofs, k)
+        Of the force.
+    samples : Samples
+    """
+
+    def __init__(
+        self,
+        family: str,
+        label: str,
+        model: FullModel,
+        basis: Array,
+        modes: Array,
+        samples: Samples,
+    ) -> None:
+        self.family, self.label, self.unknowns = family, label, basis.shape[1]
+        self.points = _points_touched(model, samples.dofs)
+        weights = model.weights.ravel()[self.points]
+        self._reduced = ReducedModel(model, self.unknowns, Cubature(self.points, weights))
+        self._reduced.adopt(basis)
+        functions = np.zeros((3 * len(model.mesh.nodes), self.unknowns))
+        functions[model.free[samples.dofs]] = (basis.T @ modes @ samples.fit).T
+        test = np.zeros_like(self._reduced.content.system.gradients)
+        point_gradients(model.connectivity, model.gradients, self.points, functions, test)
+        self._bound = bind(_Content(self._reduced.content, test))
+
+    def solve(self, case: Case) -> Answer:
+        """Solve from rest; the state is the modes' coordinates."""
+        try:
+            converged, iterations = _newton(self._bound, case.nodes, case.forces)
+        except np.linalg.LinAlgError:  # a singular tangent, or none that is finite
+            converged, iterations = False, MAX_ITERATIONS
+        return Answer(self._reduced.content.q.copy(), converged, converged, iterations)
+
+    def displacement(self, answer: Answer) -> Array:
+        """Nodal displacement (n, 3) mm."""
+        return (self._reduced.content.modes @ answer.state).reshape(-1, 3)
+
+
+def _points_touched(model: FullModel, dofs: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Quadrature points of the elements that have a share in the force on free dofs."""
+    touched = np.isin(model.connectivity, model.free[dofs] // 3).any(axis=1)
+    per_element = model.weights.shape[1]
+    return (per_element * np.flatnonzero(touched)[:, None] + np.arange(per_element)).ravel()

@@ -1,0 +1,160 @@
+"""Bases that a reduced model can be built on, all orthonormal in the energy of the rest state.
+
+Theory.  Every space here spans displacements (free dofs, m) with ``V^T K V = I``, ``K`` the rest
+stiffness, so that ``V^T f`` are the coordinates of the linear response in it.  They differ in what
+they are made of:
+
+======================= ====================================================== =====================
+space                   spans                                                  knows of
+======================= ====================================================== =====================
+``modal``               eigenmodes of least frequency, ``K x = omega^2 M x``   stiffness and mass
+``krylov``              ``K^-1 F``, ``K^-1 M K^-1 F``, ... of a block of loads and the loads
+``static_derivatives``  ``dU/dt`` and second and third derivatives at rest     and the tissue law
+``pod``                 the main directions of full solutions                  what it was shown
+======================= ====================================================== =====================
+
+The first two, and POD, are the MOD, RITZ and POD of Radermacher & Reese.  A mass matters to a
+quasi-static body only in that it makes a sequence of ever shorter waves out of one load.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.linalg import LinearOperator, eigsh
+
+from offline.full_model import FullModel
+from offline.spaces import energy_pod, ritz_vectors
+from shared.elements import gauss, hexahedron, shape
+from shared.quadrature import volume_quadrature
+
+Array = NDArray[np.float64]
+Inner = Literal["energy", "euclidean"]
+
+EXHAUSTED = 1e-10
+"""Energy of what a vector adds to a space, relative to its own, that is round-off."""
+
+MASS_POINTS = 3
+"""Gauss points per edge: of 2, a hex20's mass has no more than 8 x 3 of its 60 directions."""
+
+
+def mass(model: FullModel) -> csr_matrix:
+    """Consistent mass (free dofs, free dofs) mm^3 of unit density."""
+    nodes, elements = model.mesh.nodes, model.mesh.elements
+    count = elements.shape[1]
+    N, _ = shape(hexahedron(count), gauss(MASS_POINTS, 3)[0])
+    _, weights = volume_quadrature(nodes, elements, MASS_POINTS)
+    blocks = np.einsum("eq,qa,qb->eab", weights, N, N)
+    dofs = 3 * elements.astype(np.int64)[..., None] + np.arange(3)
+    rows = np.broadcast_to(dofs[:, :, None], (len(elements), count, count, 3))
+    cols = np.broadcast_to(dofs[:, None], rows.shape)
+    values = np.broadcast_to(blocks[..., None], rows.shape)
+    size = 3 * len(nodes)
+    whole = csr_matrix((values.ravel(), (rows.ravel(), cols.ravel())), (size, size))
+    return whole[model.free][:, model.free]
+
+
+def modal(model: FullModel, size: int) -> Array:
+    """Linear eigenmodes (free dofs, size), lowest frequency first.
+
+    Lanczos on ``K^-1 M`` (shift and invert about zero) with the model's own factorisation.
+    """
+    M, K = mass(model), model.rest_stiffness
+    inverse = LinearOperator(K.shape, matvec=model.solve_linear, dtype=float)
+    start = np.ones(len(model.free))  # the default is random
+    squares, modes = eigsh(K, size, M=M, sigma=0.0, OPinv=inverse, v0=start)
+    ascending = np.argsort(squares)
+    # eigsh makes them orthonormal in M
+    return np.ascontiguousarray(modes[:, ascending] / np.sqrt(squares[ascending]))
+
+
+def krylov(model: FullModel, M: csr_matrix, loads: Array, size: int) -> Array:
+    """Load-dependent vectors (free dofs, <= size): one block of loads, moment after moment.
+
+    The space is ``K^-1 F, (K^-1 M) K^-1 F, (K^-1 M)^2 K^-1 F, ...``.  For a single load that is
+    Wilson's sequence of Ritz vectors (Wilson, Yuan & Dickens 1982); for a block, the Krylov space
+    that matches the moments of the frequency response about zero (Bai 2002).  They are the same
+    space up to the block, hence the same code.  For a static body only the first block counts: a
+    mass does no more than choose what follows.
+
+    Parameters
+    ----------
+    model : FullModel
+    M : csr_matrix, shape (free dofs, free dofs)
+    loads : ndarray, shape (free dofs, b)
+    size : int
+        Vectors wanted; fewer come back if the sequence ends before.
+
+    Returns
+    -------
+    modes : ndarray
+        Whole blocks are nested.
+    """
+    V, KV = np.empty((len(loads), 0)), np.empty((len(loads), 0))
+    KX = loads
+    while KX.shape[1] and V.shape[1] < size:
+        X, KX = _orthonormal(V, KV, model.solve_linear(KX), KX)
+        V, KV = np.hstack([V, X]), np.hstack([KV, KX])
+        KX = M @ X
+    return np.ascontiguousarray(V[:, :size])
+
+
+def _orthonormal(V: Array, KV: Array, X: Array, KX: Array) -> tuple[Array, Array]:
+    """What ``X`` adds to ``V``, orthonormal in K, and K times that.
+
+    A block Gram-Schmidt process, done twice against round-off.
+    """
+    lengths = np.sqrt(np.sum(X * KX, axis=0))
+    X, KX = X / lengths, KX / lengths
+    for _ in range(2):
+        common = KV.T @ X
+        X, KX = X - V @ common, KX - KV @ common
+        energies, Q = np.linalg.eigh(X.T @ KX)
+        kept = np.flatnonzero(energies > EXHAUSTED)[::-1]
+        scaled = Q[:, kept] / np.sqrt(energies[kept])
+        X, KX = X @ scaled, KX @ scaled
+    return X, KX
+
+
+def static_derivatives(model: FullModel, loads: Array, size: int) -> Array:
+    """Ritz vectors of three loads carried to third order: (free dofs, <= min(size, 19)).
+
+    First, second and third derivatives at rest of the equilibrium under any combination of the
+    loads (``offline.spaces``); of fewer than 19, those that lead in energy at these loads.
+
+    Parameters
+    ----------
+    model : FullModel
+    loads : ndarray, shape (free dofs, 3), mN
+        Scaled to the loads expected.
+    size : int
+    """
+    return energy_pod(model, ritz_vectors(model, loads), size)[0]
+
+
+def pod(
+    model: FullModel,
+    displacements: Array,
+    size: int,
+    inner: Inner = "energy",
+) -> Array:
+    """Proper orthogonal decomposition of solutions, (free dofs, <= size), nested.
+
+    Parameters
+    ----------
+    model : FullModel
+    displacements : ndarray, shape (k, 3 n), mm
+    size : int
+    inner : {"energy", "euclidean"}
+        Product in which the modes are best; the modes come back orthonormal in the energy anyhow.
+    """
+    snapshots = displacements[:, model.free].T.astype(float)
+    if inner == "energy":
+        return energy_pod(model, snapshots, size)[0]
+    U, amplitudes, _ = np.linalg.svd(snapshots, full_matrices=False)
+    U = U[:, : min(size, int((amplitudes**2 > EXHAUSTED * amplitudes[0] ** 2).sum()))]
+    L = np.linalg.cholesky(U.T @ (model.rest_stiffness @ U))
+    return np.ascontiguousarray(np.linalg.solve(L, U.T).T)

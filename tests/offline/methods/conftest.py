@@ -1,0 +1,35 @@
+import numpy as np
+import pytest
+
+from offline.methods.catalogue import Snapshots, Training
+from offline.validate import random_loads, unseen_loads
+from offline.workshop import Workshop
+from shared.artifact import read_artifact
+from shared.atlas import Atlas
+
+SNAPSHOTS, QUERIES = 40, 4
+
+
+@pytest.fixture(scope="session")
+def atlas(artifact):
+    return Atlas.load(artifact)
+
+
+@pytest.fixture(scope="session")
+def workshop(artifact):
+    return Workshop.of_artifact(read_artifact(artifact))
+
+
+@pytest.fixture(scope="session")
+def training(atlas, workshop):
+    rng = np.random.default_rng(0)
+    loads = random_loads(atlas.surface, atlas.limits, atlas.scene, SNAPSHOTS, rng)
+    solved = [workshop.solve(load).displacement.ravel() for load in loads]
+    return Training(workshop, Snapshots(loads, np.stack(solved)), atlas)
+
+
+@pytest.fixture(scope="session")
+def queries(atlas, workshop):
+    """Return loads that no method has seen, and their full solutions (n, 3)."""
+    loads = unseen_loads(atlas, QUERIES, 1)
+    return [(load, workshop.solve(load).displacement) for load in loads]

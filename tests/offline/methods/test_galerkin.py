@@ -1,0 +1,122 @@
+"""Compiled Galerkin models: the full model's equilibrium in the span of a basis."""
+
+import numpy as np
+import pytest
+
+from offline.full_model import FullModel
+from offline.methods.catalogue import build
+from offline.methods.galerkin import (
+    TOLERANCE,
+    Cubature,
+    Galerkin,
+    GalerkinAtHand,
+    ReducedModel,
+    point_gradients,
+)
+from offline.methods.method import Case
+from offline.spaces import energy_pod
+from offline.studies.baselines import solve_galerkin
+from offline.validate import relative
+from offline.workshop import Load
+from shared.reduced import LANES
+
+CLOSE = 3 * TOLERANCE
+"""The residual allowed, with tissue that is at most three times softer than at rest; gradients in
+single precision weigh a hundred times less."""
+
+
+def galerkin(model, basis):
+    return Galerkin("pod", "pod", model, basis, Cubature.full(model))
+
+
+def test_gradients_at_points_are_those_of_the_shape_functions(workshop, rng):
+    model, m = workshop.model, 3
+    modes = rng.standard_normal((3 * len(workshop.mesh.nodes), m))
+    points = np.array([5, 17, 18, 100, 101, 102, 103, *range(200, 212)])
+    tiles = -(-len(points) // LANES)
+    out = np.zeros((4, 9 * LANES * tiles), np.float32)
+    point_gradients(model.connectivity, model.gradients, points, modes, out)
+    e, q = np.divmod(points, model.weights.shape[1])
+    local = modes.reshape(-1, 3, m)[model.connectivity[e]]
+    expected = np.einsum("caim,caj->mcij", local, model.gradients[e, q]).reshape(m, -1, 9)
+    found = out.reshape(4, tiles, 9, LANES).transpose(0, 1, 3, 2).reshape(4, -1, 9)
+    np.testing.assert_allclose(found[:m, : len(points)], expected, atol=1e-6)
+    assert not found[m:].any()
+    assert not found[:, len(points) :].any()
+
+
+def test_a_basis_that_holds_the_answer_finds_it(workshop, queries, rng):
+    model = workshop.model
+    for load, exact in queries:
+        u = exact.ravel()[model.free]
+        basis, _ = energy_pod(model, np.stack([u, *rng.random((4, len(u)))], axis=1), 5)
+        method = galerkin(model, basis)
+        answer = method.solve(Case.of(workshop, load))
+        assert answer.converged
+        assert answer.trusted
+        found = method.displacement(answer)
+        assert np.linalg.norm(found - exact) <= CLOSE * np.linalg.norm(exact)
+
+
+def test_it_is_the_python_galerkin_model(workshop, training, queries):
+    model, basis = workshop.model, training.pod(18)
+    method = galerkin(model, basis)
+    loads = [load for load, _ in queries]
+    expected, converged = solve_galerkin(workshop, basis, loads, np.zeros((len(loads), 18)))
+    assert converged.all()
+    for load, q in zip(loads, expected, strict=True):
+        answer = method.solve(Case.of(workshop, load))
+        assert answer.converged
+        assert np.linalg.norm(answer.state[:18] - q) <= CLOSE * np.linalg.norm(q)
+
+
+def test_answers_do_not_depend_on_what_was_asked_before(workshop, training, queries):
+    method = galerkin(workshop.model, training.pod(10))
+    first, second = (Case.of(workshop, load) for load, _ in queries[:2])
+    once = method.solve(first).state
+    method.solve(second)
+    np.testing.assert_array_equal(method.solve(first).state, once)
+
+
+def test_a_small_load_is_answered_linearly(workshop, training, queries):
+    model, basis, load = workshop.model, training.pod(10), queries[0][0]
+    soft = Load(load.position, load.direction, 1e-4 * load.pressure)
+    answer = galerkin(model, basis).solve(Case.of(workshop, soft))
+    q = basis.T @ workshop.load_vector(soft).ravel()[model.free]
+    assert np.linalg.norm(answer.state[:10] - q) <= 1e-3 * np.linalg.norm(q)
+
+
+def test_the_first_ritz_vector_is_exact_in_the_limit_of_small_loads(workshop, training, queries):
+    method, load, errors = build("ritz-at-hand", 1, training), queries[0][0], []
+    for fraction in (0.04, 0.02):
+        soft = Load(load.position, load.direction, fraction * load.pressure)
+        exact = workshop.solve(soft).displacement
+        errors.append(relative(method.displacement(method.solve(Case.of(workshop, soft))), exact))
+    assert errors[0] < 0.02
+    assert errors[0] / errors[1] == pytest.approx(2, rel=0.1)
+
+
+def test_a_basis_at_hand_may_come_smaller_than_the_last(workshop, training, queries):
+    model, cases = workshop.model, [Case.of(workshop, load) for load, _ in queries[:2]]
+    bases = iter([training.pod(11), training.pod(3)])
+    method = GalerkinAtHand("", "", model, 11, lambda case: next(bases))
+    method.solve(cases[0])
+    found = method.solve(cases[1]).state[1]
+    expected = galerkin(model, training.pod(3)).solve(cases[1]).state
+    np.testing.assert_allclose(found, expected[:3], rtol=1e-6)
+
+
+def test_no_load_moves_nothing(workshop, queries):
+    load = queries[0][0]
+    case = Case.of(workshop, Load(load.position, load.direction, 0.0))
+    method = GalerkinAtHand("", "", workshop.model, 4, lambda case: pytest.fail("not needed"))
+    answer = method.solve(case)
+    assert answer.converged
+    assert not method.displacement(answer).any()
+
+
+def test_points_that_share_a_dilatation_are_refused(workshop):
+    scene = workshop.scene
+    other = FullModel(workshop.mesh, "hex8-mean-dilatation", scene.tissue.young, 0.49)
+    with pytest.raises(ValueError, match="dilatation"):
+        ReducedModel(other, 4, Cubature.full(other))
