@@ -93,7 +93,7 @@ FAST = {"contract", "reassoc", "nsz"}
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def _superpose(rows, coefficients, out):
+def superpose(rows, coefficients, out):
     """``out = coefficients @ rows``: rows (4 k, n) int16 or float32, out (n,) float32."""
     for i in range(len(out)):
         out[i] = np.float32(0.0)
@@ -109,7 +109,7 @@ def _superpose(rows, coefficients, out):
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def _project(rows, vector, out):
+def project(rows, vector, out):
     """``out = rows @ vector``: rows (4 k, n) int16 or float32, vector (n,) float32."""
     for j in range(0, len(rows), 4):
         p, q, r, s = rows[j], rows[j + 1], rows[j + 2], rows[j + 3]
@@ -183,8 +183,8 @@ def nonlinear_stress(H, weights, mu, lam, J, trace, linear, P):
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def _linearise(H, weights, mu, lam, state):
-    """What ``_increments`` needs, in tiles of ``STATE`` components; moduli times weight."""
+def linearise(H, weights, mu, lam, state):
+    """What ``increments`` needs, in tiles of ``STATE`` components; moduli times weight."""
     for tile in range(len(weights) // LANES):
         h = H[TILE * tile : TILE * (tile + 1)]
         s = state[STATE * LANES * tile : STATE * LANES * (tile + 1)]
@@ -205,7 +205,7 @@ def _linearise(H, weights, mu, lam, state):
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def _increments(state, gradients, out):
+def increments(state, gradients, out):
     """Tangent less that at rest, times the gradient of every mode: (m, 9 c) in tiles."""
     for tile in range(gradients.shape[1] // TILE):
         s = state[STATE * LANES * tile : STATE * LANES * (tile + 1)]
@@ -270,13 +270,15 @@ class LocalSystem(NamedTuple):
     J: Array  # (c,)
     trace: Array  # (c,)
     linear: Array  # (c,)
-    state: Field  # (13 c,) in tiles, see _linearise
+    state: Field  # (13 c,) in tiles, see linearise
     increments: Field  # (m, 9 c) in tiles
     tangent: Array  # (m, m), lower triangle
     factor: Array  # (m, m) lower Cholesky factor
 
 
 def _is_local_system(system: object) -> bool:
+    if isinstance(system, types.StructRef):  # bound
+        return tuple(system.field_dict) == LocalSystem._fields
     return isinstance(system, types.NamedTuple) and system.instance_class is LocalSystem
 
 
@@ -286,7 +288,7 @@ def _potential(system, u, residual):
         return None
 
     def potential(system, u, residual):
-        _superpose(system.gradients, u, system.H)
+        superpose(system.gradients, u, system.H)
         J, trace, linear = system.J, system.trace, system.linear
         weights, mu, lam = system.weights, system.mu, system.lam
         nonlinear_stress(system.H, weights, mu, lam, J, trace, linear, system.P)
@@ -296,7 +298,7 @@ def _potential(system, u, residual):
         energy = 0.0
         for c in range(len(weights)):
             energy += weights[c] * (tissue.energy(J[c], trace[c], mu[c], lam[c]) - linear[c])
-        _project(system.gradients, system.P, residual)
+        project(system.gradients, system.P, residual)
         for i in range(len(u)):
             residual[i] += u[i] - system.load[i]
             energy += (0.5 * u[i] - system.load[i]) * u[i]
@@ -311,9 +313,9 @@ def _factorise(system, u, shift):
         return None
 
     def factorise(system, u, shift):
-        _superpose(system.gradients, u, system.H)
-        _linearise(system.H, system.weights, system.mu, system.lam, system.state)
-        _increments(system.state, system.gradients, system.increments)
+        superpose(system.gradients, u, system.H)
+        linearise(system.H, system.weights, system.mu, system.lam, system.state)
+        increments(system.state, system.gradients, system.increments)
         _lower_products(system.gradients, system.increments, system.tangent)
         for i in range(len(u)):
             system.tangent[i, i] += 1.0
@@ -678,13 +680,13 @@ def _enrich(patches, k, wide, scratch):
     """
     gradients, steps, residual = patches.gradients[k], patches.steps[k], scratch.residual
     vectors = scratch.vectors
-    _project(gradients, scratch.P, residual)
+    project(gradients, scratch.P, residual)
     _to_wide(scratch.q, vectors, wide)
     for i in range(len(residual)):
         residual[i] = residual[i] * steps[i] + wide[i] - scratch.wide_load[i]
     vectors[PATH] = residual
     missed = _append(PATH, steps, scratch)
-    _superpose(gradients, scratch.stepped[PATH], scratch.gradients[NARROW - 1])
+    superpose(gradients, scratch.stepped[PATH], scratch.gradients[NARROW - 1])
     scratch.newton[0, NARROW - 1] = np.dot(vectors[PATH], residual)
     return missed
 

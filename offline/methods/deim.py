@@ -38,7 +38,7 @@ from offline.methods.galerkin import (
 )
 from offline.methods.method import Answer, Case
 from shared.bound import bind
-from shared.reduced import _increments, _linearise, _project, _superpose, nonlinear_stress
+from shared.reduced import increments, linearise, nonlinear_stress, project, superpose
 
 Array = NDArray[np.float64]
 
@@ -100,9 +100,8 @@ class _Content(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _newton(bound, nodes, forces):
+def _newton(content, nodes, forces):
     """Plain Newton's method from rest: (converged, iterations), and ``q``."""
-    content = bound.content
     test, q, work = content.test, content.trial.q, content.trial.newton
     s = content.trial.system
     reduce_load(content.trial.modes, nodes, forces, s.load)
@@ -110,17 +109,17 @@ def _newton(bound, nodes, forces):
     residual = work[0]
     target = max(TOLERANCE * math.sqrt(np.dot(s.load, s.load)), 1e-12)
     for iteration in range(1, MAX_ITERATIONS):
-        _superpose(s.gradients, q, s.H)
+        superpose(s.gradients, q, s.H)
         nonlinear_stress(s.H, s.weights, s.mu, s.lam, s.J, s.trace, s.linear, s.P)
         if not s.J.min() > 0.0:
             return False, iteration
-        _project(test, s.P, residual)
+        project(test, s.P, residual)
         for i in range(len(q)):
             residual[i] += q[i] - s.load[i]
         if math.sqrt(np.dot(residual, residual)) <= target:
             return True, iteration
-        _linearise(s.H, s.weights, s.mu, s.lam, s.state)
-        _increments(s.state, s.gradients, s.increments)
+        linearise(s.H, s.weights, s.mu, s.lam, s.state)
+        increments(s.state, s.gradients, s.increments)
         s.tangent[:] = np.dot(test, s.increments.T)
         for i in range(len(q)):
             s.tangent[i, i] += 1.0

@@ -102,9 +102,8 @@ def reduce_load(modes, nodes, forces, load):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _solve(bound, nodes, forces):
+def _solve(content, nodes, forces):
     """Equilibrium from rest: (status, iterations), and ``q``."""
-    content = bound.content
     system, q, work = content.system, content.q, content.newton
     reduce_load(content.modes, nodes, forces, system.load)
     # at rest the residual is the load's negative and the tangent the identity

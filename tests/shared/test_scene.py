@@ -38,13 +38,8 @@ von_mises = 0.02
 query = 150e-6
 [training]
 limit_spacing = 4.0
-ritz_spacing = 1.0
-patch_spacing = 2.5
 region_spacing = 7.5
-modes = 64
-region_modes = 200
 blend = 0.2
-cubature_points = 96
 samples = 60
 """
 
@@ -108,6 +103,7 @@ def test_load_scene_knows_its_folder(tmp_path) -> None:
         ("[1.0, 9.0]", "[9.0, 1.0]", r"surface: x must be \[from, to\]"),
         ('"slab"', '"../slab"', r"name = '../slab'"),
         ("max_tilt = 30.0", "max_tilt = 90.0", r"endoscope.max_tilt = 90.0: .*less than 90"),
+        ("samples = 60", "samples = 6", r"training.samples = 6: .*greater than or equal to 60"),
         ("radius = 2.0", "radius = -2.0", r"endoscope.radius = -2.0: .*greater than 0"),
     ],
 )

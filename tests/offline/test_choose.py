@@ -1,0 +1,71 @@
+"""The smallest size that meets a tolerance, and what is said when none does."""
+
+import numpy as np
+import pytest
+
+from offline.choose import LADDER, MARGIN, WORST, Trial, TrialResult, choose
+from shared.scene import Budget, Tolerance
+
+BUDGET = Budget(query=150e-6)
+
+
+def attempts(errors, seconds=50e-6):
+    """Trials whose errors are given size by size; also the sizes tried, in order."""
+    tried = []
+
+    def attempt(size):
+        tried.append(LADDER.index(size))
+        error = np.full(20, errors[tried[-1]])
+        return Trial.of(size, [TrialResult(error, 2 * error, seconds)])
+
+    return attempt, tried
+
+
+@pytest.mark.parametrize("smallest", range(len(LADDER)))
+def test_the_smallest_size_that_is_good_enough(smallest):
+    errors = [0.02 if i < smallest else 0.007 for i in range(len(LADDER))]
+    attempt, tried = attempts(errors)
+    choice = choose(Tolerance(displacement=0.01, von_mises=0.02), BUDGET, attempt)
+    assert choice.size == LADDER[smallest]
+    assert len(tried) == len(set(tried)) <= 3
+    assert choice.why.startswith("the smallest")
+    assert [LADDER.index(trial.size) for trial in choice.trials] == sorted(tried)
+
+
+def test_a_looser_tolerance_takes_a_smaller_model():
+    errors = [0.03, 0.015, 0.01, 0.006, 0.004]
+    sizes = [
+        choose(Tolerance(displacement=t, von_mises=2 * t), BUDGET, attempts(errors)[0]).size
+        for t in (0.01, 0.02, 0.05)
+    ]
+    assert sizes == [LADDER[3], LADDER[1], LADDER[0]]
+
+
+def test_a_tolerance_out_of_reach_is_said_plainly():
+    attempt, _ = attempts([0.5, 0.4, 0.3, 0.2, 0.1])
+    choice = choose(Tolerance(displacement=0.01, von_mises=0.02), BUDGET, attempt)
+    assert choice.size == LADDER[-1]
+    assert "no size meets the tolerance of 1.00%" in choice.why
+    assert "10.00% displacement, 20.00% von Mises" in choice.why
+
+
+def test_a_budget_exceeded_names_the_best_within_it():
+    def attempt(size):
+        place = LADDER.index(size)
+        error = np.full(20, [0.5, 0.4, 0.3, 0.005, 0.004][place])
+        return Trial.of(size, [TrialResult(error, error, 60e-6 * place)])
+
+    choice = choose(Tolerance(displacement=0.01, von_mises=0.02), BUDGET, attempt)
+    assert choice.size == LADDER[3]
+    assert "180 µs to solve, over the budget of 150 µs" in choice.why
+    assert "the best within it" in choice.why
+    assert "30.00% displacement" in choice.why
+
+
+def test_a_single_wild_error_is_not_outweighed_by_many_good_ones():
+    tolerance = Tolerance(displacement=0.01, von_mises=0.02)
+    error = np.full(99, 0.5 * MARGIN * 0.01)
+    good = Trial.of(LADDER[0], [TrialResult(error, error, 1e-4)])
+    wild = np.append(error, 1.01 * WORST * 0.01)
+    assert good.meets(tolerance)
+    assert not Trial.of(LADDER[0], [TrialResult(wild, error, 1e-4)]).meets(tolerance)
