@@ -33,6 +33,7 @@ from offline.checkpoint import Checkpoint, content_key
 from offline.choose import LADDER, Trial, TrialResult, choose
 from offline.mesh import mesh_quality
 from offline.patches import PatchResult, PatchTask, RegionResult
+from offline.refinement import MOST_DOFS, mesh_error_document
 from offline.sampling import (
     area,
     centred_points,
@@ -45,7 +46,7 @@ from offline.scenes import find_scene
 from offline.spaces import Footprint
 from offline.validate import Comparison, compare, random_loads, summarise
 from offline.workers import Tasks, resume, worker_pool
-from offline.workshop import Workshop, open_workshop, run
+from offline.workshop import Load, Workshop, open_workshop, run
 from shared.artifact import Dataset, write_artifact
 from shared.atlas import Atlas, Estimator, LocalModels
 from shared.reduced import ERROR_FEATURES, NARROW
@@ -67,6 +68,8 @@ BATCH, LEAST = 60, 180
 CONTACTS_PER_PATCH = 400
 
 TRIAL_PATCHES = 8
+
+REFINED_LOADS = 6
 COVERAGE = 0.97
 """Share of known loads whose errors the estimate must cover: above 95 %, for unseen ones to be."""
 
@@ -163,6 +166,8 @@ class Pipeline:
         layout = self.layout(size)
         models = self.local_models(layout, limits)
         estimator, documents, rows = self._validate(models, limits)
+        if 3 * len(self.workshop.mesh.nodes) <= MOST_DOFS:
+            documents["mesh_error"] = self._mesh_error(limits)
         documents["training"] |= {"layout": self._describe(layout, models)}
         if choice is not None:
             documents["training"]["choice"] = choice.document
@@ -355,6 +360,19 @@ class Pipeline:
             "validation": summarise(rows),
         }
         return estimator, documents, rows
+
+    def _mesh_error(self, limits: Array) -> dict[str, Any]:
+        """Press at half the range on finer and other meshes."""
+        rng = np.random.default_rng([self.scene.seed, 5])
+        tasks = {}
+        for i, point in enumerate(spread_points(self.surface, REFINED_LOADS, rng)):
+            x, normal, _, fields = self.surface.locate(point, limits)
+            tasks[f"mesh-{i}"] = Workshop.mesh_error, Load(x, -normal, float(fields[0]) / 2)
+        found = self._stage(
+            "mesh error", tasks, lambda r: dict(zip(("dofs", "moved"), r, strict=True))
+        )
+        moved = np.array([found[name]["moved"] for name in tasks])
+        return mesh_error_document(self.scene, found["mesh-0"]["dofs"], moved)
 
     # --- pieces --------------------------------------------------------------------------------
 

@@ -31,6 +31,7 @@ from offline.patches import (
     random_load,
     train_patch,
 )
+from offline.refinement import refined, twin
 from offline.spaces import Footprint, energy_pod, ritz_vectors
 from offline.surface_mesh import accessible_surface
 from shared.artifact import Artifact, read_artifact
@@ -237,6 +238,27 @@ class Workshop:
         kept = self.beyond_clamped_layer
         stresses = [self.von_mises(u)[kept] for u in (displacement, reference)]
         return relative(displacement, reference), relative(*stresses)
+
+    @cached_property
+    def _others(self) -> tuple[Workshop, Workshop]:
+        return Workshop(twin(self.scene)), Workshop(refined(self.scene))
+
+    def mesh_error(self, load: Load) -> tuple[Array, Array]:
+        """Degrees of freedom of the scene's mesh, its twin and a finer one, and what a load does.
+
+        Returns
+        -------
+        dofs, moved : ndarray, shape (3,)
+            Mean displacement under the footprint, mm.
+        """
+        bodies = (self, *self._others)
+        moved = []
+        for body in bodies:
+            nodal, _ = body.unit_load(load.position)
+            force = load.pressure * nodal[:, None] * load.direction
+            displacement = body.model.solve(force).displacement
+            moved.append(np.linalg.norm(nodal @ displacement) / nodal.sum())
+        return np.array([body.mesh.nodes.size for body in bodies]), np.array(moved)
 
     def sample(self, load: Load) -> NDArray[np.float32] | None:
         """Full displacement (n, 3) mm, None where there is no equilibrium."""

@@ -105,3 +105,13 @@ def test_one_compilation_serves_training_and_queries(artifact):
     )  # fmt: skip
     other.solve(atlas.surface.vertices[0], 0.1)
     assert len(query.signatures) == 1
+
+
+def test_the_mesh_error_is_that_of_other_meshes(artifact):
+    report = Atlas.load(artifact).info["mesh_error"]
+    own, other = report["elements"]["hex20"], report["elements"]["hex8-mean-dilatation"]
+    assert report["reference_dofs"] >= 5 * own["dofs"]
+    assert other["dofs"] == pytest.approx(own["dofs"], rel=0.3)
+    for errors in (own, other):
+        assert -0.2 < errors["least"] <= errors["mean"] <= errors["greatest"] < 0.2
+    assert abs(own["mean"]) < abs(other["mean"])
