@@ -69,7 +69,7 @@ CONTACTS_PER_PATCH = 400
 
 TRIAL_PATCHES = 8
 
-REFINED_LOADS = 6
+REFINED_LOADS = 4
 COVERAGE = 0.97
 """Share of known loads whose errors the estimate must cover: above 95 %, for unseen ones to be."""
 
