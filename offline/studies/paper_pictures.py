@@ -22,10 +22,13 @@ STYLES = {"MOD": ("#0072B2", "o"), "RITZ": ("#E69F00", "s"), "POD": ("#009E73", 
 NO_ANSWER = 0.99
 """Error at P from which on bases do not answer the load at all: there is nothing to time."""
 
-SIZE = (1200, 820)
+SIZE = (1200, 940)
 COLOURS, INK, RING = "viridis", "#202428", "#ffffff"
 SUBDIVISIONS = 2
-VIEWS = {"medial side, pressed in the ring": (1.0, -0.7, 0.35), "lateral side": (-1.0, 0.7, 0.35)}
+VIEWS = {
+    "medial side, pressed in the ring": (1.0, -0.7, 0.35),
+    "lateral side (grey: value is zero)": (-1.0, 0.7, 0.35),
+}
 DECADES = 4
 """Most powers of ten that a scale of colours shows."""
 
@@ -49,7 +52,8 @@ def chart(path: Path, rows: list[dict[str, Any]], title: str) -> None:
         )
         timed = [row for row in own if row["error_at_P_mean"] < NO_ANSWER]
         ratios.plot([row["bases"] for row in timed], [row["cpu_ratio"] for row in timed], **style)
-    errors.axhline(100 * TOLERANCE, color="0.4", linestyle=":", label="the solver's tolerance")
+    errors.axhline(100 * TOLERANCE, color="0.4", linestyle=":")
+    errors.text(7, 80 * TOLERANCE, "tolerance of the reduced solver", va="top", color="0.3")
     ticks = sorted({row["bases"] for row in rows})
     plain = FuncFormatter(lambda value, _: f"{value:g}")
     for axes in (errors, ratios):
@@ -67,7 +71,7 @@ def chart(path: Path, rows: list[dict[str, Any]], title: str) -> None:
     ratios.tick_params(which="minor", labelsize=11)
     errors.set_ylabel("(a) relative error of displacement at P, %", fontsize=12)
     ratios.set_ylabel("(b) CPU time, full model / reduced", fontsize=12)
-    errors.legend(fontsize=11)
+    ratios.legend(fontsize=11, loc="lower left")
     figure.savefig(path, dpi=110)
 
 
@@ -117,7 +121,7 @@ def contours(path: Path, mesh: Mesh, errors: dict[str, Array], at: Array, radius
             plotter.add_text(title, position=(0.04, 0.92), viewport=True, font_size=11, color=INK)
             plotter.view_vector(towards, viewup=(0, 0, 1))
             plotter.camera.parallel_projection = True
-            plotter.camera.zoom(1.25)
+            plotter.camera.zoom(1.15)
         plotter.add_scalar_bar(
             f"relative error of {name}\n", mapper=painted.mapper, color=INK, fmt="%.0e",
             position_x=0.15, width=0.7, position_y=0.03, height=0.13,
