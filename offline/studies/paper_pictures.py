@@ -53,8 +53,9 @@ def chart(path: Path, rows: list[dict[str, Any]], title: str) -> None:
         timed = [row for row in own if row["error_at_P_mean"] < NO_ANSWER]
         ratios.plot([row["bases"] for row in timed], [row["cpu_ratio"] for row in timed], **style)
     errors.axhline(100 * TOLERANCE, color="0.4", linestyle=":")
-    errors.text(7, 80 * TOLERANCE, "tolerance of the reduced solver", va="top", color="0.3")
     ticks = sorted({row["bases"] for row in rows})
+    words = {"ha": "right", "va": "top", "color": "0.3"}
+    errors.text(ticks[-1], 80 * TOLERANCE, "tolerance of the reduced solver", **words)
     plain = FuncFormatter(lambda value, _: f"{value:g}")
     for axes in (errors, ratios):
         axes.set_xscale("log")
@@ -90,7 +91,7 @@ def contours(path: Path, mesh: Mesh, errors: dict[str, Array], at: Array, radius
         PNG.
     mesh : Mesh
     errors : dict of ndarray, shape (n,)
-        Relative errors; nan is drawn grey.
+        Relative errors; nan is drawn grey: no displacement, or stress cut off at zero.
     at : ndarray, shape (3,), mm
     radius : float, mm
         Centre and radius of the footprint, which is ringed.
