@@ -248,6 +248,46 @@ def mesh_independence(queries: int, seed: int, as_json: bool) -> None:
         _show(compare(queries, seed, Path(folder)), as_json)
 
 
+@study.command()
+@click.option(
+    "--report",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=Path("artifacts/cube/report"),
+    show_default=True,
+    help="Folder for the table and the chart.",
+)
+@json_option
+def cube(report: Path, as_json: bool) -> None:
+    """Redraw figure 1 of Radermacher & Reese.
+
+    A cube under compression in modal, Ritz and POD bases: relative error at a point and ratio of
+    CPU times against the number of bases, and which of the paper's claims hold.
+    """
+    from offline.studies.paper import cube
+
+    _show(cube(report), as_json)
+
+
+@study.command()
+@click.option(
+    "--report",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=Path("artifacts/turbinate/report"),
+    show_default=True,
+    help="Folder for the table, the chart and the contours.",
+)
+@json_option
+def turbinate(report: Path, as_json: bool) -> None:
+    """Redraw figures 1, 2c and 2d of Radermacher & Reese.
+
+    The turbinate under one footprint in modal, Ritz and POD bases, and contours of the relative
+    errors in five POD bases. Needs PyVista: pip install -e '.[pictures]'.
+    """
+    from offline.studies.paper import turbinate
+
+    _show(turbinate(report), as_json)
+
+
 @study.command("newton-step")
 @click.option("--element", type=click.Choice(["hex8", "hex20"]), default="hex20", show_default=True)
 @click.option("--repeats", type=click.IntRange(min=1), default=20, show_default=True)

@@ -1,0 +1,121 @@
+"""The paper's figures on bodies of few elements, and those of its claims that hold there."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from offline.mesh import local_thickness
+from offline.scenes import find_scene
+from offline.studies import paper, paper_pictures
+from offline.workshop import Workshop
+from shared.cli import main
+from shared.errors import PalpateError
+
+SIZES = (1, 2, 3, 6)
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def coarse(name, *divisions):
+    scene = find_scene(name)
+    geometry = scene.geometry.model_copy(update={"divisions": divisions})
+    return Workshop(scene.model_copy(update={"geometry": geometry}))
+
+
+@pytest.fixture(autouse=True)
+def few_snapshots(monkeypatch):
+    monkeypatch.setattr(paper, "SNAPSHOTS", 8)
+    monkeypatch.setattr(paper, "SIZES", SIZES)
+
+
+@pytest.fixture
+def pressed():
+    return paper.footprint(coarse("turbinate", 7, 1, 7), paper.MEDIAL)
+
+
+def test_the_cube_under_compression(tmp_path, monkeypatch):
+    monkeypatch.setattr(paper, "Workshop", lambda scene: coarse(scene.name, 4, 4, 4))
+    report = tmp_path / "new"
+    result = CliRunner().invoke(main, ["study", "cube", "--report", str(report), "--json"])
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert found["load"]["point_P_mm"] == [5, 5, 10]
+    claims = found["claims"]
+    assert claims["pod_least_error"]["holds"]
+    # the first bending modes know nothing of a load straight down
+    assert found["figure_1"]["MOD 1"]["error_at_P_mean"] == pytest.approx(1)
+    ratios = claims["pod_best_cpu_ratio"]["at_accuracy"]["0.001"]
+    assert ratios["POD"] > 1
+    assert ratios["MOD"] is None
+    assert ratios["RITZ"] is None
+    assert claims["stress_best_near_support"]["largest_stress_is_near"]
+    with (report / "paper_cube.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["method"] for row in rows} == {"MOD", "RITZ", "POD"}
+    assert all(row["unconverged"] == "0" and float(row["cpu_ratio"]) > 1 for row in rows)
+    assert (report / "paper_cube.png").read_bytes().startswith(PNG)
+
+
+def test_the_turbinate_under_a_footprint(tmp_path, pressed):
+    found = paper.compare(pressed, tmp_path, SIZES)
+    claims = found["claims"]
+    assert claims["pod_least_error"]["holds"]
+    assert claims["pod_best_cpu_ratio"]["holds"]
+    # POD alone is accurate at all
+    assert claims["pod_best_cpu_ratio"]["at_accuracy"]["0.01"]["RITZ"] is None
+    assert found["figure_1"]["POD 3"]["error_at_P_mean"] < 1e-3
+    few = found["claims_with_fewer_bases"]["3"]
+    assert few["error_largest_where_value_smallest"]["holds"]
+    assert few["stress_best_near_support"]["holds"]
+    assert not list(tmp_path.glob("*contours*"))
+
+
+def test_the_footprint_presses_as_hard_as_is_trained_for(pressed):
+    largest = np.linalg.norm(paper.snapshots(pressed)[-1], axis=1).max()
+    allowed = pressed.workshop.scene.load.max_indentation
+    at, normal, _ = pressed.workshop.surface.project(np.array(paper.MEDIAL))
+    (thickness,) = local_thickness(pressed.workshop.mesh, at[None], normal[None])
+    assert largest == pytest.approx(allowed * thickness, rel=0.05)
+
+
+def test_pressure_on_the_whole_top():
+    example = paper.covered(coarse("cube", 2, 2, 2), 2.0)
+    np.testing.assert_allclose(example.load.sum(axis=0), [0, 0, -200], atol=1e-9)
+
+
+def test_polished_equilibrium_is_one_of_the_bases(pressed):
+    known = paper.snapshots(pressed)
+    model = pressed.workshop.model
+    basis = paper.spaces(pressed, known, 2)["POD"]
+    u = paper.polished(pressed, basis, np.zeros(2), 0.2)
+    force = np.zeros(u.size)
+    model.internal(u.ravel(), force)
+    load = 0.2 * pressed.load.ravel()[model.free]
+    off = basis.T @ (force[model.free] - load)
+    assert np.linalg.norm(off) < 1e-6 * np.linalg.norm(basis.T @ load)
+
+
+def test_tenths_are_by_value():
+    value = np.arange(1.0, 101.0)
+    found = paper._tenths(value, 1 / value)
+    assert found["holds"]
+    assert found["rank_correlation"] == pytest.approx(-1)
+    assert not paper._tenths(value, value)["holds"]
+
+
+def test_contours(tmp_path, pressed):
+    pytest.importorskip("pyvista")
+    mesh = pressed.workshop.mesh
+    error = np.where(mesh.clamped, np.nan, 10.0 ** -mesh.nodes[:, 0])
+    out = tmp_path / "new" / "contours.png"
+    paper_pictures.contours(out, mesh, {"displacement": error, "stress": error}, pressed.at, 2.0)
+    assert out.read_bytes().startswith(PNG)
+
+
+def test_missing_pyvista_is_named_before_any_work(tmp_path, monkeypatch):
+    monkeypatch.setattr(paper_pictures, "find_spec", lambda name: None)
+    with pytest.raises(PalpateError, match=r"\.\[pictures\]"):
+        paper.turbinate(tmp_path)
+    assert not list(tmp_path.iterdir())
