@@ -147,16 +147,19 @@ class Workshop:
         wanted = self.scene.load.max_indentation * thickness
         pressure = wanted / np.linalg.norm((linear @ normal).reshape(-1, 3), axis=1).max()
         start, exponent, last, low, high = None, 1.0, None, 0.0, np.inf
+        below = None  # the state at the pressure ``low``
         while high > 1.03 * low:
             try:
-                state = self.model.solve(-pressure * nodal[:, None] * normal, start)
+                # no load steps: where a jump fails, the pressure between is asked for anyway
+                force = -pressure * nodal[:, None] * normal
+                state = self.model.solve(force, start, smallest_step=1.0)
             except NoEquilibrium:
                 high = pressure
-                pressure, start = (low + high) / 2, None
+                pressure, start = (low + high) / 2, below
                 continue
             moved = np.linalg.norm(state.displacement, axis=1).max()
             if moved < 1.02 * wanted:
-                low = pressure
+                low, below = pressure, state.displacement
             if moved > 0.98 * wanted:
                 high = pressure
             # displacement as a power of pressure, through the last two points
