@@ -61,7 +61,8 @@ LEARNING = 103
 SIZE, DERIVATIVES = 40, 19
 
 ROUGHLY = 0.1
-"""Errors that a wrong answer may have to be roughly right."""
+"""Error of displacement that a wrong answer may have to be roughly right; hardly any but the
+artifact is within the tolerance of a scene, and not even these have the stress."""
 
 ARTIFACT, WARM, FULL = "artifact", "artifact, warm", "full model, one jump"
 
@@ -69,8 +70,8 @@ RIGHT = "right"
 RIGHT_FLAGGED = "right but flagged"
 WRONG_FLAGGED = "wrong but flagged"
 REFUSED = "refused, or rightly none"
-DIVERGED = "diverged"
-ROUGH = "silent, within 10 %"
+DIVERGED = "not converged"
+ROUGH = "silently wrong, displacement within 10 %"
 SILENT = "silently wrong"
 INVERTED = "silently inverted"
 
@@ -150,7 +151,8 @@ def stability(
     dict
         ``artifact``: totals of its silent errors, of answers that are not finite and of crashes,
         and the share of right answers that it flags, overall and in range; ``methods``: outcomes;
-        ``without_equilibrium``: cases that the full model has no answer to.
+        ``without_equilibrium``: cases that the full model has no answer to;
+        ``with_several_equilibria``: cases whose path and jump end apart, a column if there are any.
     """
     atlas = Atlas.load(artifact)
     workshop = Workshop.of_artifact(read_artifact(artifact))
@@ -374,7 +376,7 @@ def _judge(workshop: Workshop, u: Array | None, trusted: bool, truth: Truth) -> 
     elif right:
         outcome = RIGHT
     else:
-        outcome = ROUGH if max(errors) <= ROUGHLY else SILENT
+        outcome = ROUGH if errors[0] <= ROUGHLY else SILENT
     return Reply(outcome, *errors, inverted)
 
 
@@ -425,7 +427,7 @@ def _publish(
     ]
     _write(report / "stability.csv", rows)
     _write(report / "stability_silent.csv", silent)
-    draw(report / "stability.png", rows)
+    draw(report / "stability.png", rows, [name for name, own in questions.items() if own])
     for checkpoint in checkpoints:
         checkpoint.remove()
     return _summary(table, questions)
@@ -462,7 +464,10 @@ def _summary(table: Table, questions: Mapping[str, Sequence[Question]]) -> dict[
     missing = {
         stressor: sum(truth.path is None for _, truth in own) for stressor, own in questions.items()
     }
-    report: dict[str, Any] = {"without_equilibrium": {k: n for k, n in missing.items() if n}}
+    report: dict[str, Any] = {
+        "without_equilibrium": {stressor: n for stressor, n in missing.items() if n},
+        "with_several_equilibria": len(questions.get(SEVERAL, ())),
+    }
     for name in (ARTIFACT, WARM):
         if name in table:
             report[name] = _honesty(table[name])
@@ -482,8 +487,7 @@ def _honesty(columns: Mapping[str, Sequence[Reply]]) -> dict[str, Any]:
         "nan": sum(reply.nan for reply in replies),
         "crashes": sum(reply.crashed for reply in replies),
         "right_but_flagged": _flagged(replies),
-        "right_but_flagged_in_range": _flagged(columns.get(CONTROL, ())),
-    }
+    } | ({"right_but_flagged_in_range": _flagged(columns[CONTROL])} if CONTROL in columns else {})
 
 
 def _flagged(replies: Sequence[Reply]) -> float:
@@ -493,34 +497,36 @@ def _flagged(replies: Sequence[Reply]) -> float:
     return counts[RIGHT_FLAGGED] / right if right else 0.0
 
 
-def draw(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+def draw(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> None:
     """Draw the map: a bar of outcomes for each method and stressor, its median error below."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
-    methods, columns = (list(dict.fromkeys(row[key] for row in rows)) for key in KEYS)
-    size = 3.4 + 0.86 * len(columns), 3.0 + 0.5 * len(methods)
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    size = 3.2 + 0.72 * len(columns), 2.8 + 0.44 * len(methods)
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.add_subplot()
     for row in rows:
         _cell(axes, columns.index(row["stressor"]), methods.index(row["method"]), row)
     axes.set_xticks(range(len(columns)), columns, rotation=40, ha="left", rotation_mode="anchor")
     axes.xaxis.tick_top()
-    axes.set_yticks(range(len(methods)), methods)
+    axes.set_yticks([y + MIDDLE for y in range(len(methods))], methods)
     axes.set(xlim=(-0.55, len(columns) - 0.45), ylim=(len(methods) - 0.45, -0.55))
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
     handles = [Patch(facecolor=c, edgecolor="0.4", label=name) for name, c in OUTCOMES.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
     figure.suptitle(
-        "Who fails under what, and who says so\n"
-        "share of cases in each outcome; below, the median displacement error of the answers given",
-        fontsize=12,
+        "Who fails under what, and who says so: what became of the answers to "
+        f"{rows[0]['cases']} loads of each kind\n"
+        "Below each bar: median error of displacement of the answers given, flagged ones included",
+        fontsize=13,
     )
     figure.savefig(path, dpi=100)
 
 
-KEYS = ("method", "stressor")
+MIDDLE = -0.12
+"""Of the bar in a cell, below the cell's own."""
 
 
 def _cell(axes: Any, x: int, y: int, row: Mapping[str, Any]) -> None:
@@ -528,12 +534,18 @@ def _cell(axes: Any, x: int, y: int, row: Mapping[str, Any]) -> None:
     left, cases = x - 0.45, int(row["cases"])
     for outcome, colour in OUTCOMES.items():
         width = 0.9 * int(row[outcome]) / cases
-        axes.barh(y - 0.12, width, 0.46, left, color=colour, linewidth=0)
+        axes.barh(y + MIDDLE, width, 0.46, left, color=colour, linewidth=0)
         left += width
-    axes.barh(y - 0.12, 0.9, 0.46, x - 0.45, fill=False, edgecolor="0.4", linewidth=0.5)
-    error = 100 * float(row["displacement_median"])
-    if not np.isnan(error):
-        text = (
-            f"{error:.2g} %" if error < 99.5 else f"{error:.0f} %" if error < 1000 else "> 1000 %"
-        )
-        axes.text(x, y + 0.28, text, ha="center", va="center", fontsize=7, color="0.25")
+    axes.barh(y + MIDDLE, 0.9, 0.46, x - 0.45, fill=False, edgecolor="0.4", linewidth=0.5)
+    axes.text(x, y + 0.25, _percent(row["displacement_median"]), ha="center", va="center", size=8)
+
+
+def _percent(error: float) -> str:
+    """Two digits for people; a dash where there is no answer to have one."""
+    percent = 100 * error
+    if np.isnan(percent):
+        return "–"
+    if not 0.01 <= percent < 1000:
+        return "< 0.01 %" if percent < 0.01 else "> 999 %"
+    digits = 0 if percent > 9.95 else 1 if percent > 0.095 else 2
+    return f"{percent:.{digits}f} %"
