@@ -303,6 +303,27 @@ def newton_step(element: str, repeats: int, as_json: bool) -> None:
     _show(compare(element, repeats), as_json)
 
 
+@study.command()
+@click.argument("scene")
+@click.option("--artifact", type=ARTIFACT, metavar="F", help="[default: artifacts/NAME.h5]")
+@click.option("--cases", type=click.IntRange(min=1), default=20, show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@json_option
+def stability(scene: str, artifact: Path | None, cases: int, seed: int, as_json: bool) -> None:
+    """Map which methods fail under what, and whether they say so.
+
+    The artifact of SCENE and other methods answer CASES loads of every stressor, in range and far
+    beyond it, for which the full model's answer is known. The map goes to
+    NAME/report/stability.csv and .png beside the artifact, the artifact's silent errors to
+    stability_silent.csv. A killed run goes on where it stopped.
+    """
+    from offline.scenes import find_scene
+    from offline.studies.stability import stability
+
+    path = artifact or Path("artifacts") / f"{find_scene(scene).name}.h5"
+    _show(stability(path, cases, seed), as_json)
+
+
 def _show(report: Mapping[str, object], as_json: bool) -> None:
     """Print a report as JSON, or as one ``name value`` line per leaf."""
     if as_json:

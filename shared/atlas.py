@@ -56,6 +56,9 @@ Array = NDArray[np.float64]
 Field = NDArray[np.float32]
 Region = Literal["surface", "all"]
 
+BESIDE = 0.1
+"""Millimetres beyond the rim of the surface at which the answer is not to the question any more."""
+
 _INWARD = np.zeros(3)
 """Direction that stands for the inward normal."""
 
@@ -567,6 +570,8 @@ class Atlas:
             raise QueryError("direction", "must point into the tissue")
         limit = scalars[LIMIT]
         out_of_range: tuple[str, ...] = ()
+        if distance > BESIDE and _beside(at, record[_POINT], record[_NORMAL], distance):
+            out_of_range += ("position",)
         if pressure > limit * (1 + 1e-9):
             out_of_range += ("pressure",)
         if tilt > endoscope.max_tilt + 1e-6:
@@ -635,6 +640,11 @@ class Atlas:
         # an answer that did not converge may be beyond single precision
         with np.errstate(over="ignore"):
             return stress.astype(np.float32)
+
+
+def _beside(position: Array, contact: Array, normal: Array, distance: float) -> bool:
+    """Whether a position lies rather beside the surface, beyond its rim, than above or below it."""
+    return abs(float(np.dot(position - contact, normal))) < 0.7 * distance
 
 
 def _number(slot: int) -> int:

@@ -233,11 +233,10 @@ def loads_about(workshop: Workshop, case: Case) -> Array:
     Those across turn every contact's force to the side, as far as it is tilted in use.
     """
     total = np.zeros((len(workshop.mesh.nodes), 3, 3))
-    for contact in case.contacts:
+    for contact, share in zip(case.contacts, case.shares, strict=True):
         frame = np.array([contact.direction, *tangents(contact.direction)])
         frame[1:] *= TANGENTIAL
-        nodal, _ = workshop.unit_load(contact.position)
-        total += contact.pressure * nodal[:, None, None] * frame.T
+        total[case.nodes] += share[:, None, None] * frame.T
     return total.reshape(-1, 3)
 
 

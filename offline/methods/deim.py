@@ -127,8 +127,47 @@ def _newton(content, nodes, forces):
     return False, MAX_ITERATIONS
 
 
-class Deim:
-    """Interpolated internal force in a basis for the whole surface; ``offline.methods.method``.
+class PlainNewton:
+    """A reduced model whose steps are taken whole, whatever comes; see ``offline.methods.method``.
+
+    With the trial functions as test functions it is a Galerkin model without a line search.
+
+    Parameters
+    ----------
+    family, label : str
+    unknowns : int
+    reduced : ReducedModel
+    test : ndarray, shape (>= m, 9 c), float32
+        Gradients of the test functions, as those of the modes.
+    """
+
+    def __init__(
+        self,
+        family: str,
+        label: str,
+        unknowns: int,
+        reduced: ReducedModel,
+        test: NDArray[np.float32],
+    ) -> None:
+        self.family, self.label, self.unknowns = family, label, unknowns
+        self._reduced = reduced
+        self._bound = bind(_Content(reduced.content, test))
+
+    def solve(self, case: Case) -> Answer:
+        """Solve from rest; the state is the modes' coordinates."""
+        try:
+            converged, iterations = _newton(self._bound, case.nodes, case.forces)
+        except np.linalg.LinAlgError:  # a singular tangent, or none that is finite
+            converged, iterations = False, MAX_ITERATIONS
+        return Answer(self._reduced.content.q.copy(), converged, converged, iterations)
+
+    def displacement(self, answer: Answer) -> Array:
+        """Nodal displacement (n, 3) mm."""
+        return (self._reduced.content.modes @ answer.state).reshape(-1, 3)
+
+
+class Deim(PlainNewton):
+    """Interpolated internal force in a basis for the whole surface.
 
     Parameters
     ----------
@@ -150,28 +189,16 @@ class Deim:
         modes: Array,
         samples: Samples,
     ) -> None:
-        self.family, self.label, self.unknowns = family, label, basis.shape[1]
+        unknowns = basis.shape[1]
         self.points = _points_touched(model, samples.dofs)
         weights = model.weights.ravel()[self.points]
-        self._reduced = ReducedModel(model, self.unknowns, Cubature(self.points, weights))
-        self._reduced.adopt(basis)
-        functions = np.zeros((3 * len(model.mesh.nodes), self.unknowns))
+        reduced = ReducedModel(model, unknowns, Cubature(self.points, weights))
+        reduced.adopt(basis)
+        functions = np.zeros((3 * len(model.mesh.nodes), unknowns))
         functions[model.free[samples.dofs]] = (basis.T @ modes @ samples.fit).T
-        test = np.zeros_like(self._reduced.content.system.gradients)
+        test = np.zeros_like(reduced.content.system.gradients)
         point_gradients(model.connectivity, model.gradients, self.points, functions, test)
-        self._bound = bind(_Content(self._reduced.content, test))
-
-    def solve(self, case: Case) -> Answer:
-        """Solve from rest; the state is the modes' coordinates."""
-        try:
-            converged, iterations = _newton(self._bound, case.nodes, case.forces)
-        except np.linalg.LinAlgError:  # a singular tangent, or none that is finite
-            converged, iterations = False, MAX_ITERATIONS
-        return Answer(self._reduced.content.q.copy(), converged, converged, iterations)
-
-    def displacement(self, answer: Answer) -> Array:
-        """Nodal displacement (n, 3) mm."""
-        return (self._reduced.content.modes @ answer.state).reshape(-1, 3)
+        super().__init__(family, label, unknowns, reduced, test)
 
 
 def _points_touched(model: FullModel, dofs: NDArray[np.int64]) -> NDArray[np.int64]:

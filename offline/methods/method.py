@@ -6,6 +6,7 @@ the load and that a user waits for, but no field of mesh size.  ``displacement``
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -28,18 +29,33 @@ class Case:
         The nodes that are loaded.
     forces : ndarray, shape (k, 3), mN
         On those.
+    shares : ndarray, shape (contacts, k), mN
+        What each contact presses them with, in its direction.
+    radius : float, optional
+        Of the footprints, mm; the scene's if absent.
     """
 
     contacts: tuple[Load, ...]
     nodes: NDArray[np.int64]
     forces: Array = field(repr=False)
+    shares: Array = field(default_factory=lambda: np.empty((0, 0)), repr=False)
+    radius: float | None = None
 
     @classmethod
     def of(cls, workshop: Workshop, *contacts: Load) -> Case:
         """Case of one or more pressed footprints on a scene's body."""
-        total = np.sum([workshop.load_vector(contact) for contact in contacts], axis=0)
-        nodes = np.flatnonzero(np.any(total != 0.0, axis=1))
-        return cls(contacts, nodes, total[nodes])
+        return cls.pressed(contacts, [workshop.unit_load(x.position)[0] for x in contacts])
+
+    @classmethod
+    def pressed(
+        cls, contacts: tuple[Load, ...], weights: Sequence[Array], radius: float | None = None
+    ) -> Case:
+        """Case of contacts, each with the nodal weights (n,) mm^2 of its unit pressure."""
+        shares = np.array([x.pressure * own for x, own in zip(contacts, weights, strict=True)])
+        nodes = np.flatnonzero(np.any(shares != 0.0, axis=0))
+        shares = shares[:, nodes]
+        directions = np.array([contact.direction for contact in contacts])
+        return cls(contacts, nodes, shares.T @ directions, shares, radius)
 
 
 @dataclass(frozen=True)
@@ -56,12 +72,15 @@ class Answer:
         Whether it vouches for it: in range, and estimated within the scene's tolerance.  Methods
         that cannot tell vouch for whatever converged.
     iterations : int
+    refused : bool
+        Whether it declined the case instead of trying.
     """
 
     state: Any = field(repr=False)
     converged: bool
     trusted: bool
     iterations: int = 0
+    refused: bool = False
 
 
 class Method(Protocol):

@@ -193,7 +193,7 @@ class Regression:
     def solve(self, case: Case) -> Answer:
         """Interpolate; the state is the modes' coordinates."""
         if len(case.contacts) != 1:
-            return Answer(np.zeros(self.unknowns), False, False)
+            return Answer(np.zeros(self.unknowns), False, False, refused=True)
         return Answer(self._interpolant(_features(case.contacts[0])), True, True)
 
     def displacement(self, answer: Answer) -> Array:

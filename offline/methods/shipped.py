@@ -6,37 +6,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offline.methods.method import Answer, Case
-from shared.atlas import Atlas
+from shared.atlas import Atlas, State
 from shared.errors import QueryError
 
 Array = NDArray[np.float64]
 
 
 class Shipped:
-    """An artifact's atlas, cold, for a single contact; it refuses several.
+    """An artifact's atlas for a single contact; it refuses several.
 
     It finds the contact point and its load by itself, which the other methods are given.
 
     Parameters
     ----------
     atlas : Atlas
+    state : State, optional
+        Where every answer starts from the last; without it each is cold.
     """
 
     family = label = "artifact"
 
-    def __init__(self, atlas: Atlas) -> None:
+    def __init__(self, atlas: Atlas, state: State | None = None) -> None:
         self.unknowns = int(atlas.info["training"]["layout"]["narrow_modes"])
-        self._atlas = atlas
+        self._atlas, self._state = atlas, state
 
     def solve(self, case: Case) -> Answer:
         """Query the atlas; the state is its solution, None if it refuses."""
         if len(case.contacts) != 1:
-            return Answer(None, False, False)
+            return Answer(None, False, False, refused=True)
         contact = case.contacts[0]
         try:
-            solution = self._atlas.solve(contact.position, contact.pressure, contact.direction)
+            solution = self._atlas.solve(
+                contact.position, contact.pressure, contact.direction, case.radius, self._state
+            )
         except QueryError:
-            return Answer(None, False, False)
+            return Answer(None, False, False, refused=True)
         tolerance = self._atlas.scene.tolerance
         trusted = (
             solution.converged
