@@ -35,11 +35,11 @@ from offline.methods.tetrahedra import scaled
 from offline.norms import relative
 from offline.studies.baselines import SNAPSHOTS, full_solutions
 from offline.studies.chart_drawing import draw, write_page
-from offline.studies.chart_points import FIELDS, FULL, SHIPPED, Point, pareto, write_csv
+from offline.studies.chart_points import FIELDS, SHIPPED, Point, pareto, write_csv
 from offline.studies.remeshed import Remeshed, refined
 from offline.validate import random_loads, unseen_loads
 from offline.workers import resume, worker_pool
-from offline.workshop import Load, Workshop, open_artifact
+from offline.workshop import Workshop, open_artifact
 from shared.artifact import read_artifact
 from shared.atlas import Atlas
 from shared.errors import PalpateError
