@@ -218,7 +218,7 @@ def baselines(
 @click.argument("scene")
 @click.option("--artifact", type=ARTIFACT, metavar="F", help="[default: artifacts/NAME.h5]")
 @click.option("--snapshots", type=click.IntRange(min=20), default=200, show_default=True)
-@click.option("--queries", type=click.IntRange(min=1), default=40, show_default=True)
+@click.option("--queries", type=click.IntRange(min=1), default=100, show_default=True)
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 @json_option
 def chart(

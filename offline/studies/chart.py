@@ -309,8 +309,9 @@ def _point(key: str, found: Mapping[str, Any], usual: float) -> Point:
     figures: dict[str, float] = {}
     for name in FIELDS:
         errors = found[name][~np.isnan(found[name])]
-        p95, most = (np.percentile(errors, 95), errors.max()) if errors.size else (np.nan, np.nan)
-        figures |= {f"{name}_p95": float(p95), f"{name}_max": float(most)}
+        quantiles = np.percentile(errors, [50, 95, 100]) if errors.size else np.full(3, np.nan)
+        for statistic, error in zip(("median", "p95", "max"), quantiles.tolist(), strict=True):
+            figures[f"{name}_{statistic}"] = error
     return Point(
         key=key,
         family=key.rsplit(" ", 1)[0],

@@ -14,6 +14,8 @@ SHIPPED, FULL = "artifact 1", "full 1"
 FIELDS = ("displacement", "von_mises", "refined")
 """Errors: of two fields on the scene's mesh, and of displacement against a refined one."""
 
+STATISTICS = ("median", "p95", "max")
+
 
 @dataclass(frozen=True)
 class Point:
@@ -27,29 +29,32 @@ class Point:
     label: str
     unknowns: int
     time_us: float
+    displacement_median: float
     displacement_p95: float
     displacement_max: float
+    von_mises_median: float
     von_mises_p95: float
     von_mises_max: float
+    refined_median: float
     refined_p95: float
     refined_max: float
     unconverged: int
 
-    def p95(self, field: str) -> float:
-        """95th percentile of the errors of one of ``FIELDS``."""
-        return float(getattr(self, f"{field}_p95"))
-
-    def largest(self, field: str) -> float:
-        """Largest error of one of ``FIELDS``."""
-        return float(getattr(self, f"{field}_max"))
+    def error(self, field: str, statistic: str) -> float:
+        """One of ``STATISTICS`` of the errors of one of ``FIELDS``."""
+        return float(getattr(self, f"{field}_{statistic}"))
 
 
-def pareto(points: Sequence[Point], field: str = "displacement") -> list[Point]:
-    """The points, fastest first, that no other beats in both time and p95 of an error."""
+def pareto(
+    points: Sequence[Point], field: str = "displacement", statistic: str = "p95"
+) -> list[Point]:
+    """The points, fastest first, that no other beats in both time and an error."""
     front: list[Point] = []
-    for point in sorted(points, key=lambda point: (point.time_us, point.p95(field))):
-        if point.p95(field) < (front[-1].p95(field) if front else math.inf):
+    least = math.inf
+    for point in sorted(points, key=lambda point: (point.time_us, point.error(field, statistic))):
+        if point.error(field, statistic) < least:
             front.append(point)
+            least = point.error(field, statistic)
     return front
 
 

@@ -91,7 +91,7 @@ def test_another_scene_s_artifact_is_refused(artifact):
 
 def test_the_front_is_what_nothing_beats_in_both():
     def point(key, time, error):
-        return Point(key, "", "", 1, time, error, error, error, error, error, error, 0)
+        return Point(key, "", "", 1, time, *9 * [error], 0)
 
     points = [point("a", 3, 0.1), point("b", 1, 0.5), point("c", 2, 0.6), point("d", 3, 0.2)]
     assert [p.key for p in pareto(points)] == ["b", "a"]
