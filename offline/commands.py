@@ -215,6 +215,31 @@ def baselines(
 
 
 @study.command()
+@click.argument("scene")
+@click.option("--artifact", type=ARTIFACT, metavar="F", help="[default: artifacts/NAME.h5]")
+@click.option("--snapshots", type=click.IntRange(min=20), default=200, show_default=True)
+@click.option("--queries", type=click.IntRange(min=1), default=100, show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@json_option
+def chart(
+    scene: str, artifact: Path | None, snapshots: int, queries: int, seed: int, as_json: bool
+) -> None:
+    """Set speed and accuracy of many methods side by side.
+
+    Those that learn do so from full solutions of SNAPSHOTS random loads; all answer the QUERIES
+    that palpate validate asks with this seed. Times are of one core. Table, picture and page go to
+    NAME/report/chart.csv, .png and .html beside the artifact. Takes half an hour; a killed run
+    goes on where it stopped.
+    """
+    from offline.scenes import find_scene
+    from offline.studies.chart import chart
+
+    found = find_scene(scene)
+    path = artifact or Path("artifacts") / f"{found.name}.h5"
+    _show(chart(found, path, snapshots, queries, seed), as_json)
+
+
+@study.command()
 @artifact_argument
 @click.option("--paths", type=click.IntRange(min=1), default=10, show_default=True)
 @click.option("--steps", type=click.IntRange(min=1), default=60, show_default=True)

@@ -94,8 +94,8 @@ def baselines(artifact: Path, snapshots: int, queries: int, seed: int) -> dict[s
     key = f"{content_key(atlas.scene)}-{hashlib.sha256(settings).hexdigest()[:16]}"
     checkpoint = Checkpoint(artifact.parent / f".{artifact.stem}.baselines", key)
     with worker_pool(open_artifact, artifact) as pool:
-        learned, known = _full_solutions("snapshots", learned, pool, checkpoint)
-        asked, exact = _full_solutions("queries", asked, pool, checkpoint)
+        learned, known = full_solutions("snapshots", learned, pool, checkpoint)
+        asked, exact = full_solutions("queries", asked, pool, checkpoint)
         modes, _ = energy_pod(model, known[:, model.free].T, len(known))
         sizes = sorted({min(m, modes.shape[1]) for m in (GALERKIN_MODES, *_modes(atlas))})
         methods = {"regression": _regression(model, modes, learned, known, asked)}
@@ -116,7 +116,7 @@ def _modes(atlas: Atlas) -> tuple[int, int]:
     return layout["narrow_modes"], layout["wide_modes"]
 
 
-def _full_solutions(
+def full_solutions(
     title: str, loads: Sequence[Load], pool: Executor, checkpoint: Checkpoint
 ) -> tuple[list[Load], Array]:
     """The loads that have an equilibrium, and their displacements (k, 3 n) mm."""
