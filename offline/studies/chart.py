@@ -11,7 +11,7 @@ Mises stress); an answer that did not converge counts as an error of 1.  Against
 the scene's own mesh that is the error of reduction; against a refined mesh that of the mesh comes
 on top.  Nodal stresses of two meshes are averaged over different elements, and next to the support
 they grow with refinement, so that only displacements are compared there; and their median is drawn,
-for in a few loads near the top of the range one mesh dents between its points and the other not.
+for so few loads say little of a 95th percentile.
 """
 
 from __future__ import annotations

@@ -119,7 +119,7 @@ class Panel:
 PANELS = (
     Panel("Displacement", "error against the full model, 95th percentile", "displacement"),
     Panel("Von Mises stress", "error against the full model, 95th percentile", "von_mises"),
-    # p95 would be that of the few loads under which a mesh dents between its points
+    # so few loads are solved in the refined mesh that they say little of a 95th percentile
     Panel(
         "Displacement, error of the mesh included",
         "error against a refined mesh, median",

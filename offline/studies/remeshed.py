@@ -15,6 +15,7 @@ from offline.methods.method import Answer, Case
 from offline.methods.tetrahedra import Divisions, lattice
 from offline.workshop import Load, Workshop
 from shared.elements import hexahedron, shape
+from shared.endoscope import footprint
 from shared.scene import Scene
 
 Array = NDArray[np.float64]
@@ -47,16 +48,28 @@ class Remeshed:
         self.workshop = Workshop(other)
         self.unknowns = len(self.workshop.model.free)
         self.label = f"mesh of {' x '.join(map(str, other.geometry.divisions))}"
-        self._to_scene = interpolation(Workshop(scene), self.workshop)
+        own = Workshop(scene)
+        self._surface = own.surface
+        self._to_scene = interpolation(own, self.workshop)
 
     def solve(self, case: Case) -> Answer:
         """Solve from rest; the state is the displacement of the mesh's own nodes."""
-        load = np.sum([self.workshop.load_vector(contact) for contact in case.contacts], axis=0)
+        load = np.sum([self._load(contact) for contact in case.contacts], axis=0)
         try:
             found = self.workshop.model.solve(load)
         except NoEquilibrium:
             return Answer(np.zeros_like(load), False, False)
         return Answer(found.displacement, True, True, found.iterations)
+
+    def _load(self, contact: Load) -> Array:
+        """Nodal forces (m, 3) mN, pressed where the scene's own mesh is.
+
+        Its accessible surface ends at other faces: a contact on the rim would be moved by it.
+        """
+        body, nodal = self.workshop.body, np.zeros(len(self.workshop.mesh.nodes))
+        x, normal, _ = self._surface.project(contact.position)
+        footprint(body.boundary, x, normal, self.workshop.scene.endoscope.radius, nodal)
+        return contact.pressure * nodal[:, None] * contact.direction
 
     def displacement(self, answer: Answer) -> Array:
         """Displacement (n, 3) mm of the scene's nodes."""
