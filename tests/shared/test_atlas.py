@@ -52,6 +52,17 @@ def test_force_is_pressure_times_the_projected_footprint(atlas):
 
 
 @pytest.mark.parametrize(
+    ("offset", "flags"),
+    [((0, 0, 1), ()), ((0, 0, -1), ()), ((-0.05, 0, 0), ()), ((-1, 0, 0), ("position",))],
+)
+def test_a_position_beside_the_surface_is_out_of_range_one_above_it_is_not(atlas, offset, flags):
+    edge = atlas.nodes.max(axis=0) * [0.0, 0.5, 1.0]
+    solution = atlas.solve(edge + offset, 0.1)
+    np.testing.assert_allclose(solution.contact_point, edge, atol=1e-9)
+    assert solution.out_of_range == flags
+
+
+@pytest.mark.parametrize(
     ("changes", "flags"),
     [
         ({"pressure": 1.01}, ("pressure",)),
