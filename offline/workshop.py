@@ -255,9 +255,13 @@ class Workshop:
             Mean displacement under the footprint, mm.
         """
         bodies = (self, *self._others)
+        # at one place on all: the accessible surface of another mesh ends at other faces
+        x, normal, _ = self.surface.project(load.position)
+        radius = self.scene.endoscope.radius
         moved = []
         for body in bodies:
-            nodal, _ = body.unit_load(load.position)
+            nodal = np.zeros(len(body.mesh.nodes))
+            footprint(body.body.boundary, x, normal, radius, nodal)
             force = load.pressure * nodal[:, None] * load.direction
             displacement = body.model.solve(force).displacement
             moved.append(np.linalg.norm(nodal @ displacement) / nodal.sum())
