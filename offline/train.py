@@ -279,14 +279,15 @@ class Pipeline:
     ) -> PatchTask:
         """Where patch k is, and the loads it answers."""
         contacts = layout.contacts[layout.contacts_of_patch[k]]
+        located = [self.surface.locate(x, limits) for x in contacts]
         return PatchTask(
             centre=layout.centres[k],
             normal=layout.normals[k],
             pressure=float(self._range_at(layout.centres[[k]], limits)[0, 0]),
             footprints=[footprints[i] for i in layout.ritz_of_patch[k]],
             contacts=contacts,
-            normals=np.array([self.surface.project(x)[1] for x in contacts]),
-            ranges=self._range_at(contacts, limits),
+            normals=np.array([normal for _, normal, _, _ in located]),
+            ranges=np.array([fields for _, _, _, fields in located]),
             extent=layout.extent,
             blend=self.scene.training.blend,
             size=layout.size,

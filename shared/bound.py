@@ -2,7 +2,7 @@
 
 Numba checks and unpacks every array of an argument on every call: some 0.1 µs each, a tenth of a
 query for the sixty arrays it needs.  Inside compiled code a tuple travels array by array from one
-function to the next, which doubles the time to compile.  A ``Bound`` value is one pointer for both.
+function to the next, which takes longer to compile.  A ``Bound`` value is one pointer for both.
 """
 
 from typing import Any, NamedTuple

@@ -27,7 +27,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from offline.checkpoint import Checkpoint, content_key
 from offline.full_model import FullModel
-from offline.norms import relative, statistics
+from offline.norms import statistics
 from offline.spaces import energy_pod
 from offline.validate import random_loads, unseen_loads
 from offline.workers import resume, worker_pool
@@ -82,7 +82,7 @@ def baselines(artifact: Path, snapshots: int, queries: int, seed: int) -> dict[s
     -------
     dict
         For each method ``unknowns``, ``unconverged``, ``displacement`` and ``von_mises``:
-        statistics of relative errors as in ``offline.validate``.
+        statistics of relative errors as in ``offline.norms``.
     """
     atlas = Atlas.load(artifact)
     workshop = Workshop.of_artifact(read_artifact(artifact))
@@ -255,12 +255,11 @@ def _artifact(atlas: Atlas, loads: Sequence[Load]) -> Answers:
 
 
 def _errors(workshop: Workshop, answers: Answers, exact: Array) -> dict[str, Any]:
-    kept = workshop.beyond_clamped_layer
     displacement, von_mises = [], []
     for answer, reference in zip(answers.displacements, exact, strict=True):
-        displacement.append(relative(answer, reference))
-        stress = [workshop.von_mises(u.reshape(-1, 3))[kept] for u in (answer, reference)]
-        von_mises.append(relative(*stress))
+        errors = workshop.errors(answer.reshape(-1, 3), reference.reshape(-1, 3))
+        displacement.append(errors[0])
+        von_mises.append(errors[1])
     return {
         "unknowns": answers.unknowns,
         "unconverged": int((~answers.converged).sum()),
