@@ -60,7 +60,9 @@ def surface_quadrature(
     )
 
 
-def stress_recovery(nodes: Array, elements: Ints, mu: Array, lam: Array) -> StressRecovery:
+def stress_recovery(
+    nodes: Array, elements: Ints, mu: Array, lam: Array, precision: type = np.float64
+) -> StressRecovery:
     """Recovery of nodal stresses from 2x2x2 points per element; mu, lam (e,) kPa."""
     gradients, _ = volume_quadrature(nodes, elements, 2)
     at, _ = gauss(2, 3)
@@ -74,7 +76,7 @@ def stress_recovery(nodes: Array, elements: Ints, mu: Array, lam: Array) -> Stre
         midsides = midsides[np.unique(midsides[:, 0], return_index=True)[1]]
     return StressRecovery(
         connectivity=np.ascontiguousarray(elements, dtype=np.int32),
-        gradients=np.ascontiguousarray(np.moveaxis(gradients, 1, 3)),
+        gradients=np.ascontiguousarray(np.moveaxis(gradients, 1, 3), dtype=precision),
         extrapolation=np.linalg.inv(to_points).astype(np.float64),
         mu=np.ascontiguousarray(mu),
         lam=np.ascontiguousarray(lam),
