@@ -16,14 +16,14 @@ from offline.methods.tetrahedra import Divisions, lattice
 from offline.workshop import Load, Workshop
 from shared.elements import hexahedron, shape
 from shared.endoscope import footprint
-from shared.scene import Scene
+from shared.scene import Scene, divisions_of
 
 Array = NDArray[np.float64]
 
 
 def divided(scene: Scene, factor: float) -> Scene:
     """A scene with the divisions of its mesh times a factor, rounded up."""
-    divisions = tuple(int(np.ceil(factor * n)) for n in scene.geometry.divisions)
+    divisions = tuple(int(np.ceil(factor * n)) for n in divisions_of(scene.geometry))
     geometry = scene.geometry.model_copy(update={"divisions": divisions})
     return scene.model_copy(update={"geometry": geometry})
 
@@ -47,7 +47,7 @@ class Remeshed:
         other = divided(scene, factor)
         self.workshop = Workshop(other)
         self.unknowns = len(self.workshop.model.free)
-        self.label = f"mesh of {' x '.join(map(str, other.geometry.divisions))}"
+        self.label = f"mesh of {' x '.join(map(str, divisions_of(other.geometry)))}"
         own = Workshop(scene)
         self._surface = own.surface
         self._to_scene = interpolation(own, self.workshop)
