@@ -20,7 +20,6 @@ from offline.mesh import build_mesh
 from offline.refinement import refined
 from offline.sampling import spread_points
 from offline.workshop import Workshop
-from shared.endoscope import footprint
 from shared.scene import Block, Divisions, Scene, SceneError, divisions_of, parse_scene
 
 Array = NDArray[np.float64]
@@ -120,8 +119,7 @@ def _try(scene: Scene) -> MeshTrial:
 
 def _moved(workshop: Workshop, x: Array, normal: Array) -> float:
     """Mean displacement under a footprint of unit pressure, along the normal; linear elasticity."""
-    nodal = np.zeros(len(workshop.mesh.nodes))
-    footprint(workshop.body.boundary, x, normal, workshop.scene.endoscope.radius, nodal)
+    nodal = workshop.unit_load_at(x, normal)
     load = (nodal[:, None] * normal).reshape(-1)[workshop.model.free]
     u = workshop.model.solve_linear(load[:, None])[:, 0]
     return float(load @ u) / float(nodal.sum())

@@ -43,7 +43,7 @@ from offline.sampling import (
     spacing_count,
     spread_points,
 )
-from offline.scenes import find_scene
+from offline.scenes import default_artifact, find_scene
 from offline.spaces import Footprint
 from offline.validate import Comparison, compare, random_loads, summarise
 from offline.workers import Tasks, resume, worker_pool
@@ -55,7 +55,6 @@ from shared.scene import Scene, Size, Tolerance
 
 Array = NDArray[np.float64]
 
-ARTIFACTS = Path("artifacts")
 
 RITZ_SPACING = 0.455
 """Of the footprints whose Ritz vectors are taken, in units of the patch spacing."""
@@ -92,7 +91,7 @@ def train(scene: str | Path, out: Path | None = None, workers: int | None = None
     path : Path
     """
     trained, mesh_choice = with_mesh(find_scene(scene))
-    path = out or ARTIFACTS / f"{trained.name}.h5"
+    path = out or default_artifact(trained)
     path.parent.mkdir(parents=True, exist_ok=True)
     pool = worker_pool(open_workshop, trained.text, str(trained.folder), count=workers)
     checkpoint = Checkpoint(path.parent / f".{path.stem}.training", content_key(trained))

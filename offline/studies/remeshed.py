@@ -15,7 +15,6 @@ from offline.methods.method import Answer, Case
 from offline.methods.tetrahedra import Divisions, lattice
 from offline.workshop import Load, Workshop
 from shared.elements import hexahedron, shape
-from shared.endoscope import footprint
 from shared.scene import Scene, divisions_of
 
 Array = NDArray[np.float64]
@@ -66,9 +65,8 @@ class Remeshed:
 
         Its accessible surface ends at other faces: a contact on the rim would be moved by it.
         """
-        body, nodal = self.workshop.body, np.zeros(len(self.workshop.mesh.nodes))
         x, normal, _ = self._surface.project(contact.position)
-        footprint(body.boundary, x, normal, self.workshop.scene.endoscope.radius, nodal)
+        nodal = self.workshop.unit_load_at(x, normal)
         return contact.pressure * nodal[:, None] * contact.direction
 
     def displacement(self, answer: Answer) -> Array:
