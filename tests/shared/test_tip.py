@@ -12,7 +12,7 @@ TIP = tip_of(2.0, 15.0)
 def plate(kind=8):
     """Four faces of the plane z = 0, 2 mm wide each, outward normal +z."""
     reference = QUAD8_NODES if kind == 8 else QUAD_CORNERS
-    corners = [reference + [x, y] for x in (-1, 1) for y in (-1, 1)]
+    corners = [np.add(reference, [x, y]) for x in (-1, 1) for y in (-1, 1)]
     nodes, faces = np.unique(np.vstack(corners).round(9), axis=0, return_inverse=True)
     nodes = np.column_stack([nodes, np.zeros(len(nodes))])
     return nodes, faces.reshape(4, -1).astype(np.int32)
