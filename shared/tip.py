@@ -82,7 +82,7 @@ class Touching(NamedTuple):
     force: Array  # (f, k, 3) mN, on their nodes
     stiffness: Array  # (f, 3, 3, k, k) mN/mm, second derivative in the places of the nodes
     own: Array  # (3, 3) mN/mm, in the place of the tip
-    count: NDArray[np.int64]  # (1,) faces touched
+    touched: NDArray[np.int64]  # (1,) number of faces
     deepest: Array  # (1,) mm, largest penetration
     gap: Array  # (4, q) scratch: points of a face from the tip's centre, mm, and their distance
 
@@ -165,7 +165,7 @@ def room_for(surface: TipSurface, f: int) -> Touching:
         force=np.zeros((f, k, 3)),
         stiffness=np.zeros((f, 3, 3, k, k)),
         own=np.zeros((3, 3)),
-        count=np.zeros(1, np.int64),
+        touched=np.zeros(1, np.int64),
         deepest=np.zeros(1),
         gap=np.zeros((4, surface.shape.shape[1])),
     )
@@ -287,7 +287,7 @@ def touch(tip, surface, near, x, moved, touching, wanted):
                 along = areas[q] * slope
                 across = -areas[q] * pressure / distance if wanted == STIFFNESS else 0.0
                 _stiffen(surface.shape, q, along, across, n, touching.stiffness[count - 1], H)
-    touching.count[0], touching.deepest[0] = count, deepest
+    touching.touched[0], touching.deepest[0] = count, deepest
     return count, energy, deepest
 
 

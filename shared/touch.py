@@ -511,14 +511,14 @@ def _solve(models, k, slot, warm, x, normal, depth, memory, scratch, outcome):
     scalars[SMALLEST_J] = min(scalars[SMALLEST_J], smallest)
     scalars[ENERGY] += outcome.weight[slot] * energy
     scalars[PENETRATION] = max(scalars[PENETRATION], touching.deepest[0])
-    scalars[TOUCHED] += touching.count[0]
+    scalars[TOUCHED] += touching.touched[0]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _react(system, coupling, force, tangent):
     """Force, its derivative and B of an equilibrium whose tangent has just been factorised."""
     touching, modes = system.touching, system.modes
-    count = touching.count[0]
+    count = touching.touched[0]
     reaction(touching, count, force)
     coupling[:] = 0.0
     for c in range(count):

@@ -70,7 +70,7 @@ def test_force_and_stiffness_are_derivatives_of_the_energy(kind, rng):
     assert np.sum(gradient * direction) - reaction @ away == pytest.approx(expected, rel=1e-7)
     K = touching.stiffness
     change = np.zeros_like(moved)
-    for c in range(touching.count[0]):
+    for c in range(touching.touched[0]):
         own = faces[touching.face[c]]
         for i in range(3):
             for j in range(3):

@@ -50,6 +50,80 @@ def test_what_is_no_position_is_refused(atlas, position):
     assert refused.value.field == "position"
 
 
+def path(atlas, depth, points):
+    """Answers along positions (k, 2), fractions of the top, by one state."""
+    state = atlas.new_state()
+    return [atlas.touch(above(atlas, depth, at), state) for at in points]
+
+
+def test_the_tangent_is_the_derivative_of_the_force(atlas):
+    h = 2e-3
+    for at in ((0.5, 0.5), (0.31, 0.62), (0.7, 0.44)):
+        x = above(atlas, 0.6, at)
+        tangent = atlas.touch(x).tangent
+        for axis in range(3):
+            step = h * np.eye(3)[axis]
+            forces = [atlas.touch(x + s * step).force for s in (1, -1)]
+            slope = (forces[0] - forces[1]) / (2 * h)
+            assert np.abs(tangent[:, axis] - slope).max() <= 0.02 * np.abs(tangent).max()
+
+
+def test_energy_put_in_comes_out_again(atlas):
+    """Work of the force along a closed path in, aside and out, over the energy put in."""
+    deep = np.concatenate(
+        [np.linspace(-0.1, 0.8, 60), np.full(60, 0.8), np.linspace(0.8, -0.1, 60)]
+    )
+    aside = np.concatenate([np.full(60, 0.35), np.linspace(0.35, 0.65, 60), np.full(60, 0.65)])
+    back = np.linspace(0.65, 0.35, 60)
+    positions = [above(atlas, d, (a, 0.5)) for d, a in zip(deep, aside, strict=True)]
+    positions += [above(atlas, -0.1, (a, 0.5)) for a in back]
+    state = atlas.new_state()
+    answers = [atlas.touch(x, state) for x in positions]
+    x, force = np.array(positions), np.array([a.force for a in answers])
+    work = -np.sum((force[1:] + force[:-1]) / 2 * np.diff(x, axis=0), axis=1)
+    assert abs(work.sum()) <= 0.01 * work[:60].sum()
+    assert work[:59].sum() == pytest.approx(answers[59].energy, rel=0.02)
+
+
+def test_the_force_has_no_jumps_on_a_path(atlas):
+    """In steps of 0.05 mm across all local models, in and out of contact."""
+    width = atlas.nodes[:, 0].max()
+    count = int(0.6 * width / 0.05)
+    across = np.linspace(0.2, 0.8, count)
+    glide = path(atlas, 0.7, [(a, 0.37 + 0.2 * a) for a in across])
+    force = np.array([a.force for a in glide])
+    largest = np.linalg.norm(force, axis=1).max()
+    assert len({k for a in glide for k, _, _ in a.patches}) >= 3
+    assert np.linalg.norm(np.diff(force, axis=0), axis=1).max() <= 0.02 * largest
+    state = atlas.new_state()
+    depths = np.arange(0.3, -0.1, -0.01)
+    fading = [np.linalg.norm(atlas.touch(above(atlas, d), state).force) for d in depths]
+    assert fading[-1] == 0.0
+    assert np.abs(np.diff(fading)).max() <= 0.02 * largest
+
+
+def test_where_it_came_from_does_not_matter(atlas):
+    x = above(atlas, 0.6, (0.55, 0.45))
+    cold = atlas.touch(x)
+    state = atlas.new_state()
+    for depth in (0.1, 0.9, 0.5):
+        atlas.touch(above(atlas, depth, (0.5, 0.5)), state)
+    warm = atlas.touch(x, state)
+    np.testing.assert_allclose(warm.force, cold.force, atol=5e-3 * np.linalg.norm(cold.force))
+
+
+def test_what_is_outside_the_range_is_flagged(atlas):
+    inside = atlas.touch(above(atlas, 0.3))
+    assert inside.in_range
+    assert inside.depth_limit > 0.3
+    assert 0 < inside.error_displacement < 0.2
+    assert 0 < inside.error_force < 0.3
+    deep = atlas.touch(above(atlas, 1.02 * inside.depth_limit))
+    assert deep.out_of_range == ("depth",)
+    beside = above(atlas, 1.9, (1.0, 0.5)) + [0.5, 0, 0]
+    assert "position" in atlas.touch(beside).out_of_range
+
+
 def test_a_tip_inside_the_body_is_refused(atlas):
     with pytest.raises(QueryError, match="below the surface"):
         atlas.touch(above(atlas, 2.1))
