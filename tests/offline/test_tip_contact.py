@@ -29,7 +29,7 @@ def block():
 
 def touch(block, depth, aside=(0.0, 0.0), start=None):
     model, contact, top = block
-    position = top + [*aside, contact.tip.radius - depth]
+    position = np.add(top, [*aside, contact.tip.radius - depth])
     return model.touch(contact, position, np.array([0.0, 0.0, -max(depth, 0.0)]), start)
 
 
@@ -88,7 +88,9 @@ def test_a_ball_on_a_layer_is_that_of_hertz():
     """Hertz's force with the correction for a bonded layer (Dimitriadis et al. 2002, eq. 12)."""
     radius, depth, height = 10.0, 0.4, 10.0
     model, contact, top = pressed_block(radius, (20.0, 20.0, height), (10, 10, 4))
-    found = model.touch(contact, top + [0.0, 0.0, radius - depth], np.array([0.0, 0.0, -depth]))
+    found = model.touch(
+        contact, np.add(top, [0.0, 0.0, radius - depth]), np.array([0.0, 0.0, -depth])
+    )
     a = -(1.2876 - 1.4678 * POISSON + 1.3442 * POISSON**2) / (1 - POISSON)
     b = (0.6387 - 1.0277 * POISSON + 1.5164 * POISSON**2) / (1 - POISSON)
     chi, pi = np.sqrt(radius * depth) / height, np.pi

@@ -120,7 +120,7 @@ def test_what_is_outside_the_range_is_flagged(atlas):
     assert 0 < inside.error_force < 0.3
     deep = atlas.touch(above(atlas, 1.02 * inside.depth_limit))
     assert deep.out_of_range == ("depth",)
-    beside = above(atlas, 1.9, (1.0, 0.5)) + [0.5, 0, 0]
+    beside = np.add(above(atlas, 1.9, (1.0, 0.5)), [0.5, 0, 0])
     assert "position" in atlas.touch(beside).out_of_range
 
 
