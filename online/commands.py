@@ -54,6 +54,7 @@ def serve(artifacts: Path, host: str, port: int) -> None:
 
     from online.app import create_app
     from online.settings import Settings
+    from online.websocket import OPTIONS
 
     logging.basicConfig(level=logging.INFO, format="%(levelname)s: %(message)s")
     config = uvicorn.Config(
@@ -63,6 +64,7 @@ def serve(artifacts: Path, host: str, port: int) -> None:
         port=port,
         access_log=False,
         log_level="warning",
+        **OPTIONS,
     )
     bound = config.bind_socket()
     url = f"http://{f'[{host}]' if ':' in host else host}:{bound.getsockname()[1]}"
@@ -89,17 +91,22 @@ def _invite(store: "Store", url: str) -> None:
 @click.argument("url")
 @click.argument("scene")
 @click.option("--rounds", type=click.IntRange(min=1), default=3000, show_default=True)
+@click.option("--session", is_flag=True, help="Measure the steps of a session; needs an --echo.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def latency(url: str, scene: str, rounds: int, as_json: bool) -> None:
+def latency(url: str, scene: str, rounds: int, session: bool, as_json: bool) -> None:
     """Measure what a running service at URL adds to a solve of SCENE.
 
     Medians in µs over ROUNDS turns of an empty request, a solve without fields and one with all
     fields in binary. The ratios are what is left of a round trip without the solve (and the
     recovery of the fields), over the empty one.
-    """
-    from online.latency import measure
 
-    report = measure(url, scene, rounds)
+    With --session: over turns of a step of a session and an echo of frames of the same sizes,
+    which a service started with --echo gives. The ratio is what is left of a step without its
+    solve, over the echo.
+    """
+    from online.latency import measure, measure_session
+
+    report = (measure_session if session else measure)(url, scene, rounds)
     if as_json:
         click.echo(json.dumps(report))
         return
