@@ -40,8 +40,29 @@ if TYPE_CHECKING:
     show_envvar=True,
     help="0 takes a free one.",
 )
-def serve(artifacts: Path, host: str, port: int) -> None:
-    """Answer loads over HTTP.
+@click.option(
+    "--max-sessions",
+    type=click.IntRange(0),
+    default=16,
+    envvar="PALPATE_MAX_SESSIONS",
+    show_default=True,
+    show_envvar=True,
+    help="Most sessions at a time; more are refused.",
+)
+@click.option(
+    "--session-idle",
+    type=click.FloatRange(0.1),
+    default=60.0,
+    envvar="PALPATE_SESSION_IDLE",
+    show_default=True,
+    show_envvar=True,
+    help="Seconds after which a silent session is closed.",
+)
+@click.option("--echo", is_flag=True, help="Answer WS /echo, for palpate latency --session.")
+def serve(
+    artifacts: Path, host: str, port: int, max_sessions: int, session_idle: float, echo: bool
+) -> None:
+    """Answer loads over HTTP and tools in sessions.
 
     Prints a request to try once every model is loaded and warm.
     """
@@ -57,8 +78,9 @@ def serve(artifacts: Path, host: str, port: int) -> None:
     from online.websocket import OPTIONS
 
     logging.basicConfig(level=logging.INFO, format="%(levelname)s: %(message)s")
+    settings = Settings(artifacts, max_sessions=max_sessions, session_idle=session_idle, echo=echo)
     config = uvicorn.Config(
-        lambda: create_app(Settings(artifacts), on_ready=lambda store: _invite(store, url)),
+        lambda: create_app(settings, on_ready=lambda store: _invite(store, url)),
         factory=True,
         host=host,
         port=port,
