@@ -167,7 +167,7 @@ def test_a_client_that_does_not_read_is_cut(serving, tmp_path, monkeypatch, capl
             with pytest.raises(ConnectionError):
                 pour(slow, repeat(frame))
         places_come_free(url).close()
-    assert "left replies unread" in caplog.text
+    assert "leaves replies unread" in caplog.text
 
 
 def test_a_flood_is_answered_or_counted(url):
