@@ -73,6 +73,11 @@ class Follower:
         self._state = atlas.new_state()
         self._good: Touch | None = None
 
+    def restart(self) -> None:
+        """Forget where the tip has been: answers are then those of a new follower."""
+        self._state.forget()
+        self._good = None
+
     def follow(self, position: Sequence[float], budget: float) -> Step:
         """Answer a position; no new solve is begun after `budget` seconds."""
         end = perf_counter() + budget

@@ -43,6 +43,9 @@ BURST = 0.01
 PATIENCE = 5.0
 """Seconds a client may leave a reply unread."""
 
+SPARE = 4
+"""Sessions that can be opened at no cost to those under way."""
+
 GOING_AWAY, FAILED, IDLE, WRONG_VERSION = 1001, 1011, 4000, 4001
 """Codes that a session is closed with."""
 
@@ -72,10 +75,13 @@ class Sessions:
                 "too_many_sessions", "", f"{self._open} sessions are open", {"max_sessions": most}
             )
         self._open += 1
+        follower = model.followers.pop() if model.followers else Follower(model.atlas)
         try:
-            await Session(model, self._settings, scope, receive, send).run()
+            await Session(model, follower, self._settings, scope, receive, send).run()
         finally:
             self._open -= 1
+            follower.restart()
+            model.followers.append(follower)
 
 
 class Session:
@@ -84,13 +90,21 @@ class Session:
     Parameters
     ----------
     model : Model
+    follower : Follower
+        Fresh or restarted.
     settings : Settings
     scope, receive, send
         As ASGI gives them; of `online.websocket.Protocol`.
     """
 
     def __init__(
-        self, model: Model, settings: Settings, scope: Scope, receive: Receive, send: Send
+        self,
+        model: Model,
+        follower: Follower,
+        settings: Settings,
+        scope: Scope,
+        receive: Receive,
+        send: Send,
     ) -> None:
         self._model = model
         self._atlas = model.atlas
@@ -98,7 +112,7 @@ class Session:
         self._receive = receive
         self._send = send
         self._pending: Callable[[], bool] = scope["extensions"][PENDING]
-        self._follower = Follower(model.atlas)
+        self._follower = follower
         self._received = perf_counter()
         self._superseded = 0
         self._sending_since = math.inf
@@ -241,11 +255,15 @@ class Session:
 
 
 def warm(model: Model) -> None:
-    """Call all that a session calls once, so that no client pays for a first time."""
+    """Call all that a session calls once, and keep what the first sessions need at hand."""
     x, y, z = model.tip
     request = Request(0, 0.0, (x, y, z), sum(Output))
-    step = Follower(model.atlas).follow(request.position, BUDGET)
-    frames.encode_reply(request, step, recover(model.atlas, step.touch, request.outputs))
+    for _ in range(SPARE):
+        follower = Follower(model.atlas)
+        step = follower.follow(request.position, BUDGET)
+        frames.encode_reply(request, step, recover(model.atlas, step.touch, request.outputs))
+        follower.restart()
+        model.followers.append(follower)
 
 
 def recover(atlas: Atlas, touch: Touch, outputs: int) -> Extras:

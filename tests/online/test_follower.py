@@ -84,6 +84,16 @@ def test_repeating_takes_the_same_steps(atlas, rng):
         np.testing.assert_array_equal(again.touch.force, step.touch.force)
 
 
+def test_a_restarted_follower_is_a_new_one(atlas):
+    atlas.stride = 0.3
+    follower = Follower(atlas)
+    follower.follow((1.0, 5.0, 6.5), budget=0.0)
+    follower.restart()
+    assert follower.follow((9.0, 5.0, 6.5), budget=0.0).flags == TOUCHING
+    follower.restart()
+    assert follower.follow((9.0, 5.0, 4.0), budget=0.0).flags == Flag.FALLBACK
+
+
 def test_the_valid_radius_bounds_what_a_linear_force_misses():
     """5 % of Hertz's force, F = d^1.5, at the end of the radius."""
     step = Follower(FakeAtlas()).follow((5.0, 5.0, 6.5), budget=0.0)
