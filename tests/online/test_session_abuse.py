@@ -7,6 +7,7 @@ import threading
 import time
 from contextlib import ExitStack, contextmanager
 from itertools import repeat
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -117,6 +118,16 @@ def test_bytes_that_are_no_frames_of_a_websocket(url, rng):
         for _ in range(50):
             with Session(url, "toy") as session:
                 session._socket.sendall(rng.bytes(rng.integers(1, 500)))
+
+
+def test_handshakes_that_never_end(url):
+    parts = urlsplit(url)
+    with witness(url), ExitStack() as stack:
+        request = b"GET /scenes/toy/session HTTP/1.1\r\nupgrade: websocket\r\n"
+        for length in range(0, len(request), 2):
+            connection = socket.create_connection((parts.hostname, parts.port))
+            stack.enter_context(connection)
+            connection.sendall(request[:length])
 
 
 def test_a_message_too_long_ends_its_session_only(url):
