@@ -93,7 +93,7 @@ class FakeAtlas:
             distance=distance,
             direction=push,
             tilt=float(np.degrees(np.arccos(-push @ normal))),
-            missed=0.0,
+            departure=0.0,
             cubature=0.0,
             pressure=pressure,
             radius=radius,
