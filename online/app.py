@@ -11,7 +11,7 @@ from typing import Any
 from fastapi import FastAPI
 from pydantic.json_schema import models_json_schema
 
-from online import errors
+from online import errors, session
 from online.answer import answer
 from online.negotiation import OFFERED
 from online.routes import add_routes
@@ -85,6 +85,7 @@ def _warm(model: Model) -> None:
         request = SolveRequest.model_validate({"contacts": [model.example], "region": region})
         for media_type in OFFERED:
             answer(model, request, media_type, max_json_numbers=10**9)
+    session.warm(model)
 
 
 def _describe_request(app: FastAPI) -> None:

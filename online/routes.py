@@ -5,9 +5,11 @@ from typing import Annotated, Any
 import numpy as np
 import orjson
 from fastapi import FastAPI, Path, Request, Response
+from starlette.routing import WebSocketRoute
 
-from online import wire
+from online import frames, wire
 from online.answer import answer
+from online.echo import ECHO, Echo
 from online.errors import Refusal
 from online.negotiation import BINARY, JSON, MSGPACK, negotiate
 from online.schemas import (
@@ -21,6 +23,7 @@ from online.schemas import (
     Status,
     parse_request,
 )
+from online.session import Sessions
 from online.settings import Settings
 from online.store import Model, Store
 
@@ -154,6 +157,28 @@ def add_routes(app: FastAPI, store: Store, settings: Settings) -> None:
         if body is None:
             body = model.meshes[region, media_type] = _mesh(model, region, media_type)
         return Response(body, media_type=media_type)
+
+    @app.get(
+        "/scenes/{name}/session",
+        tags=["scenes"],
+        response_model=None,
+        responses={
+            101: {"description": frames.__doc__ + "\n\n" + frames.tables()},
+            **_problems(404, 422, 426, 503),
+        },
+    )
+    async def session(name: SceneName) -> Response:
+        """Open a session (WebSocket): send positions of the tip, get forces.
+
+        The first message of the service is a hello in JSON that states the layout of the frames.
+        A text message is answered in JSON, a binary one in binary.
+        """
+        store.model(name)
+        raise Refusal("upgrade_required", "upgrade", "A session is opened by a WebSocket handshake")
+
+    app.router.routes.append(WebSocketRoute("/scenes/{name}/session", Sessions(store, settings)))
+    if settings.echo:
+        app.router.routes.append(WebSocketRoute(ECHO, Echo()))
 
 
 def _media_type(request: Request) -> str:

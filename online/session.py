@@ -1,0 +1,306 @@
+"""Sessions: a tool moves, the tissue answers; the newest position counts.
+
+Frames that came while another one was solved are read together, and all but the newest are dropped
+and counted. Solves run on the event loop, since handing one to a thread and back takes longer than
+the solve. A client that does not read its replies holds up itself alone, and is cut off after
+`PATIENCE`; one that sends more than `MOST_FRAMES` is read no faster than that.
+"""
+
+import asyncio
+import logging
+import math
+from collections.abc import Callable
+from contextlib import suppress
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import orjson
+from starlette.types import Message, Receive, Scope, Send
+
+from online import frames
+from online.errors import Refusal
+from online.follower import Follower, Step
+from online.frames import Extras, Flag, FrameError, Output, Request, VersionError
+from online.schemas import parse_session_request
+from online.settings import Settings
+from online.store import Model, Store
+from online.websocket import LINGER, PENDING, STOPPING
+from shared.atlas import Atlas
+from shared.touch import Touch
+
+logger = logging.getLogger(__name__)
+
+BUDGET = 1e-3
+"""Seconds after which no further solve is begun for a step too large to follow at once."""
+
+MOST_FRAMES = 10_000
+"""Frames a second that are read of a session."""
+
+BURST = 0.01
+"""Seconds' worth of frames that may come at once."""
+
+PATIENCE = 5.0
+"""Seconds a client may leave a reply unread."""
+
+SPARE = 4
+"""Sessions that can be opened at no cost to those under way."""
+
+GOING_AWAY, FAILED, IDLE, WRONG_VERSION = 1001, 1011, 4000, 4001
+"""Codes that a session is closed with."""
+
+_COORDINATES, _DISPLACEMENT, _VON_MISES, _STRESS, _HALF = map(int, Output)
+
+
+class Sessions:
+    """The ASGI application of every session.
+
+    Parameters
+    ----------
+    store : Store
+    settings : Settings
+    """
+
+    def __init__(self, store: Store, settings: Settings) -> None:
+        self._store = store
+        self._settings = settings
+        self._open = 0
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Refuse a session or run it until it ends."""
+        model = self._store.model(scope["path_params"]["name"])
+        most = self._settings.max_sessions
+        if self._open >= most:
+            raise Refusal(
+                "too_many_sessions", "", f"{self._open} sessions are open", {"max_sessions": most}
+            )
+        self._open += 1
+        follower = model.followers.pop() if model.followers else Follower(model.atlas)
+        try:
+            await Session(model, follower, self._settings, scope, receive, send).run()
+        finally:
+            self._open -= 1
+            follower.restart()
+            model.followers.append(follower)
+
+
+class Session:
+    """One client with one tool.
+
+    Parameters
+    ----------
+    model : Model
+    follower : Follower
+        Fresh or restarted.
+    settings : Settings
+    scope, receive, send
+        As ASGI gives them; of `online.websocket.Protocol`.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        follower: Follower,
+        settings: Settings,
+        scope: Scope,
+        receive: Receive,
+        send: Send,
+    ) -> None:
+        self._model = model
+        self._atlas = model.atlas
+        self._settings = settings
+        self._receive = receive
+        self._send = send
+        self._pending: Callable[[], bool] = scope["extensions"][PENDING]
+        self._follower = follower
+        self._received = perf_counter()
+        self._superseded = 0
+        self._sending_since = math.inf
+        self._full_at = 0.0
+        self._farewell: tuple[int, str] | None = None
+
+    async def run(self) -> None:
+        """Welcome the client and answer it until it goes or is told to."""
+        await self._receive()
+        await self._send({"type": "websocket.accept"})
+        watching = asyncio.create_task(self._watch())
+        try:
+            with suppress(TimeoutError):
+                async with asyncio.timeout(None) as self._interruption:
+                    await self._deliver({"type": "websocket.send", "text": self._hello()})
+                    await self._converse()
+            if self._farewell is not None:
+                code, reason = self._farewell
+                async with asyncio.timeout(LINGER):
+                    await self._send({"type": "websocket.close", "code": code, "reason": reason})
+        except TimeoutError:
+            pass  # it does not listen; its connection is cut when this returns
+        finally:
+            watching.cancel()
+
+    async def _converse(self) -> None:
+        """Answer the newest message, again and again."""
+        while self._farewell is None:
+            message = newest = await self._receive()
+            while message["type"] == "websocket.receive":
+                await self._note()
+                newest = message
+                if not self._pending():
+                    break
+                message = await self._receive()
+                self._superseded += message["type"] == "websocket.receive"
+            if newest["type"] == "websocket.receive":
+                await self._deliver(self._reply(newest))
+            if message["type"] != "websocket.receive":
+                if message["code"] == STOPPING:
+                    self._farewell = GOING_AWAY, "the service is stopping"
+                return
+
+    async def _note(self) -> None:
+        """Note that a message has come; wait if there are too many."""
+        now = self._received = perf_counter()
+        self._full_at = max(self._full_at, now) + 1.0 / MOST_FRAMES
+        if self._full_at - now > BURST:
+            await asyncio.sleep(self._full_at - now - BURST)
+
+    async def _deliver(self, message: Message) -> None:
+        """Send a message; wait until the client has taken most of those before it."""
+        self._sending_since = perf_counter()
+        await self._send(message)
+        self._sending_since = math.inf
+
+    async def _watch(self) -> None:
+        """Interrupt a session whose client is silent, or does not listen."""
+        idle = self._settings.session_idle
+        while True:
+            await asyncio.sleep(min(0.25, 0.25 * idle))
+            now = perf_counter()
+            if now - self._sending_since > PATIENCE:
+                logger.warning("a session is cut off: its client leaves replies unread")
+                break
+            if now - self._received > idle:
+                self._farewell = IDLE, f"no frame for {idle:g} s"
+                break
+        self._interruption.reschedule(asyncio.get_running_loop().time())
+
+    def _reply(self, message: Message) -> Message:
+        """Answer a message or say what is wrong with it."""
+        try:
+            frame = message.get("bytes")
+            if frame is not None:
+                return {"type": "websocket.send", "bytes": self._answer_frame(frame)}
+            return {"type": "websocket.send", "text": self._answer_text(message["text"])}
+        except VersionError as error:
+            self._farewell = WRONG_VERSION, str(error)
+            return _complain("unknown_version", error.field, error.message)
+        except FrameError as error:
+            return _complain("invalid_frame", error.field, error.message)
+        except Refusal as refusal:
+            return _complain(refusal.code, refusal.field, refusal.message, refusal.allowed)
+        except Exception:
+            logger.exception("a session failed")
+            self._farewell = FAILED, "the service failed; its log says why"
+            return _complain("internal", "", "The service failed; its log says why")
+
+    def _answer_frame(self, frame: bytes) -> bytes:
+        request = frames.decode_request(frame)
+        step = self._follower.follow(request.position, BUDGET)
+        return self._encode(request, step)
+
+    def _answer_text(self, text: str) -> str:
+        """Answer in JSON: the same fields by name, bits as lists of names, and a reason."""
+        request = parse_session_request(text)
+        self._check_size(request.outputs)
+        step = self._follower.follow(request.position, BUDGET)
+        reply = frames.decode_reply(self._encode(request, step))
+        document = {name: value for name, value in reply._asdict().items() if value is not None}
+        document["flags"] = _names(Flag(reply.flags))
+        document["outputs"] = _names(Output(reply.outputs))
+        document["reason"] = step.reason
+        return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY).decode()
+
+    def _encode(self, request: Request, step: Step) -> bytes:
+        extras = recover(self._atlas, step.touch, request.outputs)
+        superseded, self._superseded = self._superseded, 0
+        return frames.encode_reply(
+            request, step, extras, superseded, self._received, perf_counter()
+        )
+
+    def _check_size(self, outputs: int) -> None:
+        """Refuse fields that would keep the event loop busy writing decimals."""
+        per_node = 3 * bool(outputs & _DISPLACEMENT) + bool(outputs & _VON_MISES)
+        numbers = per_node * len(self._atlas.surface_nodes)
+        if numbers > self._settings.max_json_numbers:
+            raise Refusal(
+                "too_large_for_json",
+                "outputs",
+                f"{numbers} numbers are too many for JSON; send binary frames instead",
+                {"max_numbers": self._settings.max_json_numbers},
+            )
+
+    def _hello(self) -> str:
+        """Say what is served and how to speak with it."""
+        atlas = self._atlas
+        document = {
+            "scene": atlas.name,
+            "tip_radius": atlas.scene.endoscope.radius,
+            "example": {"position": self._model.tip},
+            "nodes": len(atlas.surface_nodes),
+            "idle_timeout": self._settings.session_idle,
+            "max_frames_per_second": MOST_FRAMES,
+            "server_time": perf_counter(),
+            "layout": frames.layout(),
+        }
+        return orjson.dumps(document).decode()
+
+
+def warm(model: Model) -> None:
+    """Call all that a session calls once, and keep what the first sessions need at hand."""
+    x, y, z = model.tip
+    request = Request(0, 0.0, (x, y, z), sum(Output))
+    for _ in range(SPARE):
+        follower = Follower(model.atlas)
+        step = follower.follow(request.position, BUDGET)
+        frames.encode_reply(request, step, recover(model.atlas, step.touch, request.outputs))
+        follower.restart()
+        model.followers.append(follower)
+
+
+def recover(atlas: Atlas, touch: Touch, outputs: int) -> Extras:
+    """Get what a request asked for beyond force and tangent."""
+    if not outputs & ~_HALF:
+        return frames.NO_EXTRAS
+    kind = np.float16 if outputs & _HALF else np.float32
+    coordinates = displacement = von_mises = None
+    largest = percentile = 0.0
+    if outputs & _COORDINATES:
+        coordinates = _coordinates(touch)
+    if outputs & (_DISPLACEMENT | _VON_MISES | _STRESS):
+        everywhere = atlas.displacement(touch)
+        if outputs & _DISPLACEMENT:
+            displacement = everywhere[atlas.surface_nodes].astype(kind)
+        if outputs & (_VON_MISES | _STRESS):
+            stress = atlas.von_mises(touch, "all", everywhere)
+            if outputs & _VON_MISES:
+                von_mises = stress[atlas.surface_nodes].astype(kind)
+            if outputs & _STRESS:
+                largest, percentile = np.percentile(stress, (100.0, 99.0)).tolist()
+    return Extras(outputs, coordinates, displacement, von_mises, largest, percentile)
+
+
+def _coordinates(touch: Touch) -> np.ndarray:
+    """Reduced coordinates (MODELS, r), a row per local model."""
+    r = max((len(c) for _, _, c in touch.patches), default=0)
+    rows = np.zeros((frames.MODELS, r), np.float32)
+    for row, (_, _, c) in zip(rows, touch.patches, strict=False):
+        row[:] = c
+    return rows
+
+
+def _names(bits: Any) -> list[str]:
+    return [bit.name.lower() for bit in bits]
+
+
+def _complain(code: str, field: str, message: str, allowed: Any = None) -> Message:
+    error = {"code": code, "field": field, "message": message, "allowed": allowed}
+    return {"type": "websocket.send", "text": orjson.dumps({"error": error}).decode()}
