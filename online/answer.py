@@ -1,6 +1,7 @@
-"""From a request to the bytes of its answer: solve, recover, encode. The service's hot path.
+"""From the bytes of a request to those of its answer: decode, solve, recover, encode.
 
-Nothing here awaits: an answer has the model for itself from its first line to its last.
+The service's hot path. Nothing here awaits: an answer has the model for itself from its first line
+to its last.
 """
 
 import math
@@ -11,8 +12,9 @@ from starlette.responses import Response
 
 from online import wire
 from online.errors import Refusal
+from online.metrics import PHASES, Metrics
 from online.negotiation import JSON
-from online.schemas import SolveRequest
+from online.schemas import SolveRequest, parse_request
 from online.store import Model
 from shared.answer import describe
 from shared.atlas import Atlas, Solution
@@ -22,7 +24,9 @@ ABSURD = 10.0
 """Multiple of the largest trained pressure from which on there is no answer at all."""
 
 
-def answer(model: Model, request: SolveRequest, media_type: str, max_json_numbers: int) -> Response:
+def answer(
+    model: Model, body: bytes, media_type: str, max_json_numbers: int, metrics: Metrics
+) -> Response:
     """Solve a request from rest and write the answer.
 
     Each request is answered on its own: the same request has the same answer, whatever came
@@ -31,8 +35,11 @@ def answer(model: Model, request: SolveRequest, media_type: str, max_json_number
     Raises
     ------
     Refusal
-        If the load is not one the model can be asked about, or it has no equilibrium.
+        If the request is malformed, the load is not one the model can be asked about, or it has
+        no equilibrium.
     """
+    received = perf_counter_ns()
+    request = parse_request(body)
     atlas = model.atlas
     contact = request.contacts[0]
     if media_type == JSON:
@@ -78,14 +85,16 @@ def answer(model: Model, request: SolveRequest, media_type: str, max_json_number
         "solve_us": (solved - start) / 1e3,
         "recover_us": (recovered - solved) / 1e3,
     }
-    body = wire.encode(media_type, head, fields)
+    content = wire.encode(media_type, head, fields)
     encoded = perf_counter_ns()
-    timing = (
-        f"solve;dur={(solved - start) / 1e6:.4f}, "
-        f"recover;dur={(recovered - solved) / 1e6:.4f}, "
-        f"encode;dur={(encoded - recovered) / 1e6:.4f}"
-    )
-    return Response(body, media_type=media_type, headers={"server-timing": timing})
+    if not solution.in_range:
+        metrics.flag["query", "out_of_range"].add()
+    times = (start - received, solved - start, recovered - solved, encoded - recovered)
+    timing = []
+    for phase, nanoseconds in zip(PHASES, times, strict=True):
+        metrics.phase["query", phase].observe(1e-9 * nanoseconds)
+        timing.append(f"{phase};dur={1e-6 * nanoseconds:.4f}")
+    return Response(content, media_type=media_type, headers={"server-timing": ", ".join(timing)})
 
 
 def _check_size(atlas: Atlas, request: SolveRequest, limit: int) -> None:

@@ -5,10 +5,14 @@ from typing import Annotated, Any
 import numpy as np
 import orjson
 from fastapi import FastAPI, Path, Request, Response
+from fastapi.responses import PlainTextResponse
+from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
 from online import wire
 from online.answer import answer
 from online.errors import Refusal
+from online.guard import METRICS
+from online.metrics import Metrics
 from online.negotiation import BINARY, JSON, MSGPACK, negotiate
 from online.schemas import (
     Answer,
@@ -44,7 +48,8 @@ _BY_HAND: dict[str, Any] = {"parameters": [_NAME], "requestBody": _BODY}
 
 
 def _problems(*codes: int) -> dict[int | str, dict[str, Any]]:
-    return {code: {"model": Problem} for code in codes}
+    """Describe the refusals of an endpoint: its own `codes` and those of the guard."""
+    return {code: {"model": Problem} for code in sorted({401, 403, 429, 503, *codes})}
 
 
 def _document(model: type, what: str) -> dict[int | str, dict[str, Any]]:
@@ -64,8 +69,9 @@ def _document(model: type, what: str) -> dict[int | str, dict[str, Any]]:
     }
 
 
-def add_routes(app: FastAPI, store: Store, settings: Settings) -> None:
+def add_routes(app: FastAPI, store: Store, settings: Settings, metrics: Metrics) -> None:
     """Give `app` its endpoints, the hot ones first: the router tries them in this order."""
+    registry = metrics.registry()
 
     @app.post(
         "/scenes/{name}/solve",
@@ -73,7 +79,7 @@ def add_routes(app: FastAPI, store: Store, settings: Settings) -> None:
         response_model=None,
         responses={
             **_document(Answer, "How the tissue answers"),
-            **_problems(404, 406, 413, 415, 422, 503),
+            **_problems(404, 406, 413, 415, 422),
         },
         openapi_extra=_BY_HAND,
     )
@@ -81,18 +87,18 @@ def add_routes(app: FastAPI, store: Store, settings: Settings) -> None:
         """Press the tissue: force, displacement and stress under a load.
 
         Every request is answered from rest, independently of those before it. The header
-        Server-Timing tells the time taken to solve, recover and encode, in ms.
+        Server-Timing tells the time taken to decode, solve, recover and encode, in ms.
         """
         media_type = _media_type(request)
         model = store.model(request.path_params["name"])
-        query = parse_request(await _read(request, settings.max_body))
-        return answer(model, query, media_type, settings.max_json_numbers)
+        body = await _read(request, settings.max_body)
+        return answer(model, body, media_type, settings.max_json_numbers, metrics)
 
     @app.post(
         "/scenes/{name}/check",
         tags=["scenes"],
         response_model=None,
-        responses={200: {"model": Checked}, **_problems(404, 413, 415, 422, 503)},
+        responses={200: {"model": Checked}, **_problems(404, 413, 415, 422)},
         openapi_extra=_BY_HAND,
     )
     async def check(request: Request) -> Response:
@@ -106,7 +112,7 @@ def add_routes(app: FastAPI, store: Store, settings: Settings) -> None:
         """Tell that the process lives."""
         return {"status": "ok"}
 
-    @app.get("/ready", tags=["service"], response_model=Status, responses=_problems(503))
+    @app.get("/ready", tags=["service"], response_model=Status, responses={503: {"model": Problem}})
     async def ready() -> Any:
         """Tell whether every model is loaded and warm."""
         store.require_ready()
@@ -115,7 +121,12 @@ def add_routes(app: FastAPI, store: Store, settings: Settings) -> None:
             raise Refusal("not_ready", "", f"No artifact could be loaded: {reasons}")
         return {"status": "ready"}
 
-    @app.get("/scenes", tags=["scenes"], response_model=SceneList, responses=_problems(503))
+    @app.get(METRICS, tags=["service"], response_class=PlainTextResponse, responses=_problems())
+    async def tell_metrics() -> Response:
+        """Tell what was counted and timed, of every worker, in the text format of Prometheus."""
+        return Response(generate_latest(registry), media_type=CONTENT_TYPE_LATEST)
+
+    @app.get("/scenes", tags=["scenes"], response_model=SceneList, responses=_problems())
     async def scenes() -> Any:
         """List the scenes that are served, and the files that had to be refused."""
         store.require_ready()
@@ -130,7 +141,7 @@ def add_routes(app: FastAPI, store: Store, settings: Settings) -> None:
         "/scenes/{name}",
         tags=["scenes"],
         response_model=SceneSummary,
-        responses=_problems(404, 422, 503),
+        responses=_problems(404, 422),
     )
     async def scene(name: SceneName) -> Any:
         """Say what may be asked of a scene, and how well it is answered."""
@@ -140,7 +151,7 @@ def add_routes(app: FastAPI, store: Store, settings: Settings) -> None:
         "/scenes/{name}/mesh",
         tags=["scenes"],
         response_model=None,
-        responses={**_document(Mesh, "The mesh"), **_problems(404, 406, 422, 503)},
+        responses={**_document(Mesh, "The mesh"), **_problems(404, 406, 422)},
     )
     async def mesh(name: SceneName, request: Request, region: MeshRegion = "surface") -> Response:
         """Get the undeformed mesh that the fields of a region belong to.

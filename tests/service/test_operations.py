@@ -1,0 +1,116 @@
+"""How the service is run: settings, several workers, who is let in, what it tells of itself."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import time
+import urllib.request
+
+import pytest
+
+from online.client import Client
+
+from .conftest import PALPATE
+
+pytestmark = pytest.mark.service
+
+
+def get(url, **headers):
+    with urllib.request.urlopen(urllib.request.Request(url, headers=headers)) as response:
+        return response.read().decode()
+
+
+def workers(url, **headers):
+    """Return what each worker says of itself: {worker: {metric: value}}."""
+    found = {}
+    for name, worker, value in re.findall(
+        r'^palpate_worker_(\w+)\{worker="(\d+)"\} (\S+)$', get(f"{url}/metrics", **headers), re.M
+    ):
+        found.setdefault(int(worker), {})[name] = float(value)
+    return found
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::"])
+def test_other_machines_are_not_let_in_without_a_token(artifact, host):
+    environment = {k: v for k, v in os.environ.items() if k != "PALPATE_TOKEN"}
+    result = subprocess.run(
+        [*PALPATE, "serve", "--artifacts", artifact.parent, "--host", host],
+        capture_output=True,
+        text=True,
+        env=environment,
+    )
+    assert result.returncode == 2
+    assert "PALPATE_TOKEN" in result.stderr
+    assert "--public" in result.stderr
+
+
+def test_with_a_token_they_are(serve, artifact):
+    with serve(artifact.parent, "--host", "0.0.0.0", PALPATE_TOKEN="secret") as server:
+        url = server.url.replace("0.0.0.0", "127.0.0.1")
+        with pytest.raises(urllib.error.HTTPError, match="401"):
+            get(f"{url}/scenes")
+        assert "quick" in get(f"{url}/scenes", authorization="Bearer secret")
+        assert server.stop() == 0
+        assert "secret" not in server.log
+
+
+def test_help_names_the_variable_of_every_setting():
+    result = subprocess.run([*PALPATE, "serve", "--help"], capture_output=True, text=True)
+    options = re.findall(r"^  --([\w-]+)", result.stdout, re.M)
+    assert len(options) > 10
+    for option in options:
+        variable = "PALPATE_" + option.replace("-", "_").upper()
+        assert re.search(rf"\b{variable}S?\b", re.sub(r"\s+", " ", result.stdout)), option
+
+
+def test_settings_come_from_the_environment(serve, artifact):
+    with serve(
+        artifact.parent, PALPATE_MAX_BODY="2000", PALPATE_REALTIME="1", PALPATE_ACCESS_LOG="1"
+    ) as server:
+        with Client(server.url) as client:
+            client.solve("quick", **client.scene("quick")["example"]["contacts"][0])
+        request = urllib.request.Request(
+            f"{server.url}/scenes/quick/solve", b" " * 2001, {"content-type": "application/json"}
+        )
+        with pytest.raises(urllib.error.HTTPError, match="413"):
+            urllib.request.urlopen(request)
+        assert server.stop() == 0
+    records = [json.loads(line) for line in server.log.splitlines()]
+    messages = [record["message"] for record in records]
+    assert any(message.startswith("real-time scheduling: ") for message in messages)
+    assert any("POST /scenes/quick/solve" in message and "200" in message for message in messages)
+
+
+def test_requests_are_not_logged_unless_asked_for(serve, artifact):
+    with serve(artifact.parent) as server:
+        with Client(server.url) as client:
+            client.scenes()
+        assert server.stop() == 0
+    assert "/scenes" not in server.log
+
+
+@pytest.mark.skipif(os.name == "nt", reason="workers are for POSIX")
+def test_a_killed_worker_is_replaced_while_the_other_goes_on(serve, artifact):
+    with serve(artifact.parent, "--workers", "2") as server:
+        while len(before := workers(server.url)) < 2:
+            time.sleep(0.05)
+        with Client(server.url) as client:
+            contact = client.scene("quick")["example"]["contacts"][0]
+            os.kill(int(before[0]["pid"]), signal.SIGKILL)
+            for _ in range(200):  # whichever worker it is connected to, another one answers anew
+                try:
+                    assert client.solve("quick", **contact).trust["converged"]
+                except ConnectionError:
+                    client._connection.close()
+            while (after := workers(server.url))[0]["starts_total"] < 2:
+                time.sleep(0.05)
+        assert after[0]["pid"] != before[0]["pid"]
+        assert after[1] | {"resident_bytes": 0} == before[1] | {"resident_bytes": 0}
+        assert server.stop() == 0
+        assert "Traceback" not in server.log
+        assert "worker 0 is ready" in server.log
+    for worker in after.values():
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(worker["pid"]), 0)
