@@ -80,6 +80,22 @@ class Mesh:
     clamped: NDArray[np.uint8]
 
 
+@dataclass(frozen=True)
+class Accessible:
+    """The surface that the endoscope can touch.
+
+    Parameters
+    ----------
+    vertices, normals : ndarray, shape (v, 3), float32, mm and unit
+    triangles : ndarray, shape (t, 3), int32
+        Indices into `vertices`, outward.
+    """
+
+    vertices: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    triangles: NDArray[np.int32]
+
+
 class Client:
     """One connection to a service.
 
@@ -90,11 +106,14 @@ class Client:
     ...     print(answer.force, answer.displacement.max())
     """
 
-    def __init__(self, url: str, timeout: float = 10.0) -> None:
+    def __init__(self, url: str, timeout: float = 10.0, token: str | None = None) -> None:
         parts = urlsplit(url)
         if parts.scheme != "http" or parts.hostname is None:
             raise PalpateError(f"{url}: not an address like http://127.0.0.1:8000")
         self._connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=timeout)
+        self._headers = {"Content-Type": JSON}
+        if token is not None:
+            self._headers["Authorization"] = f"Bearer {token}"
 
     def __enter__(self) -> Self:
         return self
@@ -120,6 +139,12 @@ class Client:
         path = f"/scenes/{quote(name, safe='')}/mesh?region={quote(region)}"
         _, arrays = wire.decode(self._request("GET", path, BINARY))
         return Mesh(**arrays)
+
+    def accessible(self, name: str) -> Accessible:
+        """Get the undeformed surface that the endoscope can touch."""
+        path = f"/scenes/{quote(name, safe='')}/accessible"
+        _, arrays = wire.decode(self._request("GET", path, BINARY))
+        return Accessible(**arrays)
 
     def solve(
         self,
@@ -170,8 +195,7 @@ class Client:
         )
 
     def _request(self, method: str, path: str, accept: str, body: bytes | None = None) -> bytes:
-        headers = {"Accept": accept, "Content-Type": JSON}
-        self._connection.request(method, path, body, headers)
+        self._connection.request(method, path, body, self._headers | {"Accept": accept})
         response = self._connection.getresponse()
         content = response.read()
         if response.status != 200:

@@ -122,3 +122,86 @@ def latency(url: str, scene: str, rounds: int, as_json: bool) -> None:
         return
     for name, value in report.items():
         click.echo(f"{name:<16}{value:8.2f}")
+
+
+@click.command()
+@click.argument("url")
+@click.argument("scene", default="turbinate")
+@click.option(
+    "--sessions", type=click.IntRange(0), default=1, show_default=True, help="Tools at once."
+)
+@click.option(
+    "--rate",
+    type=click.FloatRange(1, 100_000),
+    default=1000.0,
+    show_default=True,
+    help="Frames per second of each session.",
+)
+@click.option(
+    "--queries-per-second",
+    "queries",
+    type=click.FloatRange(0, 100_000),
+    default=0.0,
+    show_default=True,
+    help="Solves over HTTP, in all, with fields in binary.",
+)
+@click.option(
+    "--region",
+    type=click.Choice(["none", "surface", "all"]),
+    default="all",
+    show_default=True,
+    help="Nodes that queries ask fields for.",
+)
+@click.option(
+    "--connections",
+    type=click.IntRange(1, 1000),
+    default=4,
+    show_default=True,
+    help="Connections that queries share.",
+)
+@click.option("--duration", type=click.FloatRange(0.5), default=10.0, show_default=True, help="s")
+@click.option(
+    "--overload",
+    type=click.FloatRange(1),
+    default=1.0,
+    help="Multiply the rates for a second DURATION, go back to them for a third, and say how soon "
+    "all is as before.",
+)
+@click.option(
+    "--depth",
+    type=click.FloatRange(0),
+    default=1.0,
+    show_default=True,
+    help="How deep the tools press, mm.",
+)
+@click.option("--seed", type=int, default=0, show_default=True, help="Of the paths.")
+@click.option("--token", envvar="PALPATE_TOKEN", show_envvar=True)
+@click.option(
+    "--out",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="PNG of latency over time and of its distribution.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def loadtest(out: Path | None, as_json: bool, **plan: Any) -> None:
+    r"""Put a load on the service at URL and time it from when each message was due.
+
+    Sessions move a tip over the whole accessible surface of SCENE at up to 50 mm/s, in and out of
+    contact; queries press random places. A generator that never sleeps sends each message when it
+    is due, whatever became of those before. Windows of 0.25 s in which the machine's host took
+    time or the generator was late are not clean; latencies are told with and without them.
+
+    \b
+    Examples:
+      palpate loadtest http://127.0.0.1:8000 --sessions 4 --queries-per-second 20
+      palpate loadtest http://127.0.0.1:8000 --sessions 0 --queries-per-second 200 --region none
+      palpate loadtest http://127.0.0.1:8000 --sessions 4 --overload 10 --out overload.png
+    """
+    from online.loadtest.report import table
+    from online.loadtest.run import Plan, run
+
+    outcome = run(Plan(**plan))
+    click.echo(json.dumps(outcome.summary) if as_json else table(outcome.summary))
+    if out is not None:
+        from online.loadtest.picture import draw
+
+        draw(outcome, out)

@@ -6,15 +6,15 @@ import numpy as np
 import orjson
 from fastapi import FastAPI, Path, Request, Response
 from fastapi.responses import PlainTextResponse
-from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
 from online import wire
 from online.answer import answer
 from online.errors import Refusal
 from online.guard import METRICS
-from online.metrics import Metrics
+from online.metrics import CONTENT_TYPE, Metrics
 from online.negotiation import BINARY, JSON, MSGPACK, negotiate
 from online.schemas import (
+    Accessible,
     Answer,
     Checked,
     Mesh,
@@ -71,7 +71,6 @@ def _document(model: type, what: str) -> dict[int | str, dict[str, Any]]:
 
 def add_routes(app: FastAPI, store: Store, settings: Settings, metrics: Metrics) -> None:
     """Give `app` its endpoints, the hot ones first: the router tries them in this order."""
-    registry = metrics.registry()
 
     @app.post(
         "/scenes/{name}/solve",
@@ -124,7 +123,7 @@ def add_routes(app: FastAPI, store: Store, settings: Settings, metrics: Metrics)
     @app.get(METRICS, tags=["service"], response_class=PlainTextResponse, responses=_problems())
     async def tell_metrics() -> Response:
         """Tell what was counted and timed, of every worker, in the text format of Prometheus."""
-        return Response(generate_latest(registry), media_type=CONTENT_TYPE_LATEST)
+        return Response(metrics.text(), media_type=CONTENT_TYPE)
 
     @app.get("/scenes", tags=["scenes"], response_model=SceneList, responses=_problems())
     async def scenes() -> Any:
@@ -165,6 +164,30 @@ def add_routes(app: FastAPI, store: Store, settings: Settings, metrics: Metrics)
         if body is None:
             body = model.meshes[region, media_type] = _mesh(model, region, media_type)
         return Response(body, media_type=media_type)
+
+    @app.get(
+        "/scenes/{name}/accessible",
+        tags=["scenes"],
+        response_model=None,
+        responses={
+            **_document(Accessible, "The accessible surface"),
+            **_problems(404, 406, 422),
+        },
+    )
+    async def accessible(name: SceneName, request: Request) -> Response:
+        """Get the part of the surface that the endoscope can touch, undeformed.
+
+        It is finer than the mesh of the fields. In the binary formats vertices and normals are
+        float32, triangles int32.
+        """
+        media_type = _media_type(request)
+        atlas = store.model(name).atlas
+        arrays = {
+            "vertices": atlas.surface.vertices.astype(np.float32),
+            "normals": atlas.surface.normals.astype(np.float32),
+            "triangles": np.ascontiguousarray(atlas.surface.triangles, np.int32),
+        }
+        return Response(wire.encode(media_type, {"scene": name}, arrays), media_type=media_type)
 
 
 def _media_type(request: Request) -> str:

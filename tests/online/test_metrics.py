@@ -3,7 +3,6 @@ import subprocess
 import sys
 
 import pytest
-from prometheus_client import generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
 from online.metrics import BOUNDS, WIDTH, Metrics, make_table
@@ -50,7 +49,7 @@ def test_a_duration_is_counted_where_prometheus_expects_it():
     durations = [0.0, *BOUNDS, 1.5e-6, 10.0]  # bounds are inclusive
     for duration in durations:
         histogram.observe(duration)
-    found = samples(generate_latest(metrics.registry()).decode())
+    found = samples(metrics.text())
     name, kind = "palpate_queue_seconds", ("kind", "session")
     for bound in (*BOUNDS, float("inf")):
         edge = "+Inf" if bound == float("inf") else repr(bound)
@@ -65,7 +64,7 @@ def test_sessions_come_and_go():
     metrics.sessions.add()
     metrics.sessions.add()
     metrics.sessions.add(-1)
-    assert samples(generate_latest(metrics.registry()).decode())[("palpate_sessions",)] == 1
+    assert samples(metrics.text())[("palpate_sessions",)] == 1
 
 
 HOLD = """
@@ -101,7 +100,7 @@ def test_a_new_worker_counts_on_where_a_killed_one_was(tmp_path):
     assert third.sessions.value == 0
     assert third.sessions_opened.value == 3
     assert third.starts.value == 2
-    text = generate_latest(third.registry()).decode()
+    text = third.text()
     assert f'palpate_sessions{{worker="{b}"}} 3.0' in text
     assert f'palpate_worker_pid{{worker="{b}"}} {float(second.pid)}' in text
     second.communicate(timeout=10)

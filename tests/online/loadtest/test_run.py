@@ -1,0 +1,43 @@
+"""Load tests of a toy service on a real socket."""
+
+import json
+
+import pytest
+from click.testing import CliRunner
+
+from online.commands import loadtest
+from online.loadtest.run import Plan, run
+
+
+@pytest.mark.parametrize("region", ["none", "all"])
+def test_queries_are_all_answered(url, region):
+    plan = Plan(url, "toy", sessions=0, queries=100.0, duration=0.5, region=region)
+    summary = run(plan).summary
+    assert (summary["due"], summary["answered"], summary["lost"]) == (50, 50, 0)
+    assert summary["refused"] == {}
+    assert summary["solve_us"]["p50_us"] < summary["all"]["p50_us"]
+
+
+def test_too_much_is_refused_and_told_apart(url):
+    plan = Plan(url, "toy", sessions=0, queries=100.0, duration=0.5, overload=60.0, region="none")
+    summary = run(plan).summary
+    counted = summary["answered"] + summary["dropped"] + sum(summary["refused"].values())
+    assert counted + summary["lost"] == summary["due"] == 50 + 3000 + 50
+    assert set(summary["overload"]) == {"before", "during", "after", "recovered_s"}
+
+
+def test_the_command_prints_json_and_draws(url, tmp_path):
+    picture = tmp_path / "load.png"
+    arguments = [url, "toy", "--sessions", "0", "--queries-per-second", "50", "--duration", "0.5"]
+    result = CliRunner().invoke(loadtest, [*arguments, "--json", "--out", str(picture)])
+    assert result.exit_code == 0, result.output
+    summary = json.loads(result.output)
+    assert {"lost", "clean", "all", "solve_us", "machine"} <= set(summary)
+    assert {"p50_us", "p99_us", "p999_us"} <= set(summary["all"])
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_command_prints_a_table(url):
+    arguments = [url, "toy", "--sessions", "0", "--queries-per-second", "50", "--duration", "0.5"]
+    result = CliRunner().invoke(loadtest, arguments)
+    assert "| queries, all windows | 25 | 0 | 0 |" in result.output
