@@ -94,6 +94,13 @@ def _scatter(K, slots, data):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def scatter_faces(K, slots, data):
+    """Add face matrices K (f, 3, 3, k, k) to the CSR ``data``; slots (f, 3k, 3k) int32."""
+    for f in range(len(K)):
+        _scatter(K[f], slots[f], data)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def standard_tangent(conn, grad, weight, mu, lam, u, slots, data):
     """Add the tangent stiffness at ``u`` to CSR ``data`` (mN/mm); slots (e, 3n, 3n) int32."""
     n = conn.shape[1]

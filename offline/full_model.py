@@ -6,6 +6,7 @@ It gives ``shared.equilibrium`` its potential, tangent and correction on the fre
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -16,10 +17,11 @@ from scipy.sparse import csr_matrix
 from offline import assembly
 from offline.linear_solver import NotPositiveDefinite, sparse_solver
 from offline.mesh import Mesh
-from shared import equilibrium
+from shared import equilibrium, tip
 from shared.errors import PalpateError
 from shared.quadrature import volume_quadrature
 from shared.scene import ElementName, Scene
+from shared.tip import Tip, TipSurface, Touching, room_for
 from shared.tissue import lame
 
 Array = NDArray[np.float64]
@@ -44,6 +46,77 @@ class Equilibrium:
     iterations: int
     load_steps: int
     min_jacobian: float
+
+
+@dataclass(frozen=True)
+class TipEquilibrium(Equilibrium):
+    """A converged state under a rigid tip."""
+
+    force: Array  # (3,) mN, on the tool
+    tangent: Array  # (3, 3) mN/mm, derivative of the force in the tip's position
+    penetration: float  # mm, largest
+    energy: float  # mN mm, stored in tissue and penalty
+
+
+class TipContact:
+    """A rigid tip, somewhere, against the full model's surface.
+
+    Attributes
+    ----------
+    tip : Tip
+    position : ndarray, shape (3,), mm
+        Centre of the tip.
+    """
+
+    def __init__(self, model: FullModel, surface: TipSurface, tip: Tip) -> None:
+        self.tip = tip
+        self.surface = surface
+        self.position = np.full(3, np.inf)
+        self._near = np.arange(len(surface.faces), dtype=np.int32)
+        self._touching: Touching = room_for(surface, len(surface.faces))
+        self._slots = model.face_slots(surface.faces)
+
+    def potential(self, displacement: Array, force: Array) -> float:
+        """Energy of the penalty (mN mm); adds its gradient to ``force`` (3 nodes,) mN."""
+        count, energy, self.deepest = self._touch(displacement, tip.FORCE)
+        faces = self.surface.faces[self._touching.face[:count]]
+        np.subtract.at(force.reshape(-1, 3), faces, self._touching.force[:count])
+        return energy
+
+    def stiffen(self, displacement: Array, data: Array, convex: bool) -> None:
+        """Add the contact's tangent at a displacement (3 nodes,), or its convex part."""
+        count, _, _ = self._touch(displacement, tip.CONVEX if convex else tip.STIFFNESS)
+        assembly.scatter_faces(
+            self._touching.stiffness[:count], self._slots[self._touching.face[:count]], data
+        )
+
+    def reaction(self, displacement: Array) -> tuple[Array, Array, Array]:
+        """Force (3,) mN on the tool, and how it couples with the tissue.
+
+        Returns
+        -------
+        force : ndarray, shape (3,)
+        own : ndarray, shape (3, 3), mN/mm
+            Second derivative of the potential in the tip's position.
+        coupling : ndarray, shape (3 nodes, 3), mN/mm
+            Minus the mixed one.
+        """
+        count, _, _ = self._touch(displacement, tip.STIFFNESS)
+        K = self._touching.stiffness[:count].copy()
+        for i, j in ((1, 0), (2, 0), (2, 1)):
+            K[:, i, j] = K[:, j, i]
+        coupling = np.zeros((len(displacement) // 3, 3, 3))
+        faces = self.surface.faces[self._touching.face[:count]]
+        np.add.at(coupling, faces, np.einsum("fijab->faij", K))
+        force = -self._touching.force[:count].sum(axis=(0, 1))
+        return force, self._touching.own, coupling.reshape(len(displacement), 3)
+
+    def _touch(self, displacement: Array, wanted: int) -> tuple[int, float, float]:
+        found: tuple[int, float, float] = tip.touch(
+            self.tip, self.surface, self._near, self.position, displacement.reshape(-1, 3),
+            self._touching, wanted,
+        )  # fmt: skip
+        return found
 
 
 @dataclass
@@ -86,6 +159,7 @@ class FullModel:
         self._work = np.zeros((4, len(self.free)))
         self._solver = sparse_solver(self.pattern)
         self._at_rest = False
+        self._contact: TipContact | None = None
 
     def _theta_points(self) -> tuple[Array, Array] | None:
         """Gradients and weights of the points whose J make up an element's dilatation."""
@@ -114,6 +188,18 @@ class FullModel:
         indptr = np.searchsorted(keys // n, np.arange(n + 1)).astype(np.int32)
         pattern = csr_matrix((np.zeros(len(keys)), (keys % n).astype(np.int32), indptr), (n, n))
         return slots.reshape(len(dofs), dofs.shape[1], -1), pattern
+
+    def face_slots(self, faces: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Slots (f, 3 k, 3 k) in the pattern of the dofs of faces (f, k); -1 is clamped."""
+        number = np.full(3 * len(self.mesh.nodes), -1, dtype=np.int64)
+        number[self.free] = np.arange(len(self.free))
+        dofs = number[(3 * faces[:, :, None] + np.arange(3)).reshape(len(faces), -1)]
+        rows = np.broadcast_to(dofs[:, :, None], (*dofs.shape, dofs.shape[1]))
+        cols = np.swapaxes(rows, 1, 2)
+        n = len(self.free)
+        filled = np.repeat(np.arange(n), np.diff(self.pattern.indptr)) * n + self.pattern.indices
+        slots = np.searchsorted(filled, rows * n + cols)
+        return np.where((rows >= 0) & (cols >= 0), slots, -1).astype(np.int32)
 
     def internal(self, displacement: Array, force: Array) -> tuple[float, float]:
         """Write the internal force (3 nodes,) mN of a displacement (3 nodes,) mm.
@@ -174,6 +260,8 @@ class FullModel:
         """Total potential energy (mN mm), its gradient (mN) and the smallest det F."""
         self._full[self.free] = u
         energy, smallest = self.internal(self._full, self._force)
+        if self._contact is not None:
+            energy += self._contact.potential(self._full, self._force)
         np.subtract(self._force[self.free], self._load, out=residual)
         return energy - float(self._load @ u), smallest
 
@@ -181,6 +269,8 @@ class FullModel:
         """Factorise the tangent plus ``shift`` times the rest stiffness, if that is definite."""
         self._full[self.free] = u
         matrix = self.stiffness(self._full)
+        if self._contact is not None:
+            self._contact.stiffen(self._full, matrix.data, shift > 0)
         data = matrix.data + shift * self.rest_stiffness.data if shift else matrix.data
         self._at_rest = False
         try:
@@ -219,14 +309,82 @@ class FullModel:
         NoEquilibrium
         """
         full_load = load.reshape(-1)[self.free]
+
+        def apply(fraction: float) -> None:
+            np.multiply(full_load, fraction, out=self._load)
+
+        target = max(TOLERANCE * float(np.linalg.norm(full_load)), 1e-12)
+        return self._follow(apply, target, start, reuse, smallest_step, "pressure")[0]
+
+    def touch(
+        self,
+        contact: TipContact,
+        position: Array,
+        approach: Array,
+        start: Array | None = None,
+        smallest_step: float = 1 / 64,
+    ) -> TipEquilibrium:
+        """Equilibrium under a rigid tip, in one jump if that converges, else in steps of its way.
+
+        Parameters
+        ----------
+        contact : TipContact
+            Made for this model; keeps where the tip is.
+        position : ndarray, shape (3,), mm
+            Centre of the tip.
+        approach : ndarray, shape (3,), mm
+            The way the tip has come: it began at ``position - approach``, without contact.
+        start : ndarray, shape (nodes, 3), mm, optional
+            First guess; rest if absent.
+        smallest_step : float
+            Fraction of the way below which a step is given up.
+
+        Raises
+        ------
+        NoEquilibrium
+        """
+
+        def apply(fraction: float) -> None:
+            contact.position[:] = position - (1.0 - fraction) * approach
+
+        # the force is not known before; that which dents the tissue by the tip's radius is
+        target = TOLERANCE * self.young * contact.tip.radius**2
+        self._contact = contact
+        self._load[:] = 0.0
+        try:
+            found, energy = self._follow(apply, target, start, REUSE, smallest_step, "depth")
+            u = found.displacement.reshape(-1)
+            self.factorise(u[self.free], 0.0)
+            force, own, coupling = contact.reaction(u)
+            coupling = coupling[self.free]
+            tangent = coupling.T @ self._solver.solve(coupling) - own
+        finally:
+            self._contact = None
+        return TipEquilibrium(
+            **vars(found),
+            force=force,
+            tangent=tangent,
+            penetration=contact.deepest,
+            energy=energy,
+        )
+
+    def _follow(
+        self,
+        apply: Callable[[float], None],
+        target: float,
+        start: Array | None,
+        reuse: float,
+        smallest_step: float,
+        field: str,
+    ) -> tuple[Equilibrium, float]:
+        """Equilibrium at the end of a path of loads, and its energy; ``apply`` sets a fraction."""
         u = np.zeros(len(self.free)) if start is None else start.reshape(-1)[self.free].copy()
         converged, reached, step = u.copy() if start is None else np.zeros_like(u), 0.0, 1.0
-        target = max(TOLERANCE * float(np.linalg.norm(full_load)), 1e-12)
         total = steps = 0
         while reached < 1.0:
             fraction = min(1.0, reached + step)
-            np.multiply(full_load, fraction, out=self._load)
-            status, iterations, _, smallest = equilibrium.newton(
+            apply(fraction)
+            status, iterations, energy, smallest = equilibrium.newton(
                 self, u, self._work, target, reuse, MAX_ITERATIONS, False
             )
             total += iterations
@@ -238,9 +396,9 @@ class FullModel:
             if step < smallest_step:
                 raise NoEquilibrium(
                     f"load: no equilibrium found beyond {100 * reached:.0f} % of it; "
-                    "lower the pressure"
+                    f"lower the {field}"
                 )
             u[:] = converged
         displacement = np.zeros(3 * len(self.mesh.nodes))
         displacement[self.free] = u
-        return Equilibrium(displacement.reshape(-1, 3), total, steps, smallest)
+        return Equilibrium(displacement.reshape(-1, 3), total, steps, smallest), energy

@@ -95,7 +95,15 @@ class Workshop:
     def body(self) -> Body:
         """Mesh and tissue as the reduced model sees them."""
         mesh, model = self.mesh, self.model
-        return Body(mesh.nodes, mesh.elements, mesh.faces, mesh.clamped, model.mu, model.lam)
+        return Body(
+            mesh.nodes,
+            mesh.elements,
+            mesh.faces,
+            mesh.clamped,
+            mesh.accessible,
+            model.mu,
+            model.lam,
+        )
 
     @cached_property
     def beyond_clamped_layer(self) -> NDArray[np.bool_]:

@@ -12,7 +12,7 @@ import orjson
 from fastapi import FastAPI
 from pydantic.json_schema import models_json_schema
 
-from online import errors, guard
+from online import errors, guard, session
 from online.answer import answer
 from online.metrics import Metrics
 from online.negotiation import OFFERED
@@ -96,6 +96,7 @@ def _warm(model: Model) -> None:
         body = orjson.dumps({"contacts": [model.example], "region": region})
         for media_type in OFFERED:
             answer(model, body, media_type, 10**9, uncounted)
+    session.warm(model)
 
 
 def _describe_request(app: FastAPI) -> None:

@@ -1,11 +1,15 @@
-"""A small client: answers as arrays, refusals as exceptions."""
+"""A small client of the HTTP service: answers as arrays, refusals as exceptions.
 
+Sessions are opened by the clients here and live in `online.session_client`.
+"""
+
+import asyncio
 import http.client
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, ParamSpec, Self, TypeVar
 from urllib.parse import quote, urlsplit
 
 import numpy as np
@@ -13,28 +17,11 @@ from numpy.typing import NDArray
 
 from online import wire
 from online.negotiation import BINARY, JSON
+from online.session_client import AsyncSession, ServiceError, Session
 from shared.errors import PalpateError
 
-
-class ServiceError(PalpateError):
-    """The service refused a request.
-
-    Parameters
-    ----------
-    status : int
-        HTTP status.
-    error : dict
-        ``code``, ``field``, ``message`` and ``allowed`` as the service sent them.
-    """
-
-    def __init__(self, status: int, error: dict[str, Any]) -> None:
-        super().__init__(
-            f"{error['field']}: {error['message']}" if error["field"] else error["message"]
-        )
-        self.status = status
-        self.code: str = error["code"]
-        self.field: str = error["field"]
-        self.allowed: Any = error["allowed"]
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -99,6 +86,14 @@ class Accessible:
 class Client:
     """One connection to a service.
 
+    Parameters
+    ----------
+    url : str
+        Such as ``http://127.0.0.1:8000``.
+    token : str, optional
+        What the service asks for, if it does.
+    timeout : float, s
+
     Examples
     --------
     >>> with Client("http://127.0.0.1:8000") as client:             # doctest: +SKIP
@@ -106,14 +101,15 @@ class Client:
     ...     print(answer.force, answer.displacement.max())
     """
 
-    def __init__(self, url: str, timeout: float = 10.0, token: str | None = None) -> None:
+    def __init__(self, url: str, token: str | None = None, timeout: float = 10.0) -> None:
         parts = urlsplit(url)
         if parts.scheme != "http" or parts.hostname is None:
             raise PalpateError(f"{url}: not an address like http://127.0.0.1:8000")
-        self._connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=timeout)
+        self._url, self._token, self._timeout = url, token, timeout
         self._headers = {"Content-Type": JSON}
         if token is not None:
             self._headers["Authorization"] = f"Bearer {token}"
+        self._connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=timeout)
 
     def __enter__(self) -> Self:
         return self
@@ -194,10 +190,69 @@ class Client:
             von_mises=fields.get("von_mises"),
         )
 
+    def session(self, name: str) -> Session:
+        """Open a session of a scene, on a connection of its own."""
+        return Session(self._url, name, self._token, self._timeout)
+
     def _request(self, method: str, path: str, accept: str, body: bytes | None = None) -> bytes:
-        self._connection.request(method, path, body, self._headers | {"Accept": accept})
+        self._connection.request(method, path, body, {"Accept": accept, **self._headers})
         response = self._connection.getresponse()
         content = response.read()
         if response.status != 200:
             raise ServiceError(response.status, json.loads(content)["error"])
         return content
+
+
+class AsyncClient:
+    """The same client for asyncio; one request at a time.
+
+    Examples
+    --------
+    >>> async with AsyncClient("http://127.0.0.1:8000") as client:     # doctest: +SKIP
+    ...     answer = await client.solve("turbinate", (13.1, 20.0, 9.5), pressure=4.0)
+    ...     async with client.session("turbinate") as session:
+    ...         reply = await session.step((13.1, 20.0, 11.4))
+    """
+
+    def __init__(self, url: str, token: str | None = None, timeout: float = 10.0) -> None:
+        self._client = Client(url, token, timeout)
+        self._url, self._token, self._timeout = url, token, timeout
+        self._turn = asyncio.Lock()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        async with self._turn:
+            self._client.__exit__(kind, error, trace)
+
+    async def scenes(self) -> dict[str, Any]:
+        """Ask what is served; see `Client.scenes`."""
+        return await self._call(self._client.scenes)
+
+    async def scene(self, name: str) -> dict[str, Any]:
+        """Ask about a scene; see `Client.scene`."""
+        return await self._call(self._client.scene, name)
+
+    async def mesh(self, name: str, region: str = "surface") -> Mesh:
+        """Get the mesh of a region; see `Client.mesh`."""
+        return await self._call(self._client.mesh, name, region)
+
+    async def solve(
+        self, name: str, position: Sequence[float], pressure: float, **options: Any
+    ) -> Answer:
+        """Press the tissue; see `Client.solve`."""
+        return await self._call(self._client.solve, name, position, pressure, **options)
+
+    def session(self, name: str) -> AsyncSession:
+        """Make a session of a scene; ``async with`` opens it."""
+        return AsyncSession(self._url, name, self._token, self._timeout)
+
+    async def _call(self, method: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        async with self._turn:
+            return await asyncio.to_thread(method, *args, **kwargs)

@@ -82,6 +82,23 @@ _option = partial(click.option, show_default=True, show_envvar=True)
     default=Settings.max_json_numbers,
     help="Most numbers in a JSON answer's fields; the binary formats have no such limit.",
 )
+@_option(
+    "--max-sessions",
+    type=click.IntRange(0),
+    default=Settings.max_sessions,
+    help="Most sessions at a time; further ones are refused.",
+)
+@_option(
+    "--session-idle",
+    type=click.FloatRange(0.1),
+    default=Settings.session_idle,
+    help="Seconds after which a session that sends nothing is closed.",
+)
+@_option(
+    "--echo/--no-echo",
+    default=False,
+    help="Answer /echo, which palpate latency compares sessions with.",
+)
 @_option("--log-format", type=click.Choice(FORMATS), default=Settings.log_format)
 @_option("--log-level", type=click.Choice(LEVELS), default=Settings.log_level)
 @_option("--access-log/--no-access-log", default=False, help="Log every request.")
@@ -106,17 +123,22 @@ def serve(host: str, port: int, public: bool, **settings: Any) -> None:
 @click.argument("url")
 @click.argument("scene")
 @click.option("--rounds", type=click.IntRange(min=1), default=3000, show_default=True)
+@click.option("--session", is_flag=True, help="Measure the steps of a session; needs an --echo.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def latency(url: str, scene: str, rounds: int, as_json: bool) -> None:
+def latency(url: str, scene: str, rounds: int, session: bool, as_json: bool) -> None:
     """Measure what a running service at URL adds to a solve of SCENE.
 
     Medians in µs over ROUNDS turns of an empty request, a solve without fields and one with all
     fields in binary. The ratios are what is left of a round trip without the solve (and the
     recovery of the fields), over the empty one.
-    """
-    from online.latency import measure
 
-    report = measure(url, scene, rounds)
+    With --session: over turns of a step of a session and an echo of frames of the same sizes,
+    which a service started with --echo gives. The ratio is what is left of a step without its
+    solve, over the echo.
+    """
+    from online.latency import measure, measure_session
+
+    report = (measure_session if session else measure)(url, scene, rounds)
     if as_json:
         click.echo(json.dumps(report))
         return

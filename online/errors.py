@@ -26,6 +26,7 @@ STATUS = {
     "not_acceptable": 406,
     "body_too_large": 413,
     "unsupported_media_type": 415,
+    "upgrade_required": 426,
     "invalid_json": 422,
     "invalid_value": 422,
     "unanswerable_query": 422,
@@ -35,6 +36,7 @@ STATUS = {
     "internal": 500,
     "overloaded": 503,
     "not_ready": 503,
+    "too_many_sessions": 503,
 }
 
 

@@ -1,6 +1,38 @@
-"""Following a tool: from one position of the tip to the next, whatever the next one is."""
+"""Following a tool: from one position of its tip to the next, whatever the next one is.
 
-from typing import Any, NamedTuple
+A position is first tried as it is, from the warm start of the last. If no equilibrium is found
+there, the way to it from the last good position is walked in ever smaller strides, for as long as
+there is time. What is answered is then the farthest good position, with a flag, and never a state
+that is no equilibrium.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from time import perf_counter
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from online.frames import Flag
+from shared.atlas import Atlas
+from shared.errors import QueryError
+from shared.touch import Touch
+
+Array = NDArray[np.float64]
+
+CURVATURE = math.sqrt(0.05 / 0.375)
+"""Share of the depth over which a linearised force is right to 5 %, in Hertz's theory.
+
+Force goes with the depth d as F = c d^1.5, and a tangent taken at d is wrong by
+0.375 F (s / d)^2 after a step s, to second order.
+"""
+
+SHORTEST = 1.0 / 64.0
+"""Stride, as a part of the way, that is not halved any more."""
+
+_CONTACT, _CONVERGED, _IN_RANGE = map(int, (Flag.CONTACT, Flag.CONVERGED, Flag.IN_RANGE))
+_CLAMPED, _FALLBACK = int(Flag.CLAMPED), int(Flag.FALLBACK)
 
 
 class Step(NamedTuple):
@@ -9,7 +41,6 @@ class Step(NamedTuple):
     Parameters
     ----------
     touch : Touch
-        What the atlas answered
     flags : int
         Bits of `online.frames.Flag`.
     steps : int
@@ -17,10 +48,138 @@ class Step(NamedTuple):
     valid_radius : float, mm
         How far from the position force and tangent may serve.
     solve_seconds : float
+    reason : str
+        Why there is no answer to the position itself, if so.
     """
 
-    touch: Any
+    touch: Touch
     flags: int
     steps: int
     valid_radius: float
     solve_seconds: float
+    reason: str = ""
+
+
+class Follower:
+    """The tip of one session and where it has been.
+
+    Parameters
+    ----------
+    atlas : Atlas
+    """
+
+    def __init__(self, atlas: Atlas) -> None:
+        self._atlas = atlas
+        self._state = atlas.new_state()
+        self._good: Touch | None = None
+
+    def follow(self, position: Sequence[float], budget: float) -> Step:
+        """Answer a position; no new solve is begun after `budget` seconds."""
+        end = perf_counter() + budget
+        return self._follow(position, lambda steps: perf_counter() < end)
+
+    def repeat(self, position: Sequence[float], steps: int) -> Step:
+        """Answer a position as a session did that solved `steps` positions on the way.
+
+        With the same atlas and the same positions before it, the answer is the same, bit for bit.
+        """
+        return self._follow(position, lambda taken: taken < steps)
+
+    def _follow(self, position: Sequence[float], may_go_on: Callable[[int], bool]) -> Step:
+        start = perf_counter()
+        target = np.array(position, np.float64)
+        share, steps, reason = 1.0, 1, ""
+        try:
+            if not self._solve(target):
+                reason = "no equilibrium was found there"
+                share, steps = self._walk(target, may_go_on)
+        except QueryError as error:
+            reason, share = error.message, 0.0
+        touch = self._good or _nothing(target)
+        flags = _CONTACT * touch.contact + _CONVERGED * touch.converged + _IN_RANGE * touch.in_range
+        if share == 0.0:
+            flags |= _FALLBACK
+        elif share < 1.0:
+            flags |= _CLAMPED
+        else:
+            reason = ""
+        return Step(touch, flags, steps, _valid_radius(touch), perf_counter() - start, reason)
+
+    def _walk(self, target: Array, may_go_on: Callable[[int], bool]) -> tuple[float, int]:
+        """Go towards the target from the last good position: share of the way, steps tried."""
+        share, stride, steps = 0.0, 0.5, 1
+        if self._good is None:
+            return share, steps
+        start = self._good.position
+        while share < 1.0 and stride >= SHORTEST and may_go_on(steps):
+            steps += 1
+            ahead = min(share + stride, 1.0)
+            if self._solves((1.0 - ahead) * start + ahead * target):
+                share = ahead
+            else:
+                stride *= 0.5
+        return share, steps
+
+    def _solves(self, position: Array) -> bool:
+        """Solve a position that may have no answer at all."""
+        try:
+            return self._solve(position)
+        except QueryError:
+            return False
+
+    def _solve(self, position: Array) -> bool:
+        """Solve a position; tell whether that led to an equilibrium, which is then the last."""
+        touch = self._atlas.touch(position, self._state)
+        if not (touch.converged and _is_finite(touch)):
+            return False
+        self._good = touch
+        return True
+
+
+def _is_finite(touch: Touch) -> bool:
+    """Whether an answer holds neither NaN nor infinity."""
+    numbers = (
+        *touch.force.tolist(),
+        *touch.tangent.ravel().tolist(),
+        *touch.contact_point.tolist(),
+        *touch.normal.tolist(),
+        touch.energy,
+        touch.depth,
+        touch.penetration,
+        touch.min_jacobian,
+        touch.error_displacement,
+        touch.error_von_mises,
+        touch.error_force,
+    )
+    return math.isfinite(sum(numbers))
+
+
+def _nothing(position: Array) -> Touch:
+    """No force and no claim, for when there has been no good answer yet."""
+    return Touch(
+        position=position,
+        contact=False,
+        force=np.zeros(3),
+        tangent=np.zeros((3, 3)),
+        contact_point=position,
+        normal=np.zeros(3),
+        depth=0.0,
+        depth_limit=0.0,
+        penetration=0.0,
+        energy=0.0,
+        converged=False,
+        iterations=0,
+        in_range=False,
+        out_of_range=(),
+        error_displacement=0.0,
+        error_von_mises=0.0,
+        error_force=0.0,
+        min_jacobian=1.0,
+        patches=(),
+        solve_seconds=0.0,
+    )
+
+
+def _valid_radius(touch: Touch) -> float:
+    """How far force and tangent may serve: to first contact, or while they are right to 5 %."""
+    return CURVATURE * touch.depth if touch.contact else max(0.0, -touch.depth)

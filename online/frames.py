@@ -116,6 +116,7 @@ REPLY_FIELDS = (
     Field("penetration", "float32", "mm", "of the tip into the deformed surface"),
     Field("error_displacement", "float32", "", "estimated relative error"),
     Field("error_von_mises", "float32", "", "estimated relative error"),
+    Field("error_force", "float32", "", "estimated relative error"),
     Field("min_jacobian", "float32", "", "smallest volume ratio; 1 at rest, 0 is collapse"),
     Field("max_von_mises", "float32", "kPa", "largest in the body; 0 if not asked for"),
     Field("p99_von_mises", "float32", "kPa", "99th percentile of it; 0 if not asked for"),
@@ -127,7 +128,6 @@ REPLY_FIELDS = (
     Field("steps", "uint16", "", "positions solved on the way here"),
     Field("coordinates", "uint16", "", "reduced coordinates per local model that follow, or 0"),
     Field("outputs", "uint16", "", "what follows or holds, bits"),
-    Field("reserved", "uint32", "", "0"),
 )
 
 
@@ -277,6 +277,7 @@ def encode_reply(
         touch.penetration,
         touch.error_displacement,
         touch.error_von_mises,
+        touch.error_force,
         touch.min_jacobian,
         extras.max_von_mises,
         extras.p99_von_mises,
@@ -288,7 +289,6 @@ def encode_reply(
         step.steps,
         0 if extras.coordinates is None else extras.coordinates.shape[1],
         extras.outputs,
-        0,
     )
     if extras is NO_EXTRAS:
         return head
@@ -330,6 +330,7 @@ class Reply(NamedTuple):
     penetration: float
     error_displacement: float
     error_von_mises: float
+    error_force: float
     min_jacobian: float
     max_von_mises: float
     p99_von_mises: float
@@ -392,8 +393,9 @@ def decode_reply(frame: bytes) -> Reply:
         offset += size * dtype.itemsize
     if offset != len(frame):
         raise FrameError("frame", f"{len(frame)} bytes where its fields say {offset}")
-    values = (record[name] for name in _HEAD)
-    return Reply(*(v.item() if v.ndim == 0 else v for v in values), **arrays)
+    values: list[Any] = [record[name] for name in _HEAD]
+    head = [value.item() if value.ndim == 0 else value for value in values]
+    return Reply(*head, *arrays.values())
 
 
 def layout() -> dict[str, Any]:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 from online.errors import STATUS
+from online.frames import Flag
 from shared.errors import PalpateError
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
@@ -179,9 +180,36 @@ class Metrics:
         self.sessions = Number(found["palpate_sessions", ()])
         self.sessions_opened = Number(found["palpate_sessions_opened_total", ()])
         self.starts = Number(found["palpate_worker_starts_total", ()])
+        self._frame_phases = [self.phase["session", phase].observe for phase in PHASES]
+        self._flagged = [self._of_flags(flags) for flags in range(2 * max(Flag))]
         self.sessions.set(0.0)  # those of a killed worker are gone
         self.starts.add()
         Number(found["palpate_worker_pid", ()]).set(os.getpid())
+
+    def count_frame(
+        self, waited: float, times: Sequence[float], flags: int, superseded: int
+    ) -> None:
+        """Count an answered frame of a session.
+
+        Parameters
+        ----------
+        waited : float, s
+            From when it was read to when its turn came.
+        times : sequence of 5 floats, s
+            The borders of its `PHASES`.
+        flags : int
+            Bits of `online.frames.Flag`.
+        superseded : int
+            Frames that were dropped for it.
+        """
+        self.queue["session"].observe(waited)
+        for observe, start, end in zip(self._frame_phases, times, times[1:], strict=False):
+            observe(end - start)
+        for number in self._flagged[flags]:
+            number.add()
+        self.frame["answered"].add()
+        if superseded:
+            self.frame["superseded"].add(superseded)
 
     def text(self) -> str:
         """Write the numbers of all workers, labelled with theirs, as Prometheus reads them."""
@@ -195,6 +223,17 @@ class Metrics:
                 lines += _samples(family, worker, rows[worker][first:])
         lines += _memory({worker: int(rows[worker][_PID]) for worker in started})
         return "\n".join(lines) + "\n"
+
+    def _of_flags(self, flags: int) -> list[Number]:
+        """Find the numbers that count an answer with these flags."""
+        counted = {
+            "contact": flags & Flag.CONTACT,
+            "out_of_range": not flags & Flag.IN_RANGE,
+            "unconverged": not flags & Flag.CONVERGED,
+            "clamped": flags & Flag.CLAMPED,
+            "fallback": flags & Flag.FALLBACK,
+        }
+        return [self.flag["session", name] for name, counts in counted.items() if counts]
 
 
 def make_table(path: Path, workers: int) -> None:

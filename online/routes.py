@@ -6,9 +6,11 @@ import numpy as np
 import orjson
 from fastapi import FastAPI, Path, Request, Response
 from fastapi.responses import PlainTextResponse
+from starlette.routing import WebSocketRoute
 
-from online import wire
+from online import frames, wire
 from online.answer import answer
+from online.echo import ECHO, Echo
 from online.errors import Refusal
 from online.guard import METRICS
 from online.metrics import CONTENT_TYPE, Metrics
@@ -25,6 +27,7 @@ from online.schemas import (
     Status,
     parse_request,
 )
+from online.session import Sessions
 from online.settings import Settings
 from online.store import Model, Store
 
@@ -188,6 +191,30 @@ def add_routes(app: FastAPI, store: Store, settings: Settings, metrics: Metrics)
             "triangles": np.ascontiguousarray(atlas.surface.triangles, np.int32),
         }
         return Response(wire.encode(media_type, {"scene": name}, arrays), media_type=media_type)
+
+    @app.get(
+        "/scenes/{name}/session",
+        tags=["scenes"],
+        response_model=None,
+        responses={
+            101: {"description": frames.__doc__ + "\n\n" + frames.tables()},
+            **_problems(404, 422, 426),
+        },
+    )
+    async def session(name: SceneName) -> Response:
+        """Open a session (WebSocket): send positions of the tip, get forces.
+
+        The first message of the service is a hello in JSON that states the layout of the frames.
+        A text message is answered in JSON, a binary one in binary.
+        """
+        store.model(name)
+        raise Refusal("upgrade_required", "upgrade", "A session is opened by a WebSocket handshake")
+
+    app.router.routes.append(
+        WebSocketRoute("/scenes/{name}/session", Sessions(store, settings, metrics))
+    )
+    if settings.echo:
+        app.router.routes.append(WebSocketRoute(ECHO, Echo()))
 
 
 def _media_type(request: Request) -> str:

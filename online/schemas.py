@@ -10,8 +10,9 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, f
 from pydantic_core import PydanticCustomError
 
 from online.errors import invalid
+from online.frames import Output, Request
 
-Output = Literal["displacement", "von_mises"]
+FieldName = Literal["displacement", "von_mises"]
 Region = Literal["none", "surface", "all"]
 MeshRegion = Literal["surface", "all"]
 
@@ -83,13 +84,24 @@ class SolveRequest(_Strict):
     contacts: list[Contact] = Field(
         min_length=1, max_length=1, description="The endoscopes at work; one, for now."
     )
-    outputs: list[Output] = Field(
+    outputs: list[FieldName] = Field(
         ["displacement", "von_mises"], max_length=2, description="The fields to return."
     )
     region: Region = Field(
         "none",
         description="The nodes to return fields for, in the order of the mesh of that region; with "
         "none, the answer holds the contact, the force and the trust block.",
+    )
+
+
+class SessionRequest(_Strict):
+    """A position of the tip, in the JSON mode of a session."""
+
+    seq: int = Field(0, ge=0, lt=2**32, description="The client's number of this message, echoed.")
+    client_time: float = Field(0.0, description="The client's clock, s, echoed.")
+    position: Position = Field(description="Centre of the tip, [x, y, z] mm.")
+    outputs: list[Literal["coordinates", "displacement", "von_mises", "stress"]] = Field(
+        [], max_length=4, description="What is wanted beyond force and tangent."
     )
 
 
@@ -103,6 +115,18 @@ def parse_request(body: bytes) -> SolveRequest:
     except ValidationError as error:
         details = error.errors(include_url=False, include_input=False)
         raise invalid(details, _NAMES) from None
+
+
+def parse_session_request(text: str) -> Request:
+    """Make a request frame of its JSON text; raise `Refusal` with the field that is wrong."""
+    try:
+        read = SessionRequest.model_validate_json(text)
+    except ValidationError as error:
+        details = error.errors(include_url=False, include_input=False)
+        raise invalid(details, {"": list(SessionRequest.model_fields)}) from None
+    outputs = sum(Output[name.upper()] for name in set(read.outputs))
+    x, y, z = read.position
+    return Request(read.seq, read.client_time, (x, y, z), outputs)
 
 
 class ContactAnswer(BaseModel):

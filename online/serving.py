@@ -25,12 +25,10 @@ from online.guard import RECEIVED
 from online.metrics import Metrics, make_table
 from online.settings import Settings, is_loopback
 from online.store import Store
+from online.websocket import OPTIONS
 from shared.errors import PalpateError
 
 logger = logging.getLogger(__name__)
-
-GRACE = 3
-"""Seconds that answers under way and sessions get to end when the service does."""
 
 
 class Protocol(HttpToolsProtocol):
@@ -95,11 +93,9 @@ def _config(settings: Settings, host: str, port: int) -> uvicorn.Config:
         port=port,
         workers=settings.workers,
         http=Protocol,
-        ws="websockets-sansio",
-        ws_per_message_deflate=False,
         log_config=None,
         access_log=settings.access_log,
-        timeout_graceful_shutdown=GRACE,
+        **OPTIONS,
     )
 
 

@@ -31,6 +31,10 @@ class Settings:
     max_wait : float, s
         Longest that a request may have waited for its turn when it gets it; one that has waited
         longer is told to come back, so that a queue never grows beyond what is useful.
+    max_sessions : int
+        Most sessions at a time, of one worker.
+    session_idle : float, s
+        A session that has sent nothing for so long is closed.
     workers : int
         Processes that share the work.
     realtime : bool
@@ -39,6 +43,8 @@ class Settings:
         One of `online.logs.FORMATS` and of `online.logs.LEVELS`.
     access_log : bool
         Whether to log every request.
+    echo : bool
+        Whether ``/echo`` answers, for measurements.
     """
 
     artifacts: Path
@@ -48,11 +54,14 @@ class Settings:
     max_json_numbers: int = 100_000
     rate_limit: float = 2000.0
     max_wait: float = 0.1
+    max_sessions: int = 16
+    session_idle: float = 60.0
     workers: int = 1
     realtime: bool = False
     log_format: str = "json"
     log_level: str = "info"
     access_log: bool = False
+    echo: bool = False
 
 
 def is_loopback(host: str) -> bool:

@@ -23,12 +23,15 @@ class Model:
         What answers.
     example : dict
         ``position`` (mm) and ``pressure`` (kPa) of a contact that it can answer.
+    tip : list of 3 floats, mm
+        A position of the tip's centre at which it presses a little.
     meshes : dict from (region, media type) to bytes
         The mesh documents asked for so far.
     """
 
     atlas: Atlas
     example: dict[str, Any]
+    tip: list[float]
     meshes: dict[tuple[str, str], bytes] = field(default_factory=dict)
 
 
@@ -63,7 +66,7 @@ class Store:
         for path in sorted(self.directory.glob("*.h5")):
             try:
                 atlas = self._load(path)
-                model = Model(atlas, _example(atlas))
+                model = Model(atlas, _example(atlas), _tip(atlas))
                 if model.atlas.name in self.models:
                     raise PalpateError(f"{path}: another file already holds {model.atlas.name!r}")
                 warm(model)
@@ -95,11 +98,24 @@ class Store:
         self.refused.append(RefusedFile(path.name, reason))
 
 
+def _middle(atlas: Atlas) -> int:
+    """Vertex amid the accessible surface."""
+    vertices = atlas.surface.vertices
+    return int(((vertices - vertices.mean(axis=0)) ** 2).sum(axis=1).argmin())
+
+
 def _example(atlas: Atlas) -> dict[str, Any]:
     """Make a contact that `atlas` can answer: amid its surface, at half the pressure limit."""
-    vertices = atlas.surface.vertices
-    middle = int(((vertices - vertices.mean(axis=0)) ** 2).sum(axis=1).argmin())
+    middle = _middle(atlas)
     return {
-        "position": vertices[middle].round(3).tolist(),
+        "position": atlas.surface.vertices[middle].round(3).tolist(),
         "pressure": round(0.5 * float(atlas.limits[middle, 0]), 3),
     }
+
+
+def _tip(atlas: Atlas) -> list[float]:
+    """Make a position of the tip amid the surface, a tenth of its radius deep."""
+    middle, radius = _middle(atlas), atlas.scene.endoscope.radius
+    centre = atlas.surface.vertices[middle] + 0.9 * radius * atlas.surface.normals[middle]
+    position: list[float] = centre.round(3).tolist()
+    return position

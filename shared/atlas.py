@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from shared import equilibrium
+from shared import equilibrium, touch
 from shared.artifact import Artifact, ArtifactError, read_artifact
 from shared.bound import bind
 from shared.endoscope import LIMIT_FIELDS, SurfaceQuadrature
@@ -50,7 +50,14 @@ from shared.reduced import (
 from shared.scene import Scene, SceneError, parse_scene
 from shared.stress import nodal_von_mises
 from shared.surface import Surface, boundary_triangles
+from shared.tip import tip_of, tip_surface
 from shared.tissue import lame
+from shared.touch import (
+    TipModels,
+    TipState,
+    Touch,
+    assemble_tip_models,
+)
 
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
@@ -82,6 +89,8 @@ class Body:
     elements : ndarray, shape (e, 8) or (e, 20), int32
     faces : ndarray, shape (f, 4) or (f, 8), int32
     clamped : ndarray, shape (n,), bool
+    accessible : ndarray, shape (f,), bool
+        Faces an endoscope can touch.
     mu, lam : ndarray, shape (e,), kPa
     """
 
@@ -89,6 +98,7 @@ class Body:
     elements: NDArray[np.int32]
     faces: NDArray[np.int32]
     clamped: NDArray[np.bool_]
+    accessible: NDArray[np.bool_]
     mu: Array
     lam: Array
 
@@ -291,10 +301,14 @@ class State:
             scalars=self.record[_SCALARS],
         )
         self.bound = bind(Solver(patches, self.memory, self.scratch, self.outcome))
+        self.tip: TipState | None = None
+        """Of ``Atlas.touch``, made when first needed."""
 
     def forget(self) -> None:
         """Make the next answer independent of the last."""
         self.memory.patch[:] = -1
+        if self.tip is not None:
+            self.tip.forget()
 
 
 class Solution(NamedTuple):
@@ -463,6 +477,7 @@ class Atlas:
                 arrays["elements"],
                 arrays["faces"],
                 arrays["clamped"],
+                arrays["accessible"],
                 np.full(count, mu),
                 np.full(count, lam),
             ),
@@ -611,7 +626,102 @@ class Atlas:
             solve_seconds=time.perf_counter() - started,
         )
 
-    def coefficients(self, solution: Solution) -> dict[int, Field]:
+    @cached_property
+    def tips(self) -> TipModels:
+        """Local models of the rigid tip."""
+        body, models = self.body, self.models
+        radius = self.scene.endoscope.radius
+        surface = tip_surface(body.nodes, body.faces, body.accessible, radius)
+        nodes, faces = np.unique(surface.faces, return_inverse=True)
+        surface = surface._replace(
+            nodes=body.nodes[nodes],
+            faces=faces.reshape(surface.faces.shape).astype(np.int32),
+        )
+        bases = models.basis.reshape(*models.steps.shape, len(body.nodes), 3)
+        wide = []
+        for k, region in enumerate(models.region):
+            rows = np.moveaxis(bases[region][:, nodes], 0, -1).astype(np.float32)
+            C = models.steps[region][:, None] * models.modes[k]
+            wide.append((rows.reshape(-1, len(C)) @ C).reshape(len(nodes), 3, -1))
+        reach = models.extent + radius
+        return assemble_tip_models(
+            self.patches, surface, tip_of(radius, self.scene.tissue.young), wide, reach
+        )
+
+    def touch(self, position: ArrayLike, state: State | None = None) -> Touch:
+        """Answer a position of the rigid tip.
+
+        Parameters
+        ----------
+        position : array_like, shape (3,), mm
+            Centre of the tip, outside the body.
+        state : State, optional
+            Where the last answer is remembered to start from; without it every answer is cold.
+
+        Raises
+        ------
+        QueryError
+            If the position is not finite, or the tip's centre lies below the surface.
+        """
+        started = time.perf_counter()
+        at = _vector("position", position)
+        if state is None:
+            state = self._state
+            state.forget()
+        if state.tip is None:
+            state.tip = TipState(self.tips, self.surface.ground(self.limits[:, :0]))
+        touch.query(state.tip.bound, at)
+        outcome, memory = state.tip.outcome, state.tip.memory
+        scalars = outcome.scalars.tolist()
+        depth, distance = scalars[touch.DEPTH], scalars[touch.DISTANCE]
+        radius = self.scene.endoscope.radius
+        if depth > radius:
+            raise QueryError(
+                "position", f"the tip's centre lies {depth - radius:.2f} mm below the surface"
+            )
+        limit = 0.5 * radius
+        foot, normal, force = outcome.foot.copy(), outcome.normal.copy(), outcome.force.copy()
+        contact = scalars[touch.TOUCHED] > 0
+        out_of_range: tuple[str, ...] = ()
+        if contact and distance > BESIDE and _beside(at, foot, normal, distance):
+            out_of_range += ("position",)
+        if depth > limit:
+            out_of_range += ("depth",)
+        pushed = math.sqrt(float(force @ force))
+        if pushed > 0:
+            normal = force / pushed
+            foot = at - radius * normal
+        patches = tuple(
+            [
+                (_number(int(memory.patch[slot])), weight, memory.q[slot].copy())
+                for slot, weight in enumerate(outcome.weight.tolist())
+                if weight > 0 and contact
+            ]
+        )
+        return Touch(
+            position=at,
+            contact=contact,
+            force=force,
+            tangent=outcome.tangent.copy(),
+            contact_point=foot,
+            normal=normal,
+            depth=depth,
+            depth_limit=limit,
+            penetration=scalars[touch.PENETRATION],
+            energy=scalars[touch.ENERGY],
+            converged=scalars[touch.STATUS] == equilibrium.CONVERGED,
+            iterations=int(scalars[touch.ITERATIONS]),
+            in_range=not out_of_range,
+            out_of_range=out_of_range,
+            error_displacement=math.inf,
+            error_von_mises=math.inf,
+            error_force=math.inf,
+            min_jacobian=scalars[touch.SMALLEST_J],
+            patches=patches,
+            solve_seconds=time.perf_counter() - started,
+        )
+
+    def coefficients(self, solution: Solution | Touch) -> dict[int, Field]:
         """Displacement as coefficients (M,) in the basis of each region that takes part."""
         total: dict[int, Field] = {}
         for k, weight, c in solution.patches:
@@ -620,7 +730,7 @@ class Atlas:
             total[region] = total[region] + share if region in total else share
         return total
 
-    def displacement(self, solution: Solution, region: Region = "all") -> Field:
+    def displacement(self, solution: Solution | Touch, region: Region = "all") -> Field:
         """Nodal displacement (k, 3) mm, of all nodes or those of ``surface_nodes``."""
         field = np.zeros(self.models.basis.shape[2], np.float32)
         for number, coefficients in self.coefficients(solution).items():
@@ -629,7 +739,7 @@ class Atlas:
         return displacement if region == "all" else displacement[self.surface_nodes]
 
     def von_mises(
-        self, solution: Solution, region: Region = "all", displacement: Field | None = None
+        self, solution: Solution | Touch, region: Region = "all", displacement: Field | None = None
     ) -> Field:
         """Nodal von Mises stress (k,) kPa; ``displacement`` of all nodes saves its recovery."""
         if displacement is None:

@@ -10,6 +10,7 @@ from starlette.testclient import TestClient
 from online.app import create_app
 from online.settings import Settings
 from online.store import Store
+from online.websocket import OPTIONS
 from shared.errors import PalpateError
 
 from .fake_atlas import FakeAtlas
@@ -60,18 +61,33 @@ def client(serve):
 
 
 @pytest.fixture
-def url(fake_store, tmp_path):
+def serving(fake_store, tmp_path):
+    """Return a context manager that serves fake atlases on a real socket and gives the address."""
+
+    @contextmanager
+    def serving(settings=None, **atlases):
+        store = fake_store(**atlases)
+        app = create_app(settings or Settings(tmp_path), store)
+        config = uvicorn.Config(app, access_log=False, log_level="warning", **OPTIONS)
+        server = uvicorn.Server(config)
+        with socket.create_server(("127.0.0.1", 0)) as bound:
+            thread = threading.Thread(target=server.run, args=([bound],))
+            thread.start()
+            _wait_for(store)
+            try:
+                yield f"http://127.0.0.1:{bound.getsockname()[1]}"
+            finally:
+                server.should_exit = True
+                thread.join()
+
+    return serving
+
+
+@pytest.fixture
+def url(serving):
     """Return the address of a toy service on a real socket."""
-    store = fake_store(toy=FakeAtlas())
-    app = create_app(Settings(tmp_path), store)
-    server = uvicorn.Server(uvicorn.Config(app, access_log=False, log_level="warning"))
-    with socket.create_server(("127.0.0.1", 0)) as bound:
-        thread = threading.Thread(target=server.run, args=([bound],))
-        thread.start()
-        _wait_for(store)
-        yield f"http://127.0.0.1:{bound.getsockname()[1]}"
-        server.should_exit = True
-        thread.join()
+    with serving(toy=FakeAtlas()) as url:
+        yield url
 
 
 def _wait_for(store):

@@ -10,6 +10,7 @@ from shared.atlas import Solution
 from shared.errors import QueryError
 from shared.scene import Scene, load_scene
 from shared.surface import Surface
+from shared.touch import Touch
 
 QUICK = Path(__file__).parents[2] / "offline" / "scenes" / "quick.toml"
 
@@ -18,9 +19,15 @@ class FakeAtlas:
     """A block of 10 x 10 x 5 mm, clamped below, pressed from above.
 
     Above `collapse` (kPa) it has no equilibrium; `poison` makes its answers NaN.
+
+    A tip meets a bed of springs of `stiffness` (mN/mm). Deeper than `deepest` (mm) there is no
+    equilibrium, and none is found more than `stride` (mm) from the last contact.
     """
 
     pressure_max = 8.0
+    stiffness = 20.0
+    deepest = 1.5
+    stride = np.inf
 
     def __init__(
         self, name: str = "toy", divisions: int = 10, collapse: float = 40.0, poison: bool = False
@@ -95,19 +102,72 @@ class FakeAtlas:
             solve_seconds=time.perf_counter() - start,
         )
 
+    def new_state(self) -> dict[str, Any]:
+        return {"last": None}
+
+    def touch(self, position: Any, state: Any = None) -> Touch:
+        start = time.perf_counter()
+        state = self.new_state() if state is None else state
+        position = np.array(position, float)
+        radius = self.scene.endoscope.radius
+        depth = float(5.0 + radius - position[2])
+        if depth > radius:
+            raise QueryError("position", "the tip's centre lies below the surface")
+        last = state["last"]
+        leap = last is not None and float(np.linalg.norm(position - last)) > self.stride
+        converged = depth <= self.deepest and not leap
+        if converged:
+            state["last"] = position
+        contact = depth > 0.0
+        force = np.array([0.0, 0.0, self.stiffness * max(depth, 0.0)])
+        tangent = np.diag([0.0, 0.0, -self.stiffness * contact])
+        return Touch(
+            position=position,
+            contact=contact,
+            force=force * (np.nan if self.poison else 1.0),
+            tangent=tangent,
+            contact_point=position - [0.0, 0.0, radius],
+            normal=np.array([0.0, 0.0, 1.0]),
+            depth=depth,
+            depth_limit=1.0,
+            penetration=0.01 * max(depth, 0.0),
+            energy=0.5 * self.stiffness * max(depth, 0.0) ** 2,
+            converged=converged,
+            iterations=1,
+            in_range=depth <= 1.0,
+            out_of_range=("depth",) * (depth > 1.0),
+            error_displacement=0.001,
+            error_von_mises=0.002,
+            error_force=0.003,
+            min_jacobian=1.0 - 0.1 * max(depth, 0.0),
+            patches=((3, 1.0, np.array([depth, 0.5])),) * contact,
+            solve_seconds=time.perf_counter() - start,
+        )
+
     def _nodes(self, region: str) -> np.ndarray:
         return self.nodes[self.surface_nodes] if region == "surface" else self.nodes
 
-    def _shape(self, solution: Solution, region: str) -> np.ndarray:
+    def _shape(self, solution: Solution | Touch, region: str) -> np.ndarray:
         nodes = self._nodes(region)
         squared = ((nodes - solution.contact_point) ** 2).sum(axis=1)
-        return nodes[:, 2] / 5 * np.exp(-squared / (2 * solution.radius**2))
+        width = self.scene.endoscope.radius
+        return nodes[:, 2] / 5 * np.exp(-squared / (2 * width**2))
 
-    def displacement(self, solution: Solution, region: str = "all") -> np.ndarray:
-        field = np.outer(self._shape(solution, region), solution.contact_displacement)
-        return field.astype(np.float32)
+    def displacement(self, solution: Solution | Touch, region: str = "all") -> np.ndarray:
+        if isinstance(solution, Touch):
+            moved = np.array([0.0, 0.0, -max(solution.depth, 0.0)])
+        else:
+            moved = solution.contact_displacement
+        return np.outer(self._shape(solution, region), moved).astype(np.float32)
 
     def von_mises(
-        self, solution: Solution, region: str = "all", displacement: np.ndarray | None = None
+        self,
+        solution: Solution | Touch,
+        region: str = "all",
+        displacement: np.ndarray | None = None,
     ) -> np.ndarray:
-        return (solution.pressure * self._shape(solution, region)).astype(np.float32)
+        if isinstance(solution, Touch):
+            pressure = float(np.linalg.norm(solution.force))
+        else:
+            pressure = solution.pressure
+        return (pressure * self._shape(solution, region)).astype(np.float32)

