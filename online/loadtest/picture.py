@@ -11,7 +11,7 @@ from online.loadtest.report import Messages, quantiles
 from online.loadtest.run import Outcome
 
 KINDS = {"sessions": ("C0", "frames"), "queries": ("C1", "queries")}
-MARKS = {"p50_us": "50 %", "p99_us": "99 %", "p999_us": "99.9 %"}
+MARKS = {"p50_us": ("50 %", "top"), "p99_us": ("99 %", "top"), "p999_us": ("99.9 %", "bottom")}
 BINS_PER_DECADE = 40
 
 
@@ -52,17 +52,17 @@ def _histogram(axes: Axes, messages: Messages, colour: str, label: str) -> None:
     bins = np.logspace(low, high, 2 + int(BINS_PER_DECADE * (high - low)))
     axes.hist(known / 1e3, (bins / 1e3).tolist(), orientation="horizontal", color=colour, alpha=0.6)
     found = quantiles(known)
-    for name, text in MARKS.items():
+    for name, (text, side) in MARKS.items():
         value = found[name]
         assert value is not None
         axes.axhline(value / 1e3, color=colour, lw=0.8, ls="--")
         axes.annotate(
-            f"{label}: {text} {value / 1e3:.2g} ms",
+            f"{label}: {text} {value:.0f} µs",
             (1.0, value / 1e3),
             xycoords=("axes fraction", "data"),
-            xytext=(-2, 1),
+            xytext=(-2, 1 if side == "bottom" else -1),
             textcoords="offset points",
             ha="right",
-            va="bottom",
+            va=side,
             fontsize=7,
         )

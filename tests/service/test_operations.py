@@ -7,10 +7,13 @@ import signal
 import subprocess
 import time
 import urllib.request
+from contextlib import ExitStack
 
 import pytest
 
 from online.client import Client
+from online.loadtest.run import Plan, run
+from online.session_client import SessionClosed
 
 from .conftest import PALPATE
 
@@ -91,26 +94,72 @@ def test_requests_are_not_logged_unless_asked_for(serve, artifact):
     assert "/scenes" not in server.log
 
 
+def sessions_of(url):
+    """Return how many sessions each worker has: {worker: sessions}."""
+    found = re.findall(r'^palpate_sessions\{worker="(\d+)"\} (\S+)$', get(f"{url}/metrics"), re.M)
+    return {int(worker): float(number) for worker, number in found}
+
+
+def open_one_on_each(url, client, stack):
+    """Open sessions until both workers have one; return one of each."""
+    found = {}
+    for _ in range(15):
+        before = sessions_of(url)
+        session = stack.enter_context(client.session("quick"))
+        (worker,) = (w for w, number in sessions_of(url).items() if number > before[w])
+        found.setdefault(worker, session)
+        if len(found) == 2:
+            return found
+    raise AssertionError(f"one worker got all sessions: {found}")
+
+
 @pytest.mark.skipif(os.name == "nt", reason="workers are for POSIX")
-def test_a_killed_worker_is_replaced_while_the_other_goes_on(serve, artifact):
-    with serve(artifact.parent, "--workers", "2") as server:
+def test_a_killed_worker_is_replaced_while_the_others_sessions_go_on(serve, artifact):
+    with serve(artifact.parent, "--workers", "2") as server, ExitStack() as stack:
         while len(before := workers(server.url)) < 2:
             time.sleep(0.05)
-        with Client(server.url) as client:
-            contact = client.scene("quick")["example"]["contacts"][0]
-            os.kill(int(before[0]["pid"]), signal.SIGKILL)
-            for _ in range(200):  # whichever worker it is connected to, another one answers anew
-                try:
-                    assert client.solve("quick", **contact).trust["converged"]
-                except ConnectionError:
-                    client._connection.close()
-            while (after := workers(server.url))[0]["starts_total"] < 2:
-                time.sleep(0.05)
+        client = stack.enter_context(Client(server.url))
+        sessions = open_one_on_each(server.url, client, stack)
+        position = sessions[0].hello["example"]["position"]
+        assert all(session.step(position).contact for session in sessions.values())
+
+        os.kill(int(before[0]["pid"]), signal.SIGKILL)
+        with pytest.raises(SessionClosed):
+            sessions[0].step(position)
+        while (after := workers(server.url))[0]["starts_total"] < 2:
+            assert sessions[1].step(position).good
+            time.sleep(0.02)
         assert after[0]["pid"] != before[0]["pid"]
-        assert after[1] | {"resident_bytes": 0} == before[1] | {"resident_bytes": 0}
+        assert after[1]["pid"] == before[1]["pid"]
+        open_one_on_each(server.url, client, stack)  # the new one has clients again
+
         assert server.stop() == 0
+        with pytest.raises(SessionClosed, match="stopping"):
+            sessions[1].step(position)
         assert "Traceback" not in server.log
-        assert "worker 0 is ready" in server.log
     for worker in after.values():
         with pytest.raises(ProcessLookupError):
             os.kill(int(worker["pid"]), 0)
+
+
+def test_a_service_under_too_much_load_sheds_it_and_recovers(serve, artifact):
+    with serve(artifact.parent, "--rate-limit", "500") as server:
+        plan = Plan(
+            server.url, "quick", sessions=2, rate=300.0, queries=80.0, duration=2.0, overload=10.0
+        )
+        summary = run(plan).summary
+        queries = summary["queries"]
+        assert summary["lost"] == 0
+        assert summary["complaints"] == []
+        assert summary["overload"]["before"]["answered"] > 0
+        assert set(queries["refused"]) <= {"429", "503"}
+        assert queries["refused"]
+        assert queries["lost"] == 0
+        assert summary["overload"]["after"]["answered"] > 0
+        # it lives and has counted what it refused
+        text = get(f"{server.url}/metrics")
+        for code, status in (("too_many_requests", "429"), ("overloaded", "503")):
+            counted = re.search(rf'code="{code}",worker="0"\}} (\S+)', text)
+            assert float(counted[1]) == queries["refused"].get(status, 0)
+        assert server.stop() == 0
+        assert "Traceback" not in server.log

@@ -7,6 +7,8 @@ from click.testing import CliRunner
 
 from online.commands import loadtest
 from online.loadtest.run import Plan, run
+from online.settings import Settings
+from shared.errors import PalpateError
 
 
 @pytest.mark.parametrize("region", ["none", "all"])
@@ -16,6 +18,31 @@ def test_queries_are_all_answered(url, region):
     assert (summary["due"], summary["answered"], summary["lost"]) == (50, 50, 0)
     assert summary["refused"] == {}
     assert summary["solve_us"]["p50_us"] < summary["all"]["p50_us"]
+
+
+def test_no_frame_of_a_session_is_lost(url):
+    plan = Plan(url, "toy", sessions=2, rate=200.0, queries=20.0, duration=0.5, outputs=2)
+    outcome = run(plan)
+    summary = outcome.summary
+    assert (summary["due"], summary["lost"], summary["complaints"]) == (200, 0, [])
+    assert summary["answered"] + summary["superseded"] == 200
+    assert 0 < summary["flags"]["CONTACT"] < summary["answered"]
+    assert summary["solve_us"]["p50_us"] < summary["all"]["p50_us"]
+    assert summary["queries"]["answered"] == 10
+    assert len(outcome.sessions.due) == 200
+    assert len(outcome.queries.due) == 10
+
+
+def test_superseded_frames_are_told_from_lost_ones(url):
+    plan = Plan(url, "toy", sessions=1, rate=9000.0, duration=0.5)
+    summary = run(plan).summary
+    assert summary["answered"] + summary["superseded"] == summary["due"] == 4500
+    assert summary["lost"] == 0
+
+
+def test_a_session_that_is_refused_says_why(url):
+    with pytest.raises(PalpateError, match="too_many_sessions"):
+        run(Plan(url, "toy", sessions=Settings.max_sessions + 1))
 
 
 def test_too_much_is_refused_and_told_apart(url):
