@@ -1,0 +1,204 @@
+"""Clients that do everything wrong, while another one goes on being answered."""
+
+import json
+import socket
+import struct
+import threading
+import time
+from contextlib import ExitStack, contextmanager
+from itertools import repeat
+
+import numpy as np
+import pytest
+
+from online import frames
+from online import session as server_session
+from online.frames import Flag, Output, Request
+from online.session_client import ServiceError, Session, SessionClosed
+from online.settings import Settings
+
+from .fake_atlas import FakeAtlas
+
+PRESSED = (5.0, 5.0, 6.5)
+EVERYTHING = sum(Output) - Output.HALF
+
+
+@contextmanager
+def witness(url):
+    """Keep a session stepping; when the context ends, every answer must have been right."""
+    done, faults, count = threading.Event(), [], [0]
+
+    def step():
+        try:
+            with Session(url, "toy") as session:
+                while not done.is_set() or count[0] < 3:
+                    depth = 0.1 + 0.01 * (count[0] % 50)
+                    reply = session.step((5.0, 5.0, 7.0 - depth))
+                    np.testing.assert_allclose(reply.force, [0, 0, 20.0 * depth])
+                    assert reply.flags == Flag.CONTACT | Flag.CONVERGED | Flag.IN_RANGE
+                    count[0] += 1
+                    done.wait(0.001)
+        except Exception as error:
+            faults.append(error)
+
+    thread = threading.Thread(target=step)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+    assert not faults, faults
+    assert count[0] > 0
+
+
+def fuzzed(rng):
+    """Make a message: a frame with some bytes changed, or anything at all."""
+    kind = rng.integers(8)
+    if kind == 0:
+        return rng.bytes(rng.integers(0, 200))
+    if kind == 1:
+        return b"\x01\x00" + rng.bytes(38)
+    position = rng.uniform([-5, -5, -5], [15, 15, 15]) * rng.choice([1.0, 1e3, 1e300, np.nan])
+    outputs = int(rng.integers(40)) if kind == 2 else 0
+    frame = bytearray(frames.encode_request(Request(1, 0.0, tuple(position), outputs)))
+    for _ in range(rng.integers(3)):
+        frame[rng.integers(2, len(frame))] = rng.integers(256)
+    return bytes(frame)
+
+
+def check(message):
+    """Check that a message is a reply without NaN or an error that says what is wrong."""
+    if isinstance(message, str):
+        assert json.loads(message)["error"]["message"]
+        return
+    reply = frames.decode_reply(message)
+    numbers = np.concatenate([np.ravel(value) for value in reply if value is not None])
+    assert np.isfinite(numbers).all()
+    assert reply.flags & (Flag.CONVERGED | Flag.FALLBACK)
+
+
+def test_ten_thousand_fuzzed_frames(url, rng):
+    """Eight clients at a time, each replaced when the service has had enough of it."""
+    codes = set()
+    with witness(url), ExitStack() as stack:
+        sessions = [stack.enter_context(Session(url, "toy")) for _ in range(8)]
+        for _ in range(10_000 // len(sessions)):
+            for session in sessions:
+                session.send_bytes(fuzzed(rng))
+            for i, session in enumerate(sessions):
+                message = session._message()
+                check(message)
+                if isinstance(message, str) and "unknown_version" in message:
+                    with pytest.raises(SessionClosed) as closed:
+                        session.receive()
+                    codes.add(closed.value.code)
+                    session.close()
+                    sessions[i] = stack.enter_context(Session(url, "toy"))
+    assert codes == {4001}
+
+
+def test_fuzzed_text(url, rng):
+    whole = json.dumps({"seq": 1, "position": PRESSED, "outputs": ["stress"]}).encode()
+    with witness(url), Session(url, "toy") as session:
+        for _ in range(300):
+            text = bytearray(whole)
+            for _ in range(rng.integers(1, 4)):
+                text[rng.integers(len(text))] = rng.integers(32, 127)
+            session._protocol.send_text(bytes(text))
+            session._flush()
+            message = session._message()
+            assert "NaN" not in message
+            assert set(json.loads(message)) & {"error", "force"}
+
+
+def test_bytes_that_are_no_frames_of_a_websocket(url, rng):
+    with witness(url):
+        for _ in range(50):
+            with Session(url, "toy") as session:
+                session._socket.sendall(rng.bytes(rng.integers(1, 500)))
+
+
+def test_a_message_too_long_ends_its_session_only(url):
+    with witness(url), Session(url, "toy") as session:
+        session.send_bytes(bytes(100_000))
+        with pytest.raises(SessionClosed) as closed:
+            session.receive()
+        assert closed.value.code == 1009
+
+
+def test_clients_that_vanish(serving, tmp_path):
+    """Half-open, reset, and hung up at once: their places are free again."""
+    with serving(Settings(tmp_path, max_sessions=4, session_idle=0.2), toy=FakeAtlas()) as url:
+        with witness(url):
+            silent = [Session(url, "toy") for _ in range(3)]
+            for _ in range(20):
+                places_come_free(url).close()
+            for session in silent:
+                session._socket.close()
+        with witness(url):
+            for _ in range(20):
+                session = places_come_free(url)
+                session.send(PRESSED)
+                linger = struct.pack("ii", 1, 0)
+                session._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
+                session._socket.close()
+
+
+def places_come_free(url):
+    """Open a session as soon as there is a place."""
+    for _ in range(500):
+        try:
+            with Session(url, "toy") as session:
+                assert session.step(PRESSED).good
+            return Session(url, "toy")
+        except ServiceError:
+            time.sleep(0.01)
+    raise AssertionError("no place came free")
+
+
+def test_a_client_that_does_not_read_is_cut(serving, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(server_session, "PATIENCE", 0.2)
+    atlas = FakeAtlas(divisions=40)  # replies of 27 KB
+    with serving(Settings(tmp_path, max_sessions=2), toy=atlas) as url, witness(url):
+        with Session(url, "toy") as slow:
+            slow._socket.settimeout(10.0)
+            frame = frames.encode_request(Request(1, 0.0, PRESSED, EVERYTHING))
+            with pytest.raises(ConnectionError):
+                pour(slow, repeat(frame))
+        places_come_free(url).close()
+    assert "left replies unread" in caplog.text
+
+
+def test_a_flood_is_answered_or_counted(url):
+    """Every frame is either answered or told as superseded; the last one is answered."""
+    count = 10_000
+    with witness(url), Session(url, "toy") as session:
+        flood_ = (frames.encode_request(Request(i, 0.0, PRESSED)) for i in range(count))
+        flood = threading.Thread(target=pour, args=(session, flood_))
+        flood.start()
+        answered = superseded = 0
+        seq = None
+        while seq != count - 1:
+            reply = session.receive()
+            answered, superseded, seq = answered + 1, superseded + reply.superseded, reply.seq
+        flood.join()
+    assert answered + superseded == count
+    assert superseded > 0
+
+
+def pour(session, frames_):
+    """Send frames as fast as the socket takes them, reading nothing."""
+    protocol = type(session._protocol)(session._protocol.uri)
+    protocol.state = session._protocol.state
+    for i, frame in enumerate(frames_, 1):
+        protocol.send_binary(frame)
+        if i % 100 == 0:
+            session._socket.sendall(b"".join(protocol.data_to_send()))
+
+
+def test_a_tool_that_jumps_through_the_body(url, rng):
+    with witness(url), Session(url, "toy") as session:
+        for position in rng.uniform([0, 0, -5], [10, 10, 12], (500, 3)):
+            session.send(position)
+            check(session._message())
