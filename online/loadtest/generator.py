@@ -28,10 +28,11 @@ DRAIN = 1.5
 CHUNK = 1 << 18
 """Most bytes taken from a socket at once."""
 
-LOST, DROPPED, ANSWERED = 0, 1, 200
+LOST, DROPPED, SUPERSEDED, ANSWERED = 0, 1, 2, 200
 """What became of a message; other numbers are HTTP statuses of refusals.
 
-One is dropped that never went out, for want of a connection.
+A query is dropped that never went out, for want of a connection; a frame is superseded if the
+service says that it left it for a newer one.
 """
 
 

@@ -10,7 +10,7 @@ from hdrh.histogram import HdrHistogram
 from numpy.typing import NDArray
 
 from online.frames import Flag
-from online.loadtest.generator import ANSWERED, DROPPED, LOST, WINDOW, Log, Machine
+from online.loadtest.generator import ANSWERED, DROPPED, LOST, SUPERSEDED, WINDOW, Log, Machine
 from online.loadtest.queries import Queries
 from online.loadtest.sessions import Session
 
@@ -121,17 +121,11 @@ def summarize(messages: Messages, clean: NDArray[np.bool_]) -> dict[str, Any]:
 def summarize_sessions(
     sessions: Sequence[Session], messages: Messages, clean: NDArray[np.bool_]
 ) -> dict[str, Any]:
-    """Say what became of the frames of sessions.
-
-    A frame without an answer is superseded if the server says that it dropped it for a newer one,
-    else lost.
-    """
-    superseded = sum(session.superseded for session in sessions)
-    without = int((messages.outcome != ANSWERED).sum())
+    """Say what became of the frames of sessions."""
     answered = messages.flags[messages.outcome == ANSWERED]
     return {
-        "lost": without - superseded,
-        "superseded": superseded,
+        "lost": int((messages.outcome == LOST).sum()),
+        "superseded": int((messages.outcome == SUPERSEDED).sum()),
         **summarize(messages, clean),
         "flags": {bit.name: int((answered & bit > 0).sum()) for bit in Flag},
         "complaints": sorted({session.complaint for session in sessions if session.complaint}),
@@ -187,7 +181,7 @@ def summarize_overload(messages: Messages, machine: Machine, borders: Array) -> 
     dict
         Latencies and answers ``before``, ``during`` and ``after``, and ``recovered_s``: from the
         end of the overload to the first window from which on no window's 99th percentile is above
-        twice the worst before; None if that never came.
+        twice the worst before; None if that never came, or nothing was well before.
     """
     phases = np.searchsorted(borders[1:3], messages.due, "right")
     report: dict[str, Any] = {}
@@ -202,7 +196,7 @@ def summarize_overload(messages: Messages, machine: Machine, borders: Array) -> 
     bar = 2.0 * max(_worst(messages, window, w) for w in np.unique(window[phases == 0]))
     recovered = None
     for w in np.unique(window[phases == 2])[::-1]:
-        if not _worst(messages, window, w) <= bar:
+        if np.isinf(bar) or _worst(messages, window, w) > bar:
             break
         recovered = max(0.0, round(1e-9 * float(machine.borders[w]) - borders[2], 3))
     report["recovered_s"] = recovered
@@ -210,8 +204,10 @@ def summarize_overload(messages: Messages, machine: Machine, borders: Array) -> 
 
 
 def _worst(messages: Messages, window: NDArray[np.int64], chosen: int) -> float:
-    """99th percentile of the latencies of a window; infinite if one is missing."""
-    latency = messages.latency[window == chosen]
+    """99th percentile of the latencies of a window; infinite if messages got no answer."""
+    latency = messages.latency[(window == chosen) & (messages.outcome != SUPERSEDED)]
+    if not len(latency):
+        return np.inf
     return float(np.percentile(np.where(np.isnan(latency), np.inf, latency), 99, method="higher"))
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from online.frames import REPLY, REQUEST, VERSION
-from online.loadtest.generator import ANSWERED, CHUNK, Log
+from online.loadtest.generator import ANSWERED, CHUNK, SUPERSEDED, Log
 from online.loadtest.target import Target
 from shared.errors import PalpateError
 
@@ -46,8 +46,6 @@ class Session:
 
     Attributes
     ----------
-    superseded : int
-        Frames that the server says it dropped for newer ones.
     complaint : str
         What the server said last that was no answer.
     """
@@ -60,7 +58,6 @@ class Session:
         outputs: int = 0,
     ) -> None:
         self.log = Log(due)
-        self.superseded = 0
         self.complaint = ""
         self._messages = _messages(due, positions, outputs)
         self._size = len(self._messages) // len(due)
@@ -117,7 +114,9 @@ class Session:
         log.outcome[number] = ANSWERED
         log.flags[number] = flags
         log.solve_us[number] = 1e6 * _SOLVE_TIME.unpack_from(received, begin + _AT_SOLVE_TIME)[0]
-        self.superseded += _SUPERSEDED.unpack_from(received, begin + _AT_SUPERSEDED)[0]
+        (superseded,) = _SUPERSEDED.unpack_from(received, begin + _AT_SUPERSEDED)
+        for dropped in range(max(number - superseded, self._last_answered + 1), number):
+            log.outcome[dropped] = SUPERSEDED
         self._last_answered = number
 
     def _control(self, opcode: int, payload: bytes) -> None:
@@ -186,6 +185,14 @@ def _frame(received: bytes, start: int, end: int) -> tuple[int, int, int] | None
 def _open(target: Target) -> tuple[socket.socket, bytes]:
     """Open a session and wait for its hello; returns the socket and what came after that."""
     connection = target.connect()
+    try:
+        return connection, _shake_hands(connection, target)
+    except BaseException:
+        connection.close()
+        raise
+
+
+def _shake_hands(connection: socket.socket, target: Target) -> bytes:
     head = target.head(
         "GET",
         "session",
@@ -205,7 +212,7 @@ def _open(target: Target) -> tuple[socket.socket, bytes]:
         received += _more(connection)
     if hello[0] != _TEXT:
         raise PalpateError("the session does not begin with a hello")
-    return connection, received[hello[2] :]
+    return received[hello[2] :]
 
 
 def _more(connection: socket.socket) -> bytes:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from online.frames import Flag
-from online.loadtest.generator import ANSWERED, DROPPED, LOST, Log, Machine
+from online.loadtest.generator import ANSWERED, DROPPED, LOST, SUPERSEDED, Log, Machine
 from online.loadtest.report import (
     clean_windows,
     gather,
@@ -68,16 +68,15 @@ def test_a_window_is_clean_if_host_and_generator_were_on_time():
     assert clean_windows(machine(5), messages).tolist() == [True, True, False, False, True]
 
 
-class Told:
-    def __init__(self, superseded):
-        self.superseded, self.complaint = superseded, ""
+class Quiet:
+    complaint = ""
 
 
 def test_superseded_frames_are_not_lost_ones():
-    outcome = [ANSWERED, LOST, LOST, LOST, ANSWERED]
+    outcome = [ANSWERED, LOST, SUPERSEDED, SUPERSEDED, ANSWERED]
     messages = gather([log(np.arange(5.0), outcome=outcome)])
     clean = np.array([True, True, True, True, False])
-    found = summarize_sessions([Told(2)], messages, clean)
+    found = summarize_sessions([Quiet()], messages, clean)
     assert (found["lost"], found["superseded"], found["answered"]) == (1, 2, 2)
     assert found["flags"]["CONTACT"] == 2
     assert found["flags"]["FALLBACK"] == 0
@@ -86,7 +85,7 @@ def test_superseded_frames_are_not_lost_ones():
 
 def test_what_became_of_queries_is_told_apart():
     messages = gather([log(np.arange(5.0), outcome=[ANSWERED, 429, 503, DROPPED, LOST])])
-    found = summarize_queries(Told(0), messages, np.ones(5, bool))
+    found = summarize_queries(Quiet(), messages, np.ones(5, bool))
     assert (found["answered"], found["dropped"], found["lost"]) == (1, 1, 1)
     assert found["refused"] == {"429": 1, "503": 1}
 
@@ -109,3 +108,16 @@ def test_a_lost_message_is_no_recovery():
     messages = gather([log(due, outcome=outcome)])
     found = summarize_overload(messages, machine(6), np.array([0.0, 2.0, 4.0, 6.0]))
     assert found["recovered_s"] == 1.0
+
+
+def test_superseded_frames_do_not_hide_a_recovery_nor_make_one():
+    due = np.arange(0.01, 6.0, 0.01)
+    outcome = np.full(len(due), ANSWERED)
+    outcome[(due > 2.0) & (due < 4.5)] = SUPERSEDED
+    messages = gather([log(due, outcome=outcome)])
+    found = summarize_overload(messages, machine(6), np.array([0.0, 2.0, 4.0, 6.0]))
+    assert found["recovered_s"] == 0.0
+    outcome[:] = LOST
+    messages = gather([log(due, outcome=outcome)])
+    found = summarize_overload(messages, machine(6), np.array([0.0, 2.0, 4.0, 6.0]))
+    assert found["recovered_s"] is None
