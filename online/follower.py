@@ -137,7 +137,7 @@ class Follower:
 
 
 def _is_finite(touch: Touch) -> bool:
-    """Whether an answer holds neither NaN nor infinity."""
+    """Whether an answer holds no NaN, and no infinity but in its error estimates."""
     numbers = (
         *touch.force.tolist(),
         *touch.tangent.ravel().tolist(),
@@ -147,11 +147,10 @@ def _is_finite(touch: Touch) -> bool:
         touch.depth,
         touch.penetration,
         touch.min_jacobian,
-        touch.error_displacement,
-        touch.error_von_mises,
-        touch.error_force,
     )
-    return math.isfinite(sum(numbers))
+    # an estimate may be infinite: nothing is known of the error then
+    estimates = touch.error_displacement + touch.error_von_mises + touch.error_force
+    return math.isfinite(sum(numbers)) and not math.isnan(estimates)
 
 
 def _nothing(position: Array) -> Touch:

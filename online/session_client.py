@@ -156,7 +156,7 @@ class Session:
         try:
             self._protocol.send_binary(frame)
             self._flush()
-        except (InvalidState, OSError):
+        except (InvalidState, ConnectionError):
             while True:  # until the service's last word, or the end of the line
                 self._take()
 
