@@ -96,7 +96,7 @@ def _warm(model: Model) -> None:
         body = orjson.dumps({"contacts": [model.example], "region": region})
         for media_type in OFFERED:
             answer(model, body, media_type, 10**9, uncounted)
-    session.warm(model)
+    session.warm(model, uncounted)
 
 
 def _describe_request(app: FastAPI) -> None:

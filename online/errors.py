@@ -110,7 +110,7 @@ def invalid(details: Sequence[Any], names: Mapping[str, Sequence[str]] | None = 
 
 def _refuse(request: Request, refusal: Refusal) -> Response:
     """Count a refusal and answer with it."""
-    request.app.state.metrics.refusal[refusal.code].add()
+    request.app.state.metrics.count_refusal(refusal.code)
     return refusal.response()
 
 

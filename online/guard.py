@@ -64,7 +64,7 @@ class Guard:
             try:
                 self._admit(scope)
             except Refusal as refusal:
-                self._metrics.refusal[refusal.code].add()
+                self._metrics.count_refusal(refusal.code)
                 await refusal.response()(scope, receive, send)
                 return
         await self._app(scope, receive, send)
@@ -101,7 +101,7 @@ class Guard:
             )
 
     def _check_wait(self, waited: float) -> None:
-        self._metrics.queue["query"].observe(waited)
+        self._metrics.count_wait(waited)
         if waited > self._max_wait:
             raise Refusal(
                 "overloaded",

@@ -113,7 +113,7 @@ def _work(settings: Settings, url: str, table: Path | None) -> FastAPI:
         if settings.realtime:
             logger.info(realtime.enter())
         logger.info("worker %d is ready", metrics.worker)
-        if metrics.worker == 0 and metrics.starts.value == 1.0:
+        if metrics.worker == 0 and not metrics.restarted:
             _invite(store, url)
 
     return create_app(settings, on_ready=greet, metrics=metrics)

@@ -74,13 +74,12 @@ class Sessions:
                 "too_many_sessions", "", f"{self._open} sessions are open", {"max_sessions": most}
             )
         self._open += 1
-        self._metrics.sessions.set(self._open)
-        self._metrics.sessions_opened.add()
+        self._metrics.count_session(opened=True)
         try:
             await Session(model, self._settings, self._metrics, receive, send).run()
         finally:
             self._open -= 1
-            self._metrics.sessions.set(self._open)
+            self._metrics.count_session(opened=False)
 
 
 class Session:
@@ -230,12 +229,12 @@ class Session:
         frame = frames.encode_reply(
             request, step, extras, superseded, self._received, perf_counter()
         )
-        times = (start, decoded, solved, recovered, perf_counter())
-        self._metrics.count_frame(start - self._received, times, step.flags, superseded)
+        borders = (start, decoded, solved, recovered, perf_counter())
+        self._metrics.count_frame(start - self._received, borders, step.flags, superseded)
         return frame, step
 
     def _complain(self, code: str, field: str, message: str, allowed: Any = None) -> Message:
-        self._metrics.frame["refused"].add()
+        self._metrics.count_refused_frame()
         error = {"code": code, "field": field, "message": message, "allowed": allowed}
         return {"type": "websocket.send", "text": orjson.dumps({"error": error}).decode()}
 
@@ -267,12 +266,13 @@ class Session:
         return orjson.dumps(document).decode()
 
 
-def warm(model: Model) -> None:
+def warm(model: Model, metrics: Metrics) -> None:
     """Call all that a session calls once, so that no client pays for a first time."""
     x, y, z = model.tip
     request = Request(0, 0.0, (x, y, z), sum(Output))
     step = Follower(model.atlas).follow(request.position, BUDGET)
     frames.encode_reply(request, step, recover(model.atlas, step.touch, request.outputs))
+    metrics.count_frame(0.0, (0.0, 0.0, 0.0, 0.0, 0.0), step.flags, 0)
 
 
 def recover(atlas: Atlas, touch: Touch, outputs: int) -> Extras:

@@ -5,6 +5,7 @@ import sys
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from online.frames import Flag
 from online.metrics import BOUNDS, WIDTH, Metrics, make_table
 from shared.errors import PalpateError
 
@@ -45,12 +46,11 @@ def test_flags_and_refusals_are_counted(client):
 
 def test_a_duration_is_counted_where_prometheus_expects_it():
     metrics = Metrics()
-    histogram = metrics.queue["session"]
     durations = [0.0, *BOUNDS, 1.5e-6, 10.0]  # bounds are inclusive
     for duration in durations:
-        histogram.observe(duration)
+        metrics.count_wait(duration)
     found = samples(metrics.text())
-    name, kind = "palpate_queue_seconds", ("kind", "session")
+    name, kind = "palpate_queue_seconds", ("kind", "query")
     for bound in (*BOUNDS, float("inf")):
         edge = "+Inf" if bound == float("inf") else repr(bound)
         expected = sum(duration <= bound for duration in durations)
@@ -61,18 +61,40 @@ def test_a_duration_is_counted_where_prometheus_expects_it():
 
 def test_sessions_come_and_go():
     metrics = Metrics()
-    metrics.sessions.add()
-    metrics.sessions.add()
-    metrics.sessions.add(-1)
-    assert samples(metrics.text())[("palpate_sessions",)] == 1
+    for opened in (True, True, False):
+        metrics.count_session(opened)
+    found = samples(metrics.text())
+    assert found[("palpate_sessions",)] == 1
+    assert found[("palpate_sessions_opened_total",)] == 2
+
+
+def test_a_frame_is_counted_by_phase_flag_and_wait():
+    metrics = Metrics()
+    good = Flag.CONTACT | Flag.CONVERGED | Flag.IN_RANGE
+    for flags in (good, Flag.CONVERGED | Flag.CLAMPED, Flag.FALLBACK):
+        metrics.count_frame(0.5e-3, (0.0, 1e-6, 4e-6, 4e-6, 9e-6), int(flags), 2)
+    metrics.count_refused_frame()
+    found = samples(metrics.text())
+    session = ("kind", "session")
+    for phase, took in (("decode", 1e-6), ("solve", 3e-6), ("recover", 0.0), ("encode", 5e-6)):
+        labels = session, ("phase", phase)
+        assert found["palpate_phase_seconds_count", *labels] == 3
+        assert found["palpate_phase_seconds_sum", *labels] == pytest.approx(3 * took)
+    assert found["palpate_queue_seconds_sum", session] == pytest.approx(1.5e-3)
+    counted = {"contact": 1, "out_of_range": 2, "unconverged": 1, "clamped": 1, "fallback": 1}
+    for flag, number in counted.items():
+        assert found["palpate_flags_total", ("flag", flag), session] == number
+    for outcome, number in (("answered", 3), ("superseded", 6), ("refused", 1)):
+        assert found["palpate_frames_total", ("outcome", outcome)] == number
 
 
 HOLD = """
 import sys, pathlib
+from online.frames import Flag
 from online.metrics import Metrics
 metrics = Metrics(pathlib.Path(sys.argv[1]))
-metrics.sessions.add(3)
-metrics.sessions_opened.add(3)
+for _ in range(3):
+    metrics.count_session(True)
 print(metrics.worker, flush=True)
 sys.stdin.read()
 """
@@ -97,10 +119,11 @@ def test_a_new_worker_counts_on_where_a_killed_one_was(tmp_path):
     first.wait()
     third = Metrics(table)
     assert third.worker == a
-    assert third.sessions.value == 0
-    assert third.sessions_opened.value == 3
-    assert third.starts.value == 2
+    assert third.restarted
     text = third.text()
+    assert f'palpate_sessions{{worker="{a}"}} 0.0' in text
+    assert f'palpate_sessions_opened_total{{worker="{a}"}} 3.0' in text
+    assert f'palpate_worker_starts_total{{worker="{a}"}} 2.0' in text
     assert f'palpate_sessions{{worker="{b}"}} 3.0' in text
     assert f'palpate_worker_pid{{worker="{b}"}} {float(second.pid)}' in text
     second.communicate(timeout=10)
