@@ -8,6 +8,7 @@ import http.client
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 from typing import Any, ParamSpec, Self, TypeVar
 from urllib.parse import quote, urlsplit
@@ -190,9 +191,9 @@ class Client:
             von_mises=fields.get("von_mises"),
         )
 
-    def session(self, name: str) -> Session:
-        """Open a session of a scene, on a connection of its own."""
-        return Session(self._url, name, self._token, self._timeout)
+    def session(self, name: str, record: Path | None = None) -> Session:
+        """Open a session of a scene, on a connection of its own; see `Session`."""
+        return Session(self._url, name, self._token, self._timeout, record)
 
     def _request(self, method: str, path: str, accept: str, body: bytes | None = None) -> bytes:
         self._connection.request(method, path, body, {"Accept": accept, **self._headers})
@@ -249,9 +250,9 @@ class AsyncClient:
         """Press the tissue; see `Client.solve`."""
         return await self._call(self._client.solve, name, position, pressure, **options)
 
-    def session(self, name: str) -> AsyncSession:
+    def session(self, name: str, record: Path | None = None) -> AsyncSession:
         """Make a session of a scene; ``async with`` opens it."""
-        return AsyncSession(self._url, name, self._token, self._timeout)
+        return AsyncSession(self._url, name, self._token, self._timeout, record)
 
     async def _call(self, method: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         async with self._turn:

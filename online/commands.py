@@ -227,3 +227,28 @@ def loadtest(out: Path | None, as_json: bool, **plan: Any) -> None:
         from online.loadtest.picture import draw
 
         draw(outcome, out)
+
+
+@click.command()
+@click.argument("recording", type=click.Path(dir_okay=False, path_type=Path))
+@click.argument("artifact", type=click.Path(dir_okay=False, path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def replay(recording: Path, artifact: Path, as_json: bool) -> None:
+    """Answer a recorded session anew and compare, bit for bit.
+
+    RECORDING is what a client of a session wrote (`record=` of online.client); ARTIFACT the one
+    that was served. The exit code is 1 if any reply differs. The same answers to the bit need the
+    same kind of processor and the same versions of the libraries.
+    """
+    from online.recording import read_recording
+    from online.replay import replay
+    from shared.atlas import Atlas
+
+    report = replay(read_recording(recording), Atlas.load(artifact))._asdict()
+    if as_json:
+        click.echo(json.dumps(report))
+    else:
+        for name, value in report.items():
+            click.echo(f"{name:<18}{'-' if value is None else value}")
+    if report["different"]:
+        raise click.exceptions.Exit(1)

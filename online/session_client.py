@@ -11,6 +11,7 @@ import socket
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
+from pathlib import Path
 from time import perf_counter
 from types import TracebackType
 from typing import Any, Self
@@ -24,6 +25,7 @@ from websockets.uri import parse_uri
 
 from online import frames
 from online.frames import Reply, Request
+from online.recording import Recorder
 from shared.errors import PalpateError
 
 
@@ -64,7 +66,48 @@ class SessionClosed(PalpateError):
         self.reason = reason
 
 
-class Session:
+class _Dialogue:
+    """What both kinds of session do alike: numbers, frames, recording."""
+
+    hello: dict[str, Any]
+
+    def __init__(self, record: Path | None) -> None:
+        self._seq = 0
+        self._record = record
+        self._recorder: Recorder | None = None
+
+    def _begin(self, message: str | bytes) -> None:
+        self.hello = json.loads(message)
+        if self._record is not None:
+            self._recorder = Recorder(self._record, self.hello)
+
+    def _ask(
+        self, position: Sequence[float], outputs: int, client_time: float | None
+    ) -> tuple[int, bytes]:
+        """Make the next frame: its number and its bytes."""
+        self._seq = (self._seq + 1) % 2**32
+        x, y, z = position
+        now = perf_counter() if client_time is None else client_time
+        request = Request(self._seq, now, (x, y, z), outputs)
+        if self._recorder is not None:
+            self._recorder.sent(request)
+        return self._seq, frames.encode_request(request)
+
+    def _understand(self, message: str | bytes) -> Reply:
+        """Make a reply of a message of the service, or raise its complaint."""
+        if isinstance(message, str):
+            raise ServiceError(0, json.loads(message)["error"])
+        if self._recorder is not None:
+            self._recorder.received(message, perf_counter())
+        return frames.decode_reply(message)
+
+    def _end(self) -> None:
+        if self._recorder is not None:
+            self._recorder.close()
+            self._recorder = None
+
+
+class Session(_Dialogue):
     """An open session.
 
     Parameters
@@ -75,7 +118,9 @@ class Session:
     token : str, optional
         What the service asks for, if it does.
     timeout : float, s
-        Longest wait for a reply.
+        Longest wait for a reply. A session that could not send in this time is of no more use.
+    record : Path, optional
+        File to record the session to, for `palpate replay`; overwritten.
 
     Attributes
     ----------
@@ -95,18 +140,22 @@ class Session:
     """
 
     def __init__(
-        self, url: str, scene: str, token: str | None = None, timeout: float = 10.0
+        self,
+        url: str,
+        scene: str,
+        token: str | None = None,
+        timeout: float = 10.0,
+        record: Path | None = None,
     ) -> None:
-        parts = urlsplit(url)
-        self.timeout = timeout
-        self._seq = 0
+        super().__init__(record)
+        address, parts = _address(url, scene), urlsplit(url)
         self._received: deque[str | bytes] = deque()
-        self._protocol = ClientProtocol(parse_uri(_address(url, scene)), max_size=None)
+        self._protocol = ClientProtocol(parse_uri(address), max_size=None)
         self._socket = socket.create_connection((parts.hostname, parts.port or 80), timeout)
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._shake_hands(token)
-            self.hello: dict[str, Any] = json.loads(self._message())
+            self._begin(self._message())
         except BaseException:
             self._socket.close()
             raise
@@ -133,6 +182,7 @@ class Session:
             with suppress(OSError):  # it may have ended already
                 self._flush()
         self._socket.close()
+        self._end()
 
     def send(
         self, position: Sequence[float], outputs: int = 0, client_time: float | None = None
@@ -147,8 +197,8 @@ class Session:
         client_time : float, s, optional
             Echoed; now, by default.
         """
-        seq = self._seq = (self._seq + 1) % 2**32
-        self.send_bytes(_frame(seq, position, outputs, client_time))
+        seq, frame = self._ask(position, outputs, client_time)
+        self.send_bytes(frame)
         return seq
 
     def send_bytes(self, frame: bytes) -> None:
@@ -171,7 +221,7 @@ class Session:
             If the session has ended.
         TimeoutError
         """
-        return _read(self._message())
+        return self._understand(self._message())
 
     def poll(self) -> Reply | None:
         """Return a reply if there is one; raise what `receive` raises."""
@@ -232,16 +282,19 @@ class Session:
                 self._socket.sendall(data)
 
 
-class AsyncSession:
+class AsyncSession(_Dialogue):
     """A session for asyncio; opened by ``async with``. For parameters and errors see `Session`."""
 
-    hello: dict[str, Any]
-
     def __init__(
-        self, url: str, scene: str, token: str | None = None, timeout: float = 10.0
+        self,
+        url: str,
+        scene: str,
+        token: str | None = None,
+        timeout: float = 10.0,
+        record: Path | None = None,
     ) -> None:
-        self._seq = 0
-        self.timeout = timeout
+        super().__init__(record)
+        self._timeout = timeout
         self._connecting = connect(
             _address(url, scene),
             additional_headers={} if token is None else {"Authorization": f"Bearer {token}"},
@@ -258,7 +311,7 @@ class AsyncSession:
             self._connection: ClientConnection = await self._connecting
         except InvalidStatus as error:
             raise _refusal(error) from None
-        self.hello = json.loads(await self._message())
+        self._begin(await self._message())
         return self
 
     async def __aexit__(
@@ -268,21 +321,22 @@ class AsyncSession:
         trace: TracebackType | None,
     ) -> None:
         await self._connection.close()
+        self._end()
 
     async def send(
         self, position: Sequence[float], outputs: int = 0, client_time: float | None = None
     ) -> int:
         """Send a position; see `Session.send`."""
-        seq = self._seq = (self._seq + 1) % 2**32
+        seq, frame = self._ask(position, outputs, client_time)
         try:
-            await self._connection.send(_frame(seq, position, outputs, client_time))
+            await self._connection.send(frame)
         except ConnectionClosed as error:
             raise _ending(error) from None
         return seq
 
     async def receive(self) -> Reply:
         """Wait for a reply; see `Session.receive`."""
-        return _read(await self._message())
+        return self._understand(await self._message())
 
     async def step(self, position: Sequence[float], outputs: int = 0) -> Reply:
         """Send a position and wait for its reply; older ones are dropped."""
@@ -293,7 +347,7 @@ class AsyncSession:
 
     async def _message(self) -> str | bytes:
         try:
-            async with asyncio.timeout(self.timeout):
+            async with asyncio.timeout(self._timeout):
                 return await self._connection.recv()
         except ConnectionClosed as error:
             raise _ending(error) from None
@@ -304,19 +358,6 @@ def _address(url: str, scene: str) -> str:
     if parts.scheme != "http" or parts.hostname is None:
         raise PalpateError(f"{url}: not an address like http://127.0.0.1:8000")
     return f"ws://{parts.netloc}/scenes/{quote(scene, safe='')}/session"
-
-
-def _frame(seq: int, position: Sequence[float], outputs: int, client_time: float | None) -> bytes:
-    x, y, z = position
-    now = perf_counter() if client_time is None else client_time
-    return frames.encode_request(Request(seq, now, (x, y, z), outputs))
-
-
-def _read(message: str | bytes) -> Reply:
-    """Make a reply of a message of the service, or raise its complaint."""
-    if isinstance(message, str):
-        raise ServiceError(0, json.loads(message)["error"])
-    return frames.decode_reply(message)
 
 
 def _refusal(error: Exception) -> PalpateError:

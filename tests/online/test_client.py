@@ -1,7 +1,11 @@
+import asyncio
+import select
+
 import numpy as np
 import pytest
 
-from online.client import Client, ServiceError
+from online.client import AsyncClient, Client, ServiceError
+from online.session_client import SessionClosed
 from shared.errors import PalpateError
 
 from .fake_atlas import FakeAtlas
@@ -43,3 +47,55 @@ def test_refusals_are_raised(url):
 def test_other_addresses_are_refused(url):
     with pytest.raises(PalpateError, match="not an address"):
         Client(url)
+
+
+def test_the_asyncio_client_answers_alike(url):
+    async def run():
+        async with AsyncClient(url) as client:
+            mesh = await client.mesh("toy")
+            solved = await client.solve("toy", (5, 5, 5), 4.0, region="surface")
+            async with client.session("toy") as session:
+                reply = await session.step((5.0, 5.0, 6.5))
+                hello = session.hello
+            return await client.scenes(), await client.scene("toy"), mesh, solved, reply, hello
+
+    scenes, scene, mesh, solved, reply, hello = asyncio.run(run())
+    with Client(url) as client, client.session("toy") as session:
+        assert client.scenes() == scenes
+        assert client.scene("toy") == scene
+        np.testing.assert_array_equal(client.mesh("toy").nodes, mesh.nodes)
+        expected = client.solve("toy", (5, 5, 5), 4.0, region="surface")
+        np.testing.assert_array_equal(solved.displacement, expected.displacement)
+        np.testing.assert_array_equal(session.step((5.0, 5.0, 6.5)).force, reply.force)
+        assert session.hello["layout"] == hello["layout"]
+
+
+def test_the_asyncio_client_raises_alike(url):
+    async def run():
+        async with AsyncClient(url) as client:
+            with pytest.raises(ServiceError, match="greater than or equal"):
+                await client.solve("toy", (5, 5, 5), -4.0)
+            with pytest.raises(ServiceError, match="No such scene") as refused:
+                async with client.session("other"):
+                    pass
+            async with client.session("toy") as session:
+                await session.send((float("nan"), 0.0, 0.0))
+                with pytest.raises(ServiceError, match="three numbers"):
+                    await session.receive()
+                await session._connection.send(bytes(10**5))
+                with pytest.raises(SessionClosed) as closed:
+                    await session.receive()
+            return refused.value.status, closed.value.code
+
+    assert asyncio.run(run()) == (404, 1009)
+
+
+def test_poll_does_not_wait(url):
+    with Client(url) as client, client.session("toy") as session:
+        assert session.poll() is None
+        seq = session.send((5.0, 5.0, 6.5))
+        select.select([session], [], [])
+        while (reply := session.poll()) is None:
+            pass
+        assert reply.seq == seq
+        assert session.poll() is None

@@ -1,0 +1,154 @@
+import asyncio
+import json
+
+import h5py
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from online import commands
+from online.client import AsyncClient, Client
+from online.follower import Follower
+from online.frames import REPLY_FIELDS, Flag, Output, Request, encode_reply
+from online.recording import ASKED, Recorder, RecordingError, read_recording
+from online.replay import replay
+from shared.atlas import Atlas
+
+from .fake_atlas import FakeAtlas
+
+
+@pytest.fixture
+def stiff():
+    """Return a toy that needs many strides, so that the number of steps matters."""
+    atlas = FakeAtlas()
+    atlas.stride = 0.3
+    return atlas
+
+
+@pytest.fixture
+def recorded(serving, stiff, tmp_path, rng):
+    """Return the recording of a wild session, and its replies."""
+    path = tmp_path / "session.h5"
+    positions = rng.uniform([0, 0, 4.5], [10, 10, 8], (100, 3))
+    with (
+        serving(toy=stiff) as url,
+        Client(url) as client,
+        client.session("toy", record=path) as session,
+    ):
+        replies = [
+            session.step(position, Output.STRESS if i % 3 == 0 else 0)
+            for i, position in enumerate(positions)
+        ]
+        for i in range(50):  # without waiting, so that some are superseded
+            session.send((5.0, 5.0, 7.0 - 0.01 * i))
+        while replies[-1].seq != 150:
+            replies.append(session.receive())
+    return path, replies
+
+
+def test_a_recording_holds_what_was_asked_and_answered(recorded):
+    path, replies = recorded
+    recording = read_recording(path)
+    assert recording.scene == "toy"
+    assert [request.seq for request in recording.requests] == [reply.seq for reply in replies]
+    assert len(replies) < 150
+    np.testing.assert_array_equal(recording.requests[-1].position, (5.0, 5.0, 7.0 - 0.49))
+    np.testing.assert_array_equal(recording.replies["force"], [reply.force for reply in replies])
+    assert (np.diff(recording.received) > 0).all()
+    with h5py.File(path) as file:
+        for field in (*ASKED, *REPLY_FIELDS):
+            assert file[field.name].attrs["units"] == field.unit
+            assert file[field.name].attrs["description"]
+
+
+def test_a_replay_gives_the_same_answers(recorded, stiff):
+    path, replies = recorded
+    flags = {reply.flags & (Flag.CLAMPED | Flag.FALLBACK) for reply in replies}
+    assert len(flags) > 1
+    report = replay(read_recording(path), stiff)
+    assert report == (len(replies), 0, None, 0.0)
+
+
+def test_a_replay_tells_what_differs(recorded, stiff):
+    path, _ = recorded
+    recording = read_recording(path)
+    stiff.stiffness *= 1.0 + 1e-15 * 8
+    report = replay(recording, stiff)
+    assert report.different > 0
+    assert 0 < report.force_difference < 1e-12
+    touching = np.flatnonzero(recording.replies["flags"] & Flag.CONTACT)
+    assert report.first_different == touching[0]
+
+
+def test_long_sessions_are_written_piece_by_piece(serving, tmp_path, monkeypatch):
+    monkeypatch.setattr("online.recording.CHUNK", 10)
+    path = tmp_path / "session.h5"
+    with (
+        serving(toy=FakeAtlas()) as url,
+        Client(url) as client,
+        client.session("toy", record=path) as session,
+    ):
+        for i in range(25):
+            session.step((5.0, 5.0, 7.0 - 0.01 * i))
+    assert [request.seq for request in read_recording(path).requests] == list(range(1, 26))
+
+
+def test_asyncio_sessions_are_recorded_too(url, tmp_path):
+    path = tmp_path / "session.h5"
+
+    async def run():
+        async with AsyncClient(url) as client, client.session("toy", record=path) as session:
+            return await session.step((5.0, 5.0, 6.5))
+
+    reply = asyncio.run(run())
+    np.testing.assert_array_equal(read_recording(path).replies["force"], [reply.force])
+
+
+def test_numbers_may_start_again(tmp_path):
+    follower = Follower(FakeAtlas())
+    with Recorder(tmp_path / "session.h5", {"scene": "toy"}) as recorder:
+        requests = [
+            Request(seq % 2**32, 0.0, (5.0, 5.0, 6.5)) for seq in range(2**32 - 2, 2**32 + 2)
+        ]
+        for request in requests:
+            recorder.sent(request)
+        last = requests[-1]
+        step = follower.follow(last.position, 0.0)
+        recorder.received(encode_reply(last, step, superseded=3), 1.0)
+        assert not recorder._requests
+    assert read_recording(tmp_path / "session.h5").requests == [last]
+
+
+def test_other_files_are_refused(tmp_path):
+    text, foreign, newer = (tmp_path / name for name in ("text", "foreign", "newer"))
+    text.write_text("no HDF5")
+    with h5py.File(foreign, "w") as file:
+        file["x"] = [1.0]
+    with h5py.File(newer, "w") as file:
+        file.attrs["format"], file.attrs["format_version"] = "palpate-session", 9
+    for path, reason in (
+        (tmp_path / "missing", "cannot be read"),
+        (text, "cannot be read"),
+        (foreign, "not a recording"),
+        (newer, "version 9"),
+    ):
+        with pytest.raises(RecordingError, match=reason):
+            read_recording(path)
+
+
+def test_a_recording_of_another_scene_is_refused(recorded):
+    path, _ = recorded
+    with pytest.raises(RecordingError, match="of scene 'toy', the artifact of 'other'"):
+        replay(read_recording(path), FakeAtlas("other"))
+
+
+def test_the_command_tells_and_its_exit_code_too(recorded, stiff, monkeypatch):
+    path, replies = recorded
+    monkeypatch.setattr(Atlas, "load", lambda path: stiff)
+    result = CliRunner().invoke(commands.replay, [str(path), "toy.h5", "--json"])
+    assert result.exit_code == 0
+    assert json.loads(result.output)["replies"] == len(replies)
+    stiff.stiffness *= 2
+    result = CliRunner().invoke(commands.replay, [str(path), "toy.h5"])
+    assert result.exit_code == 1
+    assert "different" in result.output
