@@ -97,7 +97,7 @@ _option = partial(click.option, show_default=True, show_envvar=True)
 @_option(
     "--echo/--no-echo",
     default=False,
-    help="Answer /echo, which palpate latency compares sessions with.",
+    help="Answer /echo, for palpate latency --session.",
 )
 @_option("--log-format", type=click.Choice(FORMATS), default=Settings.log_format)
 @_option("--log-level", type=click.Choice(LEVELS), default=Settings.log_level)

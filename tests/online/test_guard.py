@@ -1,9 +1,12 @@
+import http.client
 import json
+from urllib.parse import urlsplit
 
 import pytest
 
 from online import guard
 from online.guard import RateLimit
+from online.session_client import ServiceError, Session
 from online.settings import Settings, is_loopback
 from shared.errors import PalpateError
 
@@ -163,3 +166,45 @@ def test_loopback_is_told_from_the_rest(host, loopback):
 def test_a_host_without_address_is_named():
     with pytest.raises(PalpateError, match=r"no-such-host\.invalid"):
         is_loopback("no-such-host.invalid")
+
+
+def test_sessions_ask_for_the_token_too(serving, tmp_path):
+    with serving(Settings(tmp_path, token="secret"), toy=FakeAtlas()) as url:
+        for wrong in (None, "secre"):
+            with pytest.raises(ServiceError) as refused:
+                Session(url, "toy", token=wrong)
+            assert (refused.value.status, refused.value.code) == (401, "unauthorized")
+        with Session(url, "toy", token="secret") as session:
+            assert session.step((5.0, 5.0, 6.5)).good
+
+
+def handshake(url, origin):
+    """Try to open a session from a page of `origin`; return the status."""
+    address = urlsplit(url).netloc
+    connection = http.client.HTTPConnection(address, timeout=10)
+    headers = {
+        "Origin": origin,
+        "Connection": "upgrade",
+        "Upgrade": "websocket",
+        "Sec-WebSocket-Version": "13",
+        "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
+    }
+    connection.request("GET", "/scenes/toy/session", headers=headers)
+    status = connection.getresponse().status
+    connection.close()
+    return status
+
+
+def test_pages_of_other_sites_get_no_session(serving, tmp_path):
+    page = "https://trainer.example"
+    with serving(Settings(tmp_path, origins=(page,)), toy=FakeAtlas()) as url:
+        assert handshake(url, "https://evil.example") == 403
+        assert handshake(url, page) == 101
+        assert handshake(url, url) == 101
+
+
+def test_opening_sessions_has_a_rate(serving, tmp_path):
+    with serving(Settings(tmp_path, rate_limit=3), toy=FakeAtlas()) as url:
+        statuses = [handshake(url, url) for _ in range(10)]
+    assert statuses[:3] == [101, 101, 101]
+    assert 429 in statuses[3:]

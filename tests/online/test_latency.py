@@ -4,7 +4,11 @@ import pytest
 from click.testing import CliRunner
 
 from online.commands import latency
-from online.latency import measure
+from online.latency import measure, measure_session
+from online.settings import Settings
+from shared.errors import PalpateError
+
+from .fake_atlas import FakeAtlas
 
 
 def test_what_the_service_adds_is_told_apart_from_the_solve(url):
@@ -18,3 +22,15 @@ def test_what_the_service_adds_is_told_apart_from_the_solve(url):
 def test_the_command_prints_json(url):
     result = CliRunner().invoke(latency, [url, "toy", "--rounds", "5", "--json"])
     assert json.loads(result.output)["empty_us"] > 0
+
+
+def test_what_a_session_adds_is_told_apart_from_the_solve(serving, tmp_path):
+    with serving(Settings(tmp_path, echo=True), toy=FakeAtlas()) as url:
+        report = measure_session(url, "toy", rounds=50)
+    assert report["step_added_us"] < report["step_us"]
+    assert report["step_ratio"] == pytest.approx(report["step_added_us"] / report["echo_us"])
+
+
+def test_without_an_echo_a_session_cannot_be_measured(url):
+    with pytest.raises(PalpateError, match="palpate serve --echo"):
+        measure_session(url, "toy", rounds=1)
