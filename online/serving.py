@@ -70,6 +70,8 @@ def serve(settings: Settings, host: str, port: int, public: bool) -> None:
     with tempfile.TemporaryDirectory(prefix="palpate-") as directory:
         config = _config(settings, host, port)
         bound = config.bind_socket()
+        # From here on clients wait for a worker that is ready rather than being turned away.
+        bound.listen(config.backlog)
         url = f"http://{f'[{host}]' if ':' in host else host}:{bound.getsockname()[1]}"
         table = None
         if settings.workers > 1:

@@ -144,7 +144,7 @@ def test_a_killed_worker_is_replaced_while_the_others_sessions_go_on(serve, arti
 
 
 def test_a_service_under_too_much_load_sheds_it_and_recovers(serve, artifact):
-    with serve(artifact.parent, "--rate-limit", "100") as server:
+    with serve(artifact.parent, "--rate-limit", "20") as server:
         plan = Plan(
             server.url, "quick", sessions=2, rate=300.0, queries=80.0, duration=2.0, overload=10.0
         )
