@@ -160,6 +160,13 @@ def latency(url: str, scene: str, rounds: int, session: bool, as_json: bool) -> 
     help="Frames per second of each session.",
 )
 @click.option(
+    "--output",
+    "outputs",
+    multiple=True,
+    type=click.Choice(["coordinates", "displacement", "von_mises", "stress", "half"]),
+    help="What frames ask for beyond force and tangent; may be repeated.",
+)
+@click.option(
     "--queries-per-second",
     "queries",
     type=click.FloatRange(0, 100_000),
@@ -204,7 +211,7 @@ def latency(url: str, scene: str, rounds: int, session: bool, as_json: bool) -> 
     help="PNG of latency over time and of its distribution.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def loadtest(out: Path | None, as_json: bool, **plan: Any) -> None:
+def loadtest(outputs: tuple[str, ...], out: Path | None, as_json: bool, **plan: Any) -> None:
     r"""Put a load on the service at URL and time it from when each message was due.
 
     Sessions move a tip over the whole accessible surface of SCENE at up to 50 mm/s, in and out of
@@ -218,10 +225,11 @@ def loadtest(out: Path | None, as_json: bool, **plan: Any) -> None:
       palpate loadtest http://127.0.0.1:8000 --sessions 0 --queries-per-second 200 --region none
       palpate loadtest http://127.0.0.1:8000 --sessions 4 --overload 10 --out overload.png
     """
+    from online.frames import Output
     from online.loadtest.report import table
     from online.loadtest.run import Plan, run
 
-    outcome = run(Plan(**plan))
+    outcome = run(Plan(**plan, outputs=sum(Output[name.upper()] for name in outputs)))
     click.echo(json.dumps(outcome.summary) if as_json else table(outcome.summary))
     if out is not None:
         from online.loadtest.picture import draw

@@ -13,6 +13,7 @@ import tempfile
 from functools import partial
 from pathlib import Path
 from time import perf_counter
+from typing import TYPE_CHECKING
 
 import click
 import uvicorn
@@ -24,9 +25,11 @@ from online import logs, realtime
 from online.guard import RECEIVED
 from online.metrics import Metrics, make_table
 from online.settings import Settings, is_loopback
-from online.store import Store
 from online.websocket import OPTIONS
 from shared.errors import PalpateError
+
+if TYPE_CHECKING:
+    from online.store import Store
 
 logger = logging.getLogger(__name__)
 
@@ -111,7 +114,7 @@ def _work(settings: Settings, url: str, table: Path | None) -> FastAPI:
     logging.getLogger("uvicorn.error").setLevel(logging.WARNING)
     metrics = Metrics(table)
 
-    def greet(store: Store) -> None:
+    def greet(store: "Store") -> None:
         if settings.realtime:
             logger.info(realtime.enter())
         logger.info("worker %d is ready", metrics.worker)
@@ -121,7 +124,7 @@ def _work(settings: Settings, url: str, table: Path | None) -> FastAPI:
     return create_app(settings, on_ready=greet, metrics=metrics)
 
 
-def _invite(store: Store, url: str) -> None:
+def _invite(store: "Store", url: str) -> None:
     """Print what is served and a request to try."""
     for refused in store.refused:
         click.echo(f"Refused {refused.reason}")

@@ -65,6 +65,8 @@ def test_the_command_prints_json_and_draws(url, tmp_path):
 
 
 def test_the_command_prints_a_table(url):
-    arguments = [url, "toy", "--sessions", "0", "--queries-per-second", "50", "--duration", "0.5"]
-    result = CliRunner().invoke(loadtest, arguments)
+    arguments = [url, "toy", "--rate", "50", "--queries-per-second", "50", "--duration", "0.5"]
+    outputs = ["--output", "displacement", "--output", "half"]
+    result = CliRunner().invoke(loadtest, [*arguments, *outputs])
+    assert "| frames, all windows | 25 | 0 | 0 |" in result.output
     assert "| queries, all windows | 25 | 0 | 0 |" in result.output
