@@ -176,11 +176,11 @@ class LocalTrainer:
     @property
     def narrow_compliance(self) -> Array:
         """``V L^-T`` (r, m): Cholesky factor L of the last tangent in the narrow space V."""
-        L = np.tril(self.state.memory.factor[0])
+        L = np.tril(self.state.scratch.factor)
         V = np.zeros((self.patches.gradients.shape[1], len(L)))
         V[:LEADING, :LEADING] = np.eye(LEADING)
         V[:, LEADING:] = self.state.scratch.vectors.T
-        return np.linalg.solve(L, V.T).T
+        return np.asarray(np.linalg.solve(L, V.T).T)
 
     @property
     def beyond_linear(self) -> Array:

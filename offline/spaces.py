@@ -107,6 +107,14 @@ def ritz_vectors(model: FullModel, loads: Array) -> Array:
     return np.hstack([first, second / 2, third / 6])
 
 
+def path_vectors(model: FullModel, load: Array) -> Array:
+    """First three derivatives (free dofs, 3) of the equilibrium along the path of a load (mN)."""
+    first = model.solve_linear(load[:, None])[:, 0]
+    second = model.solve_linear(-_even_part(model, first, SECOND_STEP)[:, None])[:, 0]
+    third = model.solve_linear(-_odd_part(model, first, second, THIRD_STEP)[:, None])[:, 0]
+    return np.stack([first, second, third], axis=1)
+
+
 def _solve(A: Array, B: Array) -> Array:
     return np.asarray(np.linalg.solve(A, B), dtype=float)
 

@@ -39,8 +39,8 @@ class Comparison:
     pressure, limit : float, kPa
     load, tilt : float
         Fractions of the limits.
-    missed, cubature : float
-        Residual missed and cubature error, see ``shared.atlas.Solution``.
+    departure, cubature : float
+        Departure from the linear response and cubature error, see ``shared.atlas.Solution``.
     features : ndarray
         Of the error estimate.
     displacement, von_mises : float
@@ -60,7 +60,7 @@ class Comparison:
     limit: float
     load: float
     tilt: float
-    missed: float
+    departure: float
     cubature: float
     displacement: float
     von_mises: float
@@ -170,7 +170,7 @@ def compare(workshop: Workshop, atlas: Atlas, load: Load, reference: Array) -> C
         limit=solution.pressure_limit,
         load=load.pressure / solution.pressure_limit,
         tilt=solution.tilt / atlas.scene.endoscope.max_tilt,
-        missed=solution.missed,
+        departure=solution.departure,
         cubature=solution.cubature,
         displacement=relative(displacement, reference),
         von_mises=relative(stress[kept], exact[kept]),

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from offline.choose import TrialResult
 from offline.full_model import Equilibrium, FullModel, NoEquilibrium
+from offline.load_path import LoadPath, pressure_that_moves
 from offline.mesh import Mesh, build_mesh, local_thickness
 from offline.norms import relative
 from offline.patches import (
@@ -154,31 +155,16 @@ class Workshop:
         thickness = local_thickness(self.mesh, position[None], normal[None])[0]
         wanted = self.scene.load.max_indentation * thickness
         pressure = wanted / np.linalg.norm((linear @ normal).reshape(-1, 3), axis=1).max()
-        start, exponent, last, low, high = None, 1.0, None, 0.0, np.inf
-        below = None  # the state at the pressure ``low``
-        while high > 1.03 * low:
-            try:
-                # no load steps: where a jump fails, the pressure between is asked for anyway
-                force = -pressure * nodal[:, None] * normal
-                state = self.model.solve(force, start, smallest_step=1.0)
-            except NoEquilibrium:
-                high = pressure
-                pressure, start = (low + high) / 2, below
-                continue
-            moved = np.linalg.norm(state.displacement, axis=1).max()
-            if moved < 1.02 * wanted:
-                low, below = pressure, state.displacement
-            if moved > 0.98 * wanted:
-                high = pressure
-            # displacement as a power of pressure, through the last two points
-            if last is not None:
-                exponent = np.log(moved / last[1]) / np.log(pressure / last[0])
-            last = pressure, moved
-            factor = np.clip((wanted / moved) ** (1 / np.clip(exponent, 0.4, 1.5)), 0.3, 2.5)
-            pressure, start = factor * pressure, wanted / moved * state.displacement
-            if not low < pressure < high:
-                pressure = (low + high) / 2
-        return np.array([low, *np.diag(C), C[0, 1], C[0, 2], C[1, 2]])
+        path = LoadPath(self.model, -unit @ normal)
+        # no load steps in the full model: where a jump fails, the pressure between is asked for
+        near = pressure_that_moves(path.solve, wanted, pressure)
+
+        def full(pressure: float, start: Array | None) -> Array:
+            force = -pressure * nodal[:, None] * normal
+            return self.model.solve(force, start, smallest_step=1.0).displacement
+
+        limit, _, _ = pressure_that_moves(full, wanted, *near)
+        return np.array([limit, *np.diag(C), C[0, 1], C[0, 2], C[1, 2]])
 
     def region(self, footprints: list[Footprint], modes: int) -> RegionResult:
         """Basis of a region and the Ritz vectors of footprints in it."""

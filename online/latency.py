@@ -172,6 +172,7 @@ class _WebSocket(_Connection):
         status = head.decode("latin-1").splitlines()[0]
         if " 101 " not in status:
             hint = " (start it with: palpate serve --echo)" if path == ECHO else ""
+            self._socket.close()
             raise PalpateError(f"{path}: the service refused: {status}{hint}")
 
     def receive(self) -> bytes:

@@ -1,15 +1,16 @@
 """Sessions: a tool moves, the tissue answers; the newest position counts.
 
-A session is two tasks that share a mailbox for one message. The first reads whatever comes into it,
-so that a newer frame takes the place of an older one that was not answered yet. The second answers
-what it finds there; it solves on the event loop, since handing a solve to a thread and back takes
-longer than the solve. A client that does not read holds up its own answers only, and is cut off
-after `PATIENCE`; one that sends more than `MOST_FRAMES` is read no faster than that.
+Frames that came while another one was solved are read together, and all but the newest are dropped
+and counted. Solves run on the event loop, since handing one to a thread and back takes longer than
+the solve. A client that does not read its replies holds up itself alone, and is cut off after
+`PATIENCE`; one that sends more than `MOST_FRAMES` is read no faster than that.
 """
 
 import asyncio
 import logging
 import math
+from collections.abc import Callable
+from contextlib import suppress
 from time import perf_counter
 from typing import Any
 
@@ -25,7 +26,7 @@ from online.metrics import Metrics
 from online.schemas import parse_session_request
 from online.settings import Settings
 from online.store import Model, Store
-from online.websocket import LINGER, STOPPING
+from online.websocket import LINGER, PENDING, READ_AT, STOPPING
 from shared.atlas import Atlas
 from shared.touch import Touch
 
@@ -42,6 +43,9 @@ BURST = 0.01
 
 PATIENCE = 5.0
 """Seconds a client may leave a reply unread."""
+
+SPARE = 4
+"""Sessions that can be opened at no cost to those under way."""
 
 GOING_AWAY, FAILED, IDLE, WRONG_VERSION = 1001, 1011, 4000, 4001
 """Codes that a session is closed with."""
@@ -75,11 +79,15 @@ class Sessions:
             )
         self._open += 1
         self._metrics.count_session(opened=True)
+        follower = model.followers.pop() if model.followers else Follower(model.atlas)
         try:
-            await Session(model, self._settings, self._metrics, receive, send).run()
+            session = Session(model, follower, self._settings, self._metrics, scope, receive, send)
+            await session.run()
         finally:
             self._open -= 1
             self._metrics.count_session(opened=False)
+            follower.restart()
+            model.followers.append(follower)
 
 
 class Session:
@@ -88,14 +96,23 @@ class Session:
     Parameters
     ----------
     model : Model
+    follower : Follower
+        Fresh or restarted.
     settings : Settings
     metrics : Metrics
-    receive, send : callable
-        As ASGI gives them.
+    scope, receive, send
+        As ASGI gives them; of `online.websocket.Protocol`.
     """
 
     def __init__(
-        self, model: Model, settings: Settings, metrics: Metrics, receive: Receive, send: Send
+        self,
+        model: Model,
+        follower: Follower,
+        settings: Settings,
+        metrics: Metrics,
+        scope: Scope,
+        receive: Receive,
+        send: Send,
     ) -> None:
         self._model = model
         self._atlas = model.atlas
@@ -103,62 +120,59 @@ class Session:
         self._metrics = metrics
         self._receive = receive
         self._send = send
-        self._follower = Follower(model.atlas)
-        self._news = asyncio.Event()
-        self._message: Message | None = None
+        self._pending: Callable[[], bool] = scope["extensions"][PENDING]
+        self._read_at: Callable[[], float] = scope["extensions"][READ_AT]
+        self._follower = follower
         self._received = perf_counter()
         self._superseded = 0
         self._sending_since = math.inf
+        self._full_at = 0.0
         self._farewell: tuple[int, str] | None = None
-        self._over = False
 
     async def run(self) -> None:
         """Welcome the client and answer it until it goes or is told to."""
         await self._receive()
         await self._send({"type": "websocket.accept"})
-        reading = asyncio.create_task(self._read())
         watching = asyncio.create_task(self._watch())
         try:
-            async with asyncio.timeout(None) as self._patience:
-                await self._deliver({"type": "websocket.send", "text": self._hello()})
-                await self._answer()
-                if self._farewell is not None:
-                    code, reason = self._farewell
-                    await self._deliver({"type": "websocket.close", "code": code, "reason": reason})
+            with suppress(TimeoutError):
+                async with asyncio.timeout(None) as self._interruption:
+                    await self._deliver({"type": "websocket.send", "text": self._hello()})
+                    await self._converse()
+            if self._farewell is not None:
+                code, reason = self._farewell
+                async with asyncio.timeout(LINGER):
+                    await self._send({"type": "websocket.close", "code": code, "reason": reason})
         except TimeoutError:
-            logger.warning("a session was cut off: its client left replies unread")
+            pass  # it does not listen; its connection is cut when this returns
         finally:
-            reading.cancel()
             watching.cancel()
 
-    async def _read(self) -> None:
-        """Keep the newest message in the mailbox."""
-        full_at = 0.0
-        try:
-            while (message := await self._receive())["type"] == "websocket.receive":
-                now = perf_counter()
-                if self._message is not None:
-                    self._superseded += 1
-                self._message = message
-                self._received = now
-                self._news.set()
-                full_at = max(full_at, now) + 1.0 / MOST_FRAMES
-                if full_at - now > BURST:
-                    await asyncio.sleep(full_at - now - BURST)
-            if message.get("code") == STOPPING:
-                self._farewell = GOING_AWAY, "the service is stopping"
-        finally:
-            self._over = True
-            self._news.set()
-
-    async def _answer(self) -> None:
+    async def _converse(self) -> None:
         """Answer the newest message, again and again."""
-        while not self._over or self._message is not None:
-            await self._news.wait()
-            self._news.clear()
-            message, self._message = self._message, None
-            if message is not None:
-                await self._deliver(self._reply(message))
+        while self._farewell is None:
+            message = newest = await self._receive()
+            while message["type"] == "websocket.receive":
+                await self._note()
+                newest = message
+                if not self._pending():
+                    break
+                message = await self._receive()
+                self._superseded += message["type"] == "websocket.receive"
+            if newest["type"] == "websocket.receive":
+                await self._deliver(self._reply(newest))
+            if message["type"] != "websocket.receive":
+                if message["code"] == STOPPING:
+                    self._farewell = GOING_AWAY, "the service is stopping"
+                return
+
+    async def _note(self) -> None:
+        """Note that a message has come; wait if there are too many."""
+        now = perf_counter()
+        self._received = self._read_at()
+        self._full_at = max(self._full_at, now) + 1.0 / MOST_FRAMES
+        if self._full_at - now > BURST:
+            await asyncio.sleep(self._full_at - now - BURST)
 
     async def _deliver(self, message: Message) -> None:
         """Send a message; wait until the client has taken most of those before it."""
@@ -167,20 +181,18 @@ class Session:
         self._sending_since = math.inf
 
     async def _watch(self) -> None:
-        """End a session whose client is silent, or does not listen."""
+        """Interrupt a session whose client is silent, or does not listen."""
         idle = self._settings.session_idle
         while True:
             await asyncio.sleep(min(0.25, 0.25 * idle))
             now = perf_counter()
-            if now - self._sending_since > (LINGER if self._over else PATIENCE):
-                self._patience.reschedule(asyncio.get_running_loop().time())
-            elif now - self._received > idle:
-                self._end(IDLE, f"no frame for {idle:g} s")
-
-    def _end(self, code: int, reason: str) -> None:
-        self._farewell = code, reason
-        self._over = True
-        self._news.set()
+            if now - self._sending_since > PATIENCE:
+                logger.warning("a session is cut off: its client leaves replies unread")
+                break
+            if now - self._received > idle:
+                self._farewell = IDLE, f"no frame for {idle:g} s"
+                break
+        self._interruption.reschedule(asyncio.get_running_loop().time())
 
     def _reply(self, message: Message) -> Message:
         """Answer a message or say what is wrong with it."""
@@ -190,7 +202,7 @@ class Session:
                 return {"type": "websocket.send", "bytes": self._answer_frame(frame)}
             return {"type": "websocket.send", "text": self._answer_text(message["text"])}
         except VersionError as error:
-            self._end(WRONG_VERSION, str(error))
+            self._farewell = WRONG_VERSION, str(error)
             return self._complain("unknown_version", error.field, error.message)
         except FrameError as error:
             return self._complain("invalid_frame", error.field, error.message)
@@ -198,7 +210,7 @@ class Session:
             return self._complain(refusal.code, refusal.field, refusal.message, refusal.allowed)
         except Exception:
             logger.exception("a session failed")
-            self._end(FAILED, "the service failed; its log says why")
+            self._farewell = FAILED, "the service failed; its log says why"
             return self._complain("internal", "", "The service failed; its log says why")
 
     def _answer_frame(self, frame: bytes) -> bytes:
@@ -267,12 +279,16 @@ class Session:
 
 
 def warm(model: Model, metrics: Metrics) -> None:
-    """Call all that a session calls once, so that no client pays for a first time."""
+    """Call all that a session calls once, and keep what the first sessions need at hand."""
     x, y, z = model.tip
     request = Request(0, 0.0, (x, y, z), sum(Output))
-    step = Follower(model.atlas).follow(request.position, BUDGET)
-    frames.encode_reply(request, step, recover(model.atlas, step.touch, request.outputs))
-    metrics.count_frame(0.0, (0.0, 0.0, 0.0, 0.0, 0.0), step.flags, 0)
+    for _ in range(SPARE):
+        follower = Follower(model.atlas)
+        step = follower.follow(request.position, BUDGET)
+        frames.encode_reply(request, step, recover(model.atlas, step.touch, request.outputs))
+        metrics.count_frame(0.0, (0.0, 0.0, 0.0, 0.0, 0.0), step.flags, 0)
+        follower.restart()
+        model.followers.append(follower)
 
 
 def recover(atlas: Atlas, touch: Touch, outputs: int) -> Extras:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from online.errors import Refusal
+from online.follower import Follower
 from shared.atlas import Atlas
 from shared.errors import PalpateError
 
@@ -27,12 +28,15 @@ class Model:
         A position of the tip's centre at which it presses a little.
     meshes : dict from (region, media type) to bytes
         The mesh documents asked for so far.
+    followers : list of Follower
+        Spare ones for sessions to come: a new one takes longer than many a solve.
     """
 
     atlas: Atlas
     example: dict[str, Any]
     tip: list[float]
     meshes: dict[tuple[str, str], bytes] = field(default_factory=dict)
+    followers: list[Follower] = field(default_factory=list)
 
 
 @dataclass(frozen=True)

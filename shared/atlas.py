@@ -20,6 +20,7 @@ from shared.errors import QueryError
 from shared.quadrature import stress_recovery, surface_quadrature, volume_quadrature
 from shared.reduced import (
     CUBATURE,
+    DEPARTURE,
     DISTANCE,
     ERROR_DISPLACEMENT,
     ERROR_FEATURES,
@@ -30,7 +31,6 @@ from shared.reduced import (
     LEADING,
     LIMIT,
     MAX_ACTIVE,
-    MISSED,
     NARROW,
     SCALARS,
     SMALLEST_J,
@@ -259,8 +259,8 @@ class State:
             patch=np.full(MAX_ACTIVE, -1, np.int64),
             wide=np.zeros((MAX_ACTIVE, r)),
             guess=np.zeros((MAX_ACTIVE, r)),
-            factor=np.zeros((MAX_ACTIVE, NARROW, NARROW)),
-            factorised=np.zeros(MAX_ACTIVE, np.int64),
+            secants=np.zeros((MAX_ACTIVE, r, r)),
+            origin=np.zeros((MAX_ACTIVE, 2, r)),
         )
         self.scratch = Scratch(
             gradients=np.zeros((NARROW, entries), np.float32),
@@ -274,7 +274,9 @@ class State:
             vectors=np.zeros((NARROW - LEADING, r)),
             stepped=np.zeros((NARROW - LEADING, r), np.float32),
             tangent=np.zeros((NARROW, NARROW)),
+            factor=np.zeros((NARROW, NARROW)),
             newton=np.zeros((4, NARROW)),
+            wide_newton=np.zeros((4, r)),
             q=np.zeros(NARROW),
             guess=np.zeros(NARROW, np.float32),
             load=np.zeros(NARROW),
@@ -282,6 +284,9 @@ class State:
             unit_loads=np.zeros(3 * r, np.float32),
             wide_load=np.zeros(r),
             residual=np.zeros(r),
+            start=np.zeros(r),
+            stepped_state=np.zeros(r, np.float32),
+            latest=np.zeros(r),
             features=np.zeros(FEATURES),
             nodal=np.zeros(int(np.diff(patches.node_from).max())),
             distance=np.zeros(patches.centres.shape[1]),
@@ -326,8 +331,8 @@ class Solution(NamedTuple):
         Unit direction of the load.
     tilt : float, degrees
         Of the direction from the inward normal.
-    missed : float
-        Residual left in the wide space before it is added to the narrow one, relative to the load.
+    departure : float
+        Of the answer from the linear response, relative to that, in the energy norm.
     cubature : float
         Cubature error of the patches that answer.
     pressure, radius : float
@@ -360,7 +365,7 @@ class Solution(NamedTuple):
     distance: float
     direction: Array
     tilt: float
-    missed: float
+    departure: float
     cubature: float
     pressure: float
     radius: float
@@ -441,8 +446,9 @@ class Atlas:
         )
         self._terms = bind(terms)
         self.surface_nodes, self.surface_triangles = boundary_triangles(body.faces)
-        self._recovery = stress_recovery(body.nodes, body.elements, body.mu, body.lam)
-        self._full = np.zeros((len(body.nodes), 3))
+        self._recovery = stress_recovery(
+            body.nodes, body.elements, body.mu, body.lam, precision=np.float32
+        )
         self._stress = np.zeros(len(body.nodes))
         self._state = self.new_state()
 
@@ -566,7 +572,7 @@ class Atlas:
             towards = _INWARD
         else:
             towards = _vector("direction", direction)
-            if not towards.any():
+            if not any(towards.tolist()):
                 raise QueryError("direction", "must not be the zero vector")
         if state is None:
             state = self._state
@@ -607,7 +613,7 @@ class Atlas:
             distance=distance,
             direction=record[_DIRECTION],
             tilt=tilt,
-            missed=scalars[MISSED],
+            departure=scalars[DEPARTURE],
             cubature=scalars[CUBATURE],
             pressure=pressure,
             radius=radius,
@@ -744,8 +750,7 @@ class Atlas:
         """Nodal von Mises stress (k,) kPa; ``displacement`` of all nodes saves its recovery."""
         if displacement is None:
             displacement = self.displacement(solution, "all")
-        self._full[:] = displacement
-        nodal_von_mises(self._recovery, self._full, self._stress)
+        nodal_von_mises(self._recovery, displacement, self._stress)
         stress = self._stress if region == "all" else self._stress[self.surface_nodes]
         # an answer that did not converge may be beyond single precision
         with np.errstate(over="ignore"):

@@ -13,8 +13,8 @@ from shared.stress import StressRecovery
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
-LOAD_QUADRATURE = 8
-"""Gauss points per face edge under a footprint: the load must be smooth in the contact point."""
+LOAD_SPACING = 0.4
+"""Millimetres of a face's edge to a Gauss point: the load must be smooth in the contact point."""
 
 
 def volume_quadrature(nodes: Array, elements: Ints, points: int) -> tuple[Array, Array]:
@@ -42,25 +42,36 @@ def volume_quadrature(nodes: Array, elements: Ints, points: int) -> tuple[Array,
 
 
 def surface_quadrature(
-    nodes: Array, faces: Ints, points: int = LOAD_QUADRATURE
+    nodes: Array, faces: Ints, spacing: float = LOAD_SPACING
 ) -> SurfaceQuadrature:
-    """Integration points of boundary faces, ``points``^2 a face; their nodes are mesh nodes."""
-    at, w = gauss(points, 2)
-    N, dN = shape(quadrilateral(faces.shape[1]), at)
+    """Gauss points of boundary faces, one to each ``spacing`` mm of an edge, feeding mesh nodes."""
     X = nodes[faces]
-    tangents = np.einsum("fai,qaj->fqij", X, dN)
-    normals = np.cross(tangents[..., 0], tangents[..., 1])
-    areas = np.linalg.norm(normals, axis=-1)
-    return SurfaceQuadrature(
-        points=np.einsum("qa,fai->fqi", N, X).reshape(-1, 3),
-        normals=(normals / areas[..., None]).reshape(-1, 3),
-        areas=(areas * w).reshape(-1),
-        nodes=np.repeat(faces, len(at), axis=0).astype(np.int32),
-        shape=np.tile(N, (len(faces), 1)),
-    )
+    edges = np.linalg.norm(X[:, [1, 2, 3, 0]] - X[:, :4], axis=2)
+    counts = np.ceil(np.maximum(edges[:, :2], edges[:, 2:]) / spacing).astype(int)
+    parts = []
+    for along, across in np.unique(counts, axis=0):
+        own = np.flatnonzero((counts == (along, across)).all(axis=1))
+        (x, wx), (y, wy) = gauss(along, 1), gauss(across, 1)
+        at = np.column_stack([np.repeat(x[:, 0], across), np.tile(y[:, 0], along)])
+        N, dN = shape(quadrilateral(faces.shape[1]), at)
+        tangents = np.einsum("fai,qaj->fqij", X[own], dN)
+        normals = np.cross(tangents[..., 0], tangents[..., 1])
+        areas = np.linalg.norm(normals, axis=-1)
+        parts.append(
+            (
+                np.einsum("qa,fai->fqi", N, X[own]).reshape(-1, 3),
+                (normals / areas[..., None]).reshape(-1, 3),
+                (areas * np.outer(wx, wy).ravel()).reshape(-1),
+                np.repeat(faces[own], len(at), axis=0).astype(np.int32),
+                np.tile(N, (len(own), 1)),
+            )
+        )
+    return SurfaceQuadrature(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
-def stress_recovery(nodes: Array, elements: Ints, mu: Array, lam: Array) -> StressRecovery:
+def stress_recovery(
+    nodes: Array, elements: Ints, mu: Array, lam: Array, precision: type = np.float64
+) -> StressRecovery:
     """Recovery of nodal stresses from 2x2x2 points per element; mu, lam (e,) kPa."""
     gradients, _ = volume_quadrature(nodes, elements, 2)
     at, _ = gauss(2, 3)
@@ -74,7 +85,7 @@ def stress_recovery(nodes: Array, elements: Ints, mu: Array, lam: Array) -> Stre
         midsides = midsides[np.unique(midsides[:, 0], return_index=True)[1]]
     return StressRecovery(
         connectivity=np.ascontiguousarray(elements, dtype=np.int32),
-        gradients=np.ascontiguousarray(np.moveaxis(gradients, 1, 3)),
+        gradients=np.ascontiguousarray(np.moveaxis(gradients, 1, 3), dtype=precision),
         extrapolation=np.linalg.inv(to_points).astype(np.float64),
         mu=np.ascontiguousarray(mu),
         lam=np.ascontiguousarray(lam),

@@ -24,8 +24,11 @@ energy is ``q . q / 2``, since the modes are orthonormal in it.  Only what ``W``
 
 that is small where the load is small, and lives near the contact, where the points are.  With all
 points and their own weights, and all modes, this is the Galerkin model; tissue law, load footprint
-and Newton's method are those of the full model.  The norm of the residual in the wide space,
-relative to the load's, measures what the narrow space misses.
+and Newton's method are those of the full model.
+
+A *warm* query, whose patch answered the last one too, is *followed* in the wide space itself: the
+rest stiffness there is the identity, and each residual shows a direction of the tangent, so a few
+secants (BFGS) make up for a tangent that is never formed.
 
 Between patch centres the answers of the nearest patches are blended, so that the answer is a
 continuous function of the contact point.  No array of mesh size is touched to solve a query.
@@ -59,6 +62,9 @@ TOLERANCE = 3e-4
 """Residual at equilibrium relative to the load in the wide space: in the energy norm of the rest
 state both are displacements, so this is the solver's share of the error."""
 
+FOLLOWED = 2e-3
+"""The same of a warm answer; a cold one misses as much in the wide space (median 4e-3)."""
+
 LOOSE = 0.15
 """The same before the space is enriched: near enough for the residual to show what is missing."""
 
@@ -66,6 +72,12 @@ REUSE = 0.15
 """A tangent costs about three residuals here, so a factorised one serves while it contracts."""
 
 MAX_ITERATIONS = 30
+
+MAX_SECANTS = 10
+"""Iterations after which a warm query is solved as a cold one."""
+
+LEAST_CURVATURE = 1e-2
+"""Cosine between a step and the change of force it causes, below which it is not a secant."""
 
 MISSED_MOST = 0.03
 """Residual in the wide space, relative to the load, that asks for one more mode."""
@@ -276,15 +288,46 @@ class LocalSystem(NamedTuple):
     factor: Array  # (m, m) lower Cholesky factor
 
 
-def _is_local_system(system: object) -> bool:
+class WideSystem(NamedTuple):
+    """A patch under a load in all its wide modes, with scratch memory and what it has learnt."""
+
+    gradients: NDArray[np.int16]  # (r, 9 c) in tiles
+    steps: Field  # (r,) 1/mm, of the gradients
+    weights: Array  # (c,) mm^3
+    mu: Array  # (c,) kPa
+    lam: Array  # (c,) kPa
+    load: Array  # (r,)
+    H: Field  # (9 c,) in tiles
+    P: Field  # (9 c,) in tiles
+    J: Array  # (c,)
+    trace: Array  # (c,)
+    linear: Array  # (c,)
+    stepped: Field  # (r,) state times steps
+    secants: Array  # (r, r) inverse tangent, from the secants met so far
+    origin: Array  # (2, r) state and internal force that the next secant starts from
+    latest: Array  # (r,) state of the last evaluation
+    change: Array  # (r,)
+
+
+def _is(kind: type[NamedTuple], system: object) -> bool:
+    """Whether ``system`` is a named tuple of this kind to the compiler, bound or not."""
     if isinstance(system, types.StructRef):  # bound
-        return tuple(system.field_dict) == LocalSystem._fields
-    return isinstance(system, types.NamedTuple) and system.instance_class is LocalSystem
+        return tuple(system.field_dict) == kind._fields
+    return isinstance(system, types.NamedTuple) and system.instance_class is kind
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _added_energy(weights, mu, lam, J, trace, linear):
+    """Energy that the tissue law adds to linear elasticity's, after ``nonlinear_stress``."""
+    energy = 0.0
+    for c in range(len(weights)):
+        energy += weights[c] * (tissue.energy(J[c], trace[c], mu[c], lam[c]) - linear[c])
+    return energy
 
 
 @overload(equilibrium.potential, jit_options={"error_model": "numpy"})
 def _potential(system, u, residual):
-    if not _is_local_system(system):
+    if not _is(LocalSystem, system):
         return None
 
     def potential(system, u, residual):
@@ -295,9 +338,7 @@ def _potential(system, u, residual):
         smallest = J.min()
         if not smallest > 0.0:
             return tissue.INVERTED, smallest
-        energy = 0.0
-        for c in range(len(weights)):
-            energy += weights[c] * (tissue.energy(J[c], trace[c], mu[c], lam[c]) - linear[c])
+        energy = _added_energy(weights, mu, lam, J, trace, linear)
         project(system.gradients, system.P, residual)
         for i in range(len(u)):
             residual[i] += u[i] - system.load[i]
@@ -309,7 +350,7 @@ def _potential(system, u, residual):
 
 @overload(equilibrium.factorise, jit_options={"error_model": "numpy"})
 def _factorise(system, u, shift):
-    if not _is_local_system(system):
+    if not _is(LocalSystem, system):
         return None
 
     def factorise(system, u, shift):
@@ -326,7 +367,7 @@ def _factorise(system, u, shift):
 
 @overload(equilibrium.correct, jit_options={"error_model": "numpy"})
 def _correct(system, residual, step):
-    if not _is_local_system(system):
+    if not _is(LocalSystem, system):
         return None
 
     def correct(system, residual, step):
@@ -365,6 +406,85 @@ def _cholesky(K, shift, L):
             return False
         L[i, i] = math.sqrt(pivot)
     return True
+
+
+@overload(equilibrium.potential, jit_options={"error_model": "numpy"})
+def _wide_potential(system, u, residual):
+    if not _is(WideSystem, system):
+        return None
+
+    def potential(system, u, residual):
+        steps, stepped = system.steps, system.stepped
+        for i in range(len(u)):
+            stepped[i] = u[i] * steps[i]
+        superpose(system.gradients, stepped, system.H)
+        J, trace, linear = system.J, system.trace, system.linear
+        weights, mu, lam = system.weights, system.mu, system.lam
+        nonlinear_stress(system.H, weights, mu, lam, J, trace, linear, system.P)
+        smallest = J.min()
+        if not smallest > 0.0:
+            return tissue.INVERTED, smallest
+        energy = _added_energy(weights, mu, lam, J, trace, linear)
+        project(system.gradients, system.P, residual)
+        for i in range(len(u)):
+            system.latest[i] = u[i]
+            residual[i] = residual[i] * steps[i] + u[i] - system.load[i]
+            energy += (0.5 * u[i] - system.load[i]) * u[i]
+        return energy, smallest
+
+    return potential
+
+
+@overload(equilibrium.factorise, jit_options={"error_model": "numpy"})
+def _wide_factorise(system, u, shift):
+    if not _is(WideSystem, system):
+        return None
+    # the secants are always those of the last steps
+    return lambda system, u, shift: True
+
+
+@overload(equilibrium.correct, jit_options={"error_model": "numpy"})
+def _wide_correct(system, residual, step):
+    if not _is(WideSystem, system):
+        return None
+
+    def correct(system, residual, step):
+        _learn(system.secants, system.origin, system.latest, residual, system.load, system.change)
+        for i in range(len(step)):
+            step[i] = -np.dot(system.secants[i], residual)
+
+    return correct
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def _learn(inverse, origin, state, residual, load, product):
+    """Update the inverse tangent with the secant to a new state (BFGS), which is the next origin.
+
+    Nocedal & Wright, Numerical Optimization, eq. 6.17.  The origin may stem from another query:
+    internal forces do not know the load.  From an origin of NaN no secant is drawn.
+    """
+    step, change = origin[0], origin[1]
+    curvature = length = force = 0.0
+    for i in range(len(step)):
+        step[i] = state[i] - step[i]
+        change[i] = residual[i] + load[i] - change[i]
+        curvature += step[i] * change[i]
+        length += step[i] * step[i]
+        force += change[i] * change[i]
+    if curvature > LEAST_CURVATURE * math.sqrt(length * force):
+        scale = 1.0 / curvature
+        whole = 0.0
+        for i in range(len(step)):
+            product[i] = np.dot(inverse[i], change)
+            whole += product[i] * change[i]
+        whole = (1.0 + whole * scale) * scale
+        for i in range(len(step)):
+            row, a, b = inverse[i], whole * step[i] - scale * product[i], scale * step[i]
+            for j in range(len(step)):
+                row[j] += a * step[j] - b * product[j]
+    for i in range(len(step)):
+        step[i] = state[i]
+        change[i] = residual[i] + load[i]
 
 
 descend = njit(equilibrium.descend, error_model="numpy", nogil=True, cache=True)
@@ -437,9 +557,9 @@ class Memory(NamedTuple):
 
     patch: Ints  # (MAX_ACTIVE,)
     wide: Array  # (MAX_ACTIVE, r) answer in the wide space
-    guess: Array  # (MAX_ACTIVE, r) first guess it started from
-    factor: Array  # (MAX_ACTIVE, m, m)
-    factorised: Ints  # (MAX_ACTIVE,) whether ``factor`` holds a tangent near the answer
+    guess: Array  # (MAX_ACTIVE, r) its first guess
+    secants: Array  # (MAX_ACTIVE, r, r) inverse tangent, see WideSystem
+    origin: Array  # (MAX_ACTIVE, 2, r)
 
 
 class Scratch(NamedTuple):
@@ -456,7 +576,9 @@ class Scratch(NamedTuple):
     vectors: Array  # (m - LEADING, r) narrow modes beyond the leading ones
     stepped: Field  # (m - LEADING, r) times the steps of the wide gradients
     tangent: Array  # (m, m)
+    factor: Array  # (m, m)
     newton: Array  # (4, m)
+    wide_newton: Array  # (4, r)
     q: Array  # (m,)
     guess: Field  # (m,)
     load: Array  # (m,)
@@ -464,6 +586,9 @@ class Scratch(NamedTuple):
     unit_loads: Field  # (3 r,) of a unit pressure along each axis
     wide_load: Array  # (r,)
     residual: Array  # (r,)
+    start: Array  # (r,)
+    stepped_state: Field  # (r,)
+    latest: Array  # (r,)
     features: Array  # (FEATURES,)
     nodal: Array  # (most nodes of a patch,)
     distance: Array  # (p,)
@@ -491,7 +616,7 @@ ERROR_FEATURES = 11
     ITERATIONS,
     SMALLEST_J,
     AREA,
-    MISSED,
+    DEPARTURE,
     CUBATURE,
     ENERGY,
     DISTANCE,
@@ -618,8 +743,8 @@ def _append(number, steps, scratch):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _narrow_space(patches, k, x, direction, pressure, scratch):
-    """Set up the narrow space of patch k for ``scratch.wide_load``."""
+def _path_modes(patches, k, x, direction, pressure, scratch):
+    """Modes of the narrow space of patch k for ``scratch.wide_load``, but the residual."""
     load = scratch.scaled_load
     for i in range(3):
         load[i] = direction[i] * pressure / patches.pressures[k]
@@ -640,11 +765,8 @@ def _narrow_space(patches, k, x, direction, pressure, scratch):
         feature = np.float32(scratch.features[f])
         for i in range(len(third)):
             third[i] += feature * path[f, i]
-    steps = patches.steps[k]
     for number in range(PATH):
-        _append(number, steps, scratch)
-    _narrow_gradients(patches.gradients[k], steps, scratch.stepped, scratch.gradients)
-    scratch.gradients[NARROW - 1] = 0.0
+        _append(number, patches.steps[k], scratch)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -714,19 +836,85 @@ def _merge(scratch):
 @njit(inline="always")
 def _solve_patch(patches, k, slot, warm, x, direction, pressure, memory, scratch, scalars):
     """Equilibrium of patch k under ``scratch.wide_load``; its answer goes to memory's slot."""
-    _narrow_space(patches, k, x, direction, pressure, scratch)
+    _path_modes(patches, k, x, direction, pressure, scratch)
     _first_guess(patches.guess[k], scratch)
-    q, vectors, work = scratch.q, scratch.vectors, scratch.newton
+    wide, guess, start, load = (
+        memory.wide[slot],
+        memory.guess[slot],
+        scratch.start,
+        scratch.wide_load,
+    )
+    # the last answer differs from its guess much as this one will from its own
+    np.subtract(wide, guess, start)
+    _to_wide(scratch.q, scratch.vectors, guess)
+    start += guess
+    size = max(math.sqrt(np.dot(load, load)), 1e-9)
+    status, iterations, smallest = equilibrium.STALLED, 0, 0.0
     if warm:
-        # the last answer differs from its guess much as this one will from its own
-        departure = scratch.residual
-        np.subtract(memory.wide[slot], memory.guess[slot], departure)
-        _to_wide(q, vectors, memory.guess[slot])
-        q[:LEADING] += departure[:LEADING]
-        for j in range(PATH):
-            q[LEADING + j] += np.dot(vectors[j], departure)
+        secants, origin = memory.secants[slot], memory.origin[slot]
+        status, iterations, smallest = _follow(patches, k, size, secants, origin, scratch)
+    if status == equilibrium.CONVERGED:
+        wide[:] = start
     else:
-        _to_wide(q, vectors, memory.guess[slot])
+        status, more, smallest = _solve_narrow(patches, k, size, wide, scratch)
+        iterations += more
+        _forget_secants(memory.secants[slot], memory.origin[slot])
+    memory.patch[slot] = k if status == equilibrium.CONVERGED else -2 - k
+    length = departure = 0.0
+    for i in range(len(wide)):
+        length += wide[i] ** 2
+        departure += (wide[i] - load[i]) ** 2
+    scalars[STATUS] = max(scalars[STATUS], float(status))
+    scalars[ENERGY] = max(scalars[ENERGY], math.sqrt(length))
+    scalars[DEPARTURE] = max(scalars[DEPARTURE], math.sqrt(departure) / size)
+    scalars[ITERATIONS] = max(scalars[ITERATIONS], float(iterations))
+    scalars[SMALLEST_J] = min(scalars[SMALLEST_J], smallest)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _forget_secants(inverse, origin):
+    """Start anew with the rest stiffness; the next state is the first origin."""
+    origin[:] = np.nan
+    inverse[:] = 0.0
+    for i in range(len(inverse)):
+        inverse[i, i] = 1.0
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _follow(patches, k, size, secants, origin, scratch):
+    """Equilibrium of patch k near ``scratch.start``, in place, in the wide space."""
+    system = WideSystem(
+        patches.gradients[k],
+        patches.steps[k],
+        patches.weights[k],
+        patches.mu[k],
+        patches.lam[k],
+        scratch.wide_load,
+        scratch.H,
+        scratch.P,
+        scratch.J,
+        scratch.trace,
+        scratch.linear,
+        scratch.stepped_state,
+        secants,
+        origin,
+        scratch.latest,
+        scratch.residual,
+    )
+    start, work = scratch.start, scratch.wide_newton
+    energy, smallest = equilibrium.potential(system, start, work[0])
+    status, iterations, energy, smallest = descend(
+        system, start, work, energy, smallest, FOLLOWED * size, np.inf, MAX_SECANTS, True, ROUND_OFF
+    )
+    return status, iterations, smallest
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _solve_narrow(patches, k, size, wide, scratch):
+    """Equilibrium of patch k in its narrow space, from ``scratch.q``; writes it to ``wide``."""
+    _narrow_gradients(patches.gradients[k], patches.steps[k], scratch.stepped, scratch.gradients)
+    scratch.gradients[NARROW - 1] = 0.0
+    q, vectors, work = scratch.q, scratch.vectors, scratch.newton
     system = LocalSystem(
         scratch.gradients,
         patches.weights[k],
@@ -741,47 +929,36 @@ def _solve_patch(patches, k, slot, warm, x, direction, pressure, memory, scratch
         scratch.state,
         scratch.increments,
         scratch.tangent,
-        memory.factor[slot],
+        scratch.factor,
     )
-    size = max(math.sqrt(np.dot(scratch.wide_load, scratch.wide_load)), 1e-9)
     status, iterations, energy, smallest = equilibrium.STALLED, 0, 0.0, 0.0
     for attempt in range(2):
         if attempt == 1:  # once more from rest: a guess can lie beyond a fold of the load path
             q[:] = 0.0
-            memory.factorised[slot] = 0
         energy, smallest = equilibrium.potential(system, q, work[0])
         status, more, energy, smallest = descend(
             system, q, work, energy, smallest, LOOSE * size, REUSE, MAX_ITERATIONS,
-            memory.factorised[slot] == 1, ROUND_OFF,
+            False, ROUND_OFF,
         )  # fmt: skip
         iterations += more
         if status == equilibrium.CONVERGED:
             break
     missed = np.inf
     while status == equilibrium.CONVERGED:
-        again = _enrich(patches, k, memory.wide[slot], scratch) / size
+        again = _enrich(patches, k, wide, scratch) / size
         if again > 0.8 * missed:
             break
         missed = again
-        scalars[MISSED] = max(scalars[MISSED], missed)
-        if iterations > 0:
-            memory.factorised[slot] = 1
         status, more, energy, smallest = descend(
             system, q, work, energy, smallest, TOLERANCE * size, REUSE, MAX_ITERATIONS,
-            memory.factorised[slot] == 1, ROUND_OFF,
+            iterations > 0, ROUND_OFF,
         )  # fmt: skip
         iterations += more
         if missed <= MISSED_MOST:
             break
         _merge(scratch)
-    _to_wide(q, vectors, memory.wide[slot])
-    if iterations > 0:
-        memory.factorised[slot] = 1
-    memory.patch[slot] = k if status == equilibrium.CONVERGED else -2 - k
-    scalars[STATUS] = max(scalars[STATUS], float(status))
-    scalars[ENERGY] = max(scalars[ENERGY], math.sqrt(np.dot(q, q)))
-    scalars[ITERATIONS] = max(scalars[ITERATIONS], float(iterations))
-    scalars[SMALLEST_J] = min(scalars[SMALLEST_J], smallest)
+    _to_wide(q, vectors, wide)
+    return status, iterations, smallest
 
 
 @njit(inline="always")
@@ -802,7 +979,6 @@ def _answer(solver, x, normal, direction, pressure, radius):
         warm = k >= 0
         if not warm:
             k = -2 - k
-            memory.factorised[slot] = 0
         area = _wide_load(patches, k, x, normal, direction, pressure, radius, scratch)
         scalars[AREA] = area
         _solve_patch(patches, k, slot, warm, x, direction, pressure, memory, scratch, scalars)
@@ -856,8 +1032,9 @@ def _estimate(terms, solver, load, tilt, pressure):
     """Force and estimated errors of an answer: ``log error = c . features``.
 
     The features: 1, tilt over the largest, smallest det F, the normal (where on the body), and the
-    logs of the pressure over its limit, of the residual missed, of the patch's cubature error, of
-    the contact's displacement over pressure (mm/kPa) and of the displacement in the energy norm.
+    logs of the pressure over its limit, of the departure from the linear response, of the patch's
+    cubature error, of the contact's displacement over pressure (mm/kPa) and of the displacement in
+    the energy norm.
     """
     outcome, patch = solver.outcome, solver.memory.patch
     scalars, features = outcome.scalars, outcome.features
@@ -873,7 +1050,7 @@ def _estimate(terms, solver, load, tilt, pressure):
     scalars[CUBATURE] = cubature
     features[0], features[1], features[2] = 1.0, tilt, scalars[SMALLEST_J]
     features[3:6] = outcome.normal
-    features[6], features[7] = math.log(max(load, 1e-6)), math.log(max(scalars[MISSED], 1e-6))
+    features[6], features[7] = math.log(max(load, 1e-6)), math.log(max(scalars[DEPARTURE], 1e-6))
     features[8], features[9] = math.log(max(cubature, 1e-6)), math.log(max(compliance, 1e-6))
     features[10] = math.log(max(scalars[ENERGY], 1e-6))
     scalars[ERROR_DISPLACEMENT] = math.exp(np.dot(terms.coefficients[0], features))
@@ -882,15 +1059,26 @@ def _estimate(terms, solver, load, tilt, pressure):
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc"})
 def expand(basis, coefficients, field):
-    """Add ``coefficients @ basis`` to ``field``, in blocks that stay in the first-level cache.
+    """Add ``coefficients @ basis`` to ``field``, eight rows at a time, each read end to end.
 
     basis (M, k) int16; coefficients (M,) and field (k,) float32.
     """
-    block = 2048
-    for start in range(0, len(field), block):
-        stop = min(start + block, len(field))
-        target = field[start:stop]
-        for j in range(0, len(coefficients)):
-            row, c = basis[j, start:stop], coefficients[j]
-            for i in range(len(target)):
-                target[i] += c * np.float32(row[i])
+    eighths = len(coefficients) // 8 * 8
+    for j in range(0, eighths, 8):
+        a, b, c, d = coefficients[j], coefficients[j + 1], coefficients[j + 2], coefficients[j + 3]
+        e, f, g, h = (
+            coefficients[j + 4], coefficients[j + 5], coefficients[j + 6], coefficients[j + 7],
+        )  # fmt: skip
+        p, q, r, s = basis[j], basis[j + 1], basis[j + 2], basis[j + 3]
+        t, u, v, w = basis[j + 4], basis[j + 5], basis[j + 6], basis[j + 7]
+        for i in range(len(field)):
+            field[i] += (
+                a * np.float32(p[i]) + b * np.float32(q[i])
+                + c * np.float32(r[i]) + d * np.float32(s[i])
+                + e * np.float32(t[i]) + f * np.float32(u[i])
+                + g * np.float32(v[i]) + h * np.float32(w[i])
+            )  # fmt: skip
+    for j in range(eighths, len(coefficients)):
+        row, a = basis[j], coefficients[j]
+        for i in range(len(field)):
+            field[i] += a * np.float32(row[i])

@@ -18,7 +18,7 @@ class StressRecovery(NamedTuple):
     """What recovery needs of a mesh: 2x2x2 points per element."""
 
     connectivity: NDArray[np.int32]  # (e, n)
-    gradients: NDArray[np.float64]  # (e, n, 3, 8) 1/mm: point index last, for vector arithmetic
+    gradients: NDArray[np.floating]  # (e, n, 3, 8) 1/mm: point index last, for vector arithmetic
     extrapolation: NDArray[np.float64]  # (8, 8) corner from point
     mu: NDArray[np.float64]  # (e,) kPa
     lam: NDArray[np.float64]  # (e,) kPa
@@ -30,30 +30,31 @@ class StressRecovery(NamedTuple):
 def nodal_von_mises(mesh, u, out):
     """Write the von Mises stress (nodes,) kPa of the displacement ``u`` (nodes, 3) mm to ``out``.
 
+    Displacement gradients are summed in the precision of ``mesh.gradients``, which ``u`` shares.
     Never negative: extrapolation may undershoot near steep gradients, which is cut at zero.
     """
     connectivity = mesh.connectivity
     nodes = connectivity.shape[1]
     flat = mesh.gradients.reshape(len(connectivity), nodes * 24)
-    F, at_points = np.empty(72), np.empty(8)
+    H, at_points = np.empty(72, flat.dtype), np.empty(8)
     extrapolation = mesh.extrapolation
     out[:] = 0.0
     for e in range(len(connectivity)):
-        F[:] = 0.0
+        H[:] = 0.0
         for a in range(nodes):
             node = connectivity[e, a]
             x, y, z = u[node, 0], u[node, 1], u[node, 2]
             gradients = flat[e, 24 * a : 24 * a + 24]
             for k in range(24):
-                F[k] += x * gradients[k]
-                F[24 + k] += y * gradients[k]
-                F[48 + k] += z * gradients[k]
+                H[k] += x * gradients[k]
+                H[24 + k] += y * gradients[k]
+                H[48 + k] += z * gradients[k]
         mu, lam = mesh.mu[e], mesh.lam[e]
         for q in range(8):
             at_points[q] = tissue.von_mises(
-                1.0 + F[q], F[8 + q], F[16 + q],
-                F[24 + q], 1.0 + F[32 + q], F[40 + q],
-                F[48 + q], F[56 + q], 1.0 + F[64 + q],
+                1.0 + H[q], H[8 + q], H[16 + q],
+                H[24 + q], 1.0 + H[32 + q], H[40 + q],
+                H[48 + q], H[56 + q], 1.0 + H[64 + q],
                 mu, lam,
             )  # fmt: skip
         for corner in range(8):

@@ -390,7 +390,7 @@ def _details(solution: Solution) -> dict[str, Any]:
         "distance": solution.distance,
         "tilt": solution.tilt,
         "iterations": solution.iterations,
-        "missed": solution.missed,
+        "departure": solution.departure,
         "cubature": solution.cubature,
         "min_jacobian": solution.min_jacobian,
         "estimated_displacement": solution.error_displacement,

@@ -7,7 +7,7 @@ from offline.mesh import build_mesh
 from offline.scenes import find_scene
 from offline.surface_mesh import accessible_surface
 from shared.endoscope import footprint
-from shared.quadrature import LOAD_QUADRATURE, surface_quadrature
+from shared.quadrature import LOAD_SPACING, surface_quadrature
 
 STEP = 0.05  # mm
 RADIUS = 2.0  # mm
@@ -19,10 +19,10 @@ def turbinate():
     return mesh, accessible_surface(mesh)
 
 
-def loads(turbinate, path, points=LOAD_QUADRATURE):
+def loads(turbinate, path, spacing=LOAD_SPACING):
     """Nodal weights (steps, nodes) along a path of positions."""
     mesh, surface = turbinate
-    quadrature = surface_quadrature(mesh.nodes, mesh.faces, points)
+    quadrature = surface_quadrature(mesh.nodes, mesh.faces, spacing)
     nodal = np.empty((len(path), len(mesh.nodes)))
     for row, position in zip(nodal, path, strict=True):
         x, normal, _ = surface.project(position)
@@ -58,6 +58,6 @@ def test_no_jump_and_no_kink(turbinate, path):
 @pytest.mark.parametrize("path", PATHS.values(), ids=PATHS)
 def test_quadrature_is_fine_enough(turbinate, path):
     coarse = loads(turbinate, path[::7])
-    fine = loads(turbinate, path[::7], points=24)
+    fine = loads(turbinate, path[::7], spacing=0.1)
     error = np.linalg.norm(coarse - fine, axis=1) / np.linalg.norm(fine, axis=1)
     assert error.max() < 0.01

@@ -15,6 +15,16 @@ from shared.touch import Touch
 QUICK = Path(__file__).parents[2] / "offline" / "scenes" / "quick.toml"
 
 
+class Memory:
+    """Where the tip was."""
+
+    def __init__(self) -> None:
+        self.last: np.ndarray | None = None
+
+    def forget(self) -> None:
+        self.last = None
+
+
 class FakeAtlas:
     """A block of 10 x 10 x 5 mm, clamped below, pressed from above.
 
@@ -83,7 +93,7 @@ class FakeAtlas:
             distance=distance,
             direction=push,
             tilt=float(np.degrees(np.arccos(-push @ normal))),
-            missed=0.0,
+            departure=0.0,
             cubature=0.0,
             pressure=pressure,
             radius=radius,
@@ -102,8 +112,8 @@ class FakeAtlas:
             solve_seconds=time.perf_counter() - start,
         )
 
-    def new_state(self) -> dict[str, Any]:
-        return {"last": None}
+    def new_state(self) -> "Memory":
+        return Memory()
 
     def touch(self, position: Any, state: Any = None) -> Touch:
         start = time.perf_counter()
@@ -113,11 +123,11 @@ class FakeAtlas:
         depth = float(5.0 + radius - position[2])
         if depth > radius:
             raise QueryError("position", "the tip's centre lies below the surface")
-        last = state["last"]
+        last = state.last
         leap = last is not None and float(np.linalg.norm(position - last)) > self.stride
         converged = depth <= self.deepest and not leap
         if converged:
-            state["last"] = position
+            state.last = position
         contact = depth > 0.0
         force = np.array([0.0, 0.0, self.stiffness * max(depth, 0.0)])
         tangent = np.diag([0.0, 0.0, -self.stiffness * contact])

@@ -24,7 +24,7 @@ def reply_at(*position):
 def test_near_a_reply_the_force_is_that_of_the_tissue():
     """The toy is linear, so that the linearisation is exact."""
     reply = reply_at(5.0, 5.0, SURFACE - 0.5)
-    there = np.array([5.05, 5.0, SURFACE - 0.6])
+    there = np.array([5.03, 5.0, SURFACE - 0.55])
     np.testing.assert_allclose(linear_force(reply, there), TOY.touch(there).force)
 
 

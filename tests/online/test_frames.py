@@ -1,4 +1,5 @@
 import struct
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -157,3 +158,8 @@ def test_the_layout_is_told_as_it_is():
         )
     assert f"| {frames.REPLY.fields['force'][1]} | force |" in frames.tables()
     assert layout["flags"]["FALLBACK"] == Flag.FALLBACK
+
+
+def test_the_readme_has_the_layout():
+    readme = Path(__file__).parents[2] / "README.md"
+    assert frames.tables().rstrip() in readme.read_text()

@@ -207,6 +207,16 @@ def test_sessions_do_not_share_their_history(serving):
         assert other.step((1.1, 1.0, 6.4)).good
 
 
+def test_a_session_does_not_inherit_the_history_of_another(serving):
+    """More sessions than are kept at hand, one after the other; each starts anew."""
+    atlas = FakeAtlas()
+    atlas.stride = 0.2
+    with serving(toy=atlas) as url:
+        for i in range(10):
+            with Session(url, "toy") as session:
+                assert session.step((float(i), 1.0, 6.5)).good
+
+
 def test_too_many_sessions_are_refused(serving, tmp_path):
     with serving(Settings(tmp_path, max_sessions=1), toy=FakeAtlas()) as url:
         with Session(url, "toy"):

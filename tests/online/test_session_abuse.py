@@ -7,6 +7,7 @@ import threading
 import time
 from contextlib import ExitStack, contextmanager
 from itertools import repeat
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -119,6 +120,16 @@ def test_bytes_that_are_no_frames_of_a_websocket(url, rng):
                 session._socket.sendall(rng.bytes(rng.integers(1, 500)))
 
 
+def test_handshakes_that_never_end(url):
+    parts = urlsplit(url)
+    with witness(url), ExitStack() as stack:
+        request = b"GET /scenes/toy/session HTTP/1.1\r\nupgrade: websocket\r\n"
+        for length in range(0, len(request), 2):
+            connection = socket.create_connection((parts.hostname, parts.port))
+            stack.enter_context(connection)
+            connection.sendall(request[:length])
+
+
 def test_a_message_too_long_ends_its_session_only(url):
     with witness(url), Session(url, "toy") as session:
         session.send_bytes(bytes(100_000))
@@ -167,7 +178,7 @@ def test_a_client_that_does_not_read_is_cut(serving, tmp_path, monkeypatch, capl
             with pytest.raises(ConnectionError):
                 pour(slow, repeat(frame))
         places_come_free(url).close()
-    assert "left replies unread" in caplog.text
+    assert "leaves replies unread" in caplog.text
 
 
 def test_a_flood_is_answered_or_counted(url):
