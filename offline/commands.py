@@ -207,10 +207,10 @@ def baselines(
     table goes to NAME/report/baselines.csv beside the artifact. A killed run goes on where it
     stopped.
     """
-    from offline.scenes import find_scene
+    from offline.scenes import default_artifact, find_scene
     from offline.studies.baselines import baselines
 
-    path = artifact or Path("artifacts") / f"{find_scene(scene).name}.h5"
+    path = artifact or default_artifact(find_scene(scene))
     _show(baselines(path, snapshots, queries, seed), as_json)
 
 
@@ -231,11 +231,11 @@ def chart(
     NAME/report/chart.csv, .png and .html beside the artifact. Takes half an hour; a killed run
     goes on where it stopped.
     """
-    from offline.scenes import find_scene
+    from offline.scenes import default_artifact, find_scene
     from offline.studies.chart import chart
 
     found = find_scene(scene)
-    path = artifact or Path("artifacts") / f"{found.name}.h5"
+    path = artifact or default_artifact(found)
     _show(chart(found, path, snapshots, queries, seed), as_json)
 
 
@@ -342,10 +342,10 @@ def stability(scene: str, artifact: Path | None, cases: int, seed: int, as_json:
     NAME/report/stability.csv and .png beside the artifact, the artifact's silent errors to
     stability_silent.csv. A killed run goes on where it stopped.
     """
-    from offline.scenes import find_scene
+    from offline.scenes import default_artifact, find_scene
     from offline.studies.stability import stability
 
-    path = artifact or Path("artifacts") / f"{find_scene(scene).name}.h5"
+    path = artifact or default_artifact(find_scene(scene))
     _show(stability(path, cases, seed), as_json)
 
 

@@ -22,7 +22,7 @@ from shared.elements import (
     quadrilateral,
     shape,
 )
-from shared.scene import Block, Extrusion, Patch, Scene, SceneError
+from shared.scene import Block, Extrusion, Patch, Scene, SceneError, divisions_of
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -67,10 +67,10 @@ def build_mesh(scene: Scene) -> Mesh:
     geometry = scene.geometry
     if isinstance(geometry, Extrusion):
         # Along the section, along y, through the section: right-handed in this order.
-        along, through, length = geometry.divisions
+        along, through, length = divisions_of(geometry)
         divisions, body = (along, length, through), _extrusion(scene, geometry)
     else:
-        divisions, body = geometry.divisions, _block(geometry)
+        divisions, body = divisions_of(geometry), _block(geometry)
     reference = HEX20_NODES if geometry.element == "hex20" else HEX_CORNERS
     parameters, elements, faces, sides = _lattice(divisions, reference)
     nodes = body(parameters)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.scene import ElementName, Scene
+from shared.scene import ElementName, Scene, divisions_of
 
 Array = NDArray[np.float64]
 
@@ -31,7 +31,7 @@ def twin(scene: Scene) -> Scene:
 
 
 def _meshed(scene: Scene, element: ElementName, factor: float) -> Scene:
-    divisions = tuple(max(1, round(factor * n)) for n in scene.geometry.divisions)
+    divisions = tuple(max(1, round(factor * n)) for n in divisions_of(scene.geometry))
     geometry = scene.geometry.model_copy(update={"element": element, "divisions": divisions})
     return scene.model_copy(update={"geometry": geometry})
 

@@ -31,6 +31,7 @@ from tqdm import tqdm
 
 from offline.checkpoint import Checkpoint, content_key
 from offline.choose import LADDER, Trial, TrialResult, choose
+from offline.choose_mesh import with_mesh
 from offline.mesh import mesh_quality
 from offline.patches import PatchResult, PatchTask, RegionResult
 from offline.refinement import MOST_DOFS, mesh_error_document
@@ -42,7 +43,7 @@ from offline.sampling import (
     spacing_count,
     spread_points,
 )
-from offline.scenes import find_scene
+from offline.scenes import default_artifact, find_scene
 from offline.spaces import Footprint
 from offline.validate import Comparison, compare, random_loads, summarise
 from offline.workers import Tasks, resume, worker_pool
@@ -54,7 +55,6 @@ from shared.scene import Scene, Size, Tolerance
 
 Array = NDArray[np.float64]
 
-ARTIFACTS = Path("artifacts")
 
 RITZ_SPACING = 0.455
 """Of the footprints whose Ritz vectors are taken, in units of the patch spacing."""
@@ -90,13 +90,13 @@ def train(scene: str | Path, out: Path | None = None, workers: int | None = None
     -------
     path : Path
     """
-    trained = find_scene(scene)
-    path = out or ARTIFACTS / f"{trained.name}.h5"
+    trained, mesh_choice = with_mesh(find_scene(scene))
+    path = out or default_artifact(trained)
     path.parent.mkdir(parents=True, exist_ok=True)
     pool = worker_pool(open_workshop, trained.text, str(trained.folder), count=workers)
     checkpoint = Checkpoint(path.parent / f".{path.stem}.training", content_key(trained))
     with pool:
-        Pipeline(trained, pool, checkpoint).run(path)
+        Pipeline(trained, pool, checkpoint).run(path, mesh_choice)
     checkpoint.remove()
     return path
 
@@ -149,8 +149,8 @@ class Pipeline:
         self.seconds: dict[str, float] = {}
         self.provenance = self._provenance()  # now: sources may change while it runs
 
-    def run(self, path: Path) -> None:
-        """Train and write the artifact."""
+    def run(self, path: Path, mesh_choice: dict[str, Any] | None = None) -> None:
+        """Train and write the artifact; it keeps how its mesh was chosen."""
         # beside the first stage, so that no worker waits for another's compiler
         compiled = self.executor.submit(run, Workshop.compile_query)
         limits = self._load_range()
@@ -171,6 +171,8 @@ class Pipeline:
         documents["training"] |= {"layout": self._describe(layout, models)}
         if choice is not None:
             documents["training"]["choice"] = choice.document
+        if mesh_choice is not None:
+            documents["training"]["mesh_choice"] = mesh_choice
         self._write(path, models, limits, estimator, documents)
         report = path.parent / path.stem / "report"
         report.mkdir(parents=True, exist_ok=True)

@@ -117,8 +117,12 @@ class Workshop:
     def unit_load(self, position: Array) -> tuple[Array, Array]:
         """Nodal weights (n,) mm^2 of a unit pressure at a surface point, and the normal there."""
         x, normal, _ = self.surface.project(position)
+        return self.unit_load_at(x, normal), normal
+
+    def unit_load_at(self, x: Array, normal: Array) -> Array:
+        """The same at a contact point of another mesh, whose accessible surface ends elsewhere."""
         footprint(self.body.boundary, x, normal, self.scene.endoscope.radius, self._nodal)
-        return self._nodal.copy(), normal
+        return self._nodal.copy()
 
     def load_vector(self, load: Load) -> Array:
         """Nodal forces (n, 3) mN."""
@@ -249,13 +253,10 @@ class Workshop:
             Mean displacement under the footprint, mm.
         """
         bodies = (self, *self._others)
-        # at one place on all: the accessible surface of another mesh ends at other faces
         x, normal, _ = self.surface.project(load.position)
-        radius = self.scene.endoscope.radius
         moved = []
         for body in bodies:
-            nodal = np.zeros(len(body.mesh.nodes))
-            footprint(body.body.boundary, x, normal, radius, nodal)
+            nodal = body.unit_load_at(x, normal)
             force = load.pressure * nodal[:, None] * load.direction
             displacement = body.model.solve(force).displacement
             moved.append(np.linalg.norm(nodal @ displacement) / nodal.sum())

@@ -76,7 +76,10 @@ class Extrusion(_Part):
     )
     length: Positive = Field(description="mm, along y")
     element: ElementName
-    divisions: Divisions = Field(description="elements [along the section, through it, along y]")
+    divisions: Divisions | None = Field(
+        None,
+        description="elements [along the section, through it, along y]; chosen if absent",
+    )
     grading: float = Field(
         1.0,
         ge=1,
@@ -96,12 +99,21 @@ class Block(_Part):
     kind: Literal["block"]
     size: tuple[Positive, Positive, Positive] = Field(description="[x, y, z] mm")
     element: ElementName
-    divisions: Divisions = Field(description="elements along [x, y, z]")
+    divisions: Divisions | None = Field(
+        None, description="elements along [x, y, z]; chosen if absent"
+    )
 
     @property
     def sides(self) -> tuple[str, ...]:
         """Names of the sides: low and high end of each axis of the mesh's lattice."""
         return ("left", "right", "front", "back", "bottom", "top")
+
+
+def divisions_of(geometry: Extrusion | Block) -> Divisions:
+    """Divisions of a mesh; raise `SceneError` where they have yet to be chosen."""
+    if geometry.divisions is None:
+        raise SceneError("geometry.divisions: not given; palpate train chooses them")
+    return geometry.divisions
 
 
 class Tissue(_Part):

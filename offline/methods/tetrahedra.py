@@ -21,7 +21,7 @@ from offline.methods.method import Case
 from offline.workshop import Workshop
 from shared.elements import HEX_CORNERS, gauss, hexahedron, quadrilateral, shape
 from shared.errors import PalpateError
-from shared.scene import Extrusion, Scene
+from shared.scene import Extrusion, Scene, divisions_of
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -125,7 +125,7 @@ class Tetrahedra:
 
 def lattice(scene: Scene) -> Divisions:
     """Hexahedra of a scene along the axes of its mesh's lattice (see ``offline.mesh``)."""
-    along, second, third = scene.geometry.divisions
+    along, second, third = divisions_of(scene.geometry)
     return (
         (along, third, second) if isinstance(scene.geometry, Extrusion) else (along, second, third)
     )

@@ -28,3 +28,8 @@ def find_scene(name_or_path: str | Path) -> Scene:
             )
         path = FOLDER / f"{name_or_path}.toml"
     return load_scene(path)
+
+
+def default_artifact(scene: Scene) -> Path:
+    """Where a scene's artifact goes and is looked for."""
+    return Path("artifacts") / f"{scene.name}.h5"

@@ -15,15 +15,14 @@ from offline.methods.method import Answer, Case
 from offline.methods.tetrahedra import Divisions, lattice
 from offline.workshop import Load, Workshop
 from shared.elements import hexahedron, shape
-from shared.endoscope import footprint
-from shared.scene import Scene
+from shared.scene import Scene, divisions_of
 
 Array = NDArray[np.float64]
 
 
 def divided(scene: Scene, factor: float) -> Scene:
     """A scene with the divisions of its mesh times a factor, rounded up."""
-    divisions = tuple(int(np.ceil(factor * n)) for n in scene.geometry.divisions)
+    divisions = tuple(int(np.ceil(factor * n)) for n in divisions_of(scene.geometry))
     geometry = scene.geometry.model_copy(update={"divisions": divisions})
     return scene.model_copy(update={"geometry": geometry})
 
@@ -47,7 +46,7 @@ class Remeshed:
         other = divided(scene, factor)
         self.workshop = Workshop(other)
         self.unknowns = len(self.workshop.model.free)
-        self.label = f"mesh of {' x '.join(map(str, other.geometry.divisions))}"
+        self.label = f"mesh of {' x '.join(map(str, divisions_of(other.geometry)))}"
         own = Workshop(scene)
         self._surface = own.surface
         self._to_scene = interpolation(own, self.workshop)
@@ -66,9 +65,8 @@ class Remeshed:
 
         Its accessible surface ends at other faces: a contact on the rim would be moved by it.
         """
-        body, nodal = self.workshop.body, np.zeros(len(self.workshop.mesh.nodes))
         x, normal, _ = self._surface.project(contact.position)
-        footprint(body.boundary, x, normal, self.workshop.scene.endoscope.radius, nodal)
+        nodal = self.workshop.unit_load_at(x, normal)
         return contact.pressure * nodal[:, None] * contact.direction
 
     def displacement(self, answer: Answer) -> Array:
