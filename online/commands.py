@@ -217,7 +217,8 @@ def loadtest(outputs: tuple[str, ...], out: Path | None, as_json: bool, **plan: 
     Sessions move a tip over the whole accessible surface of SCENE at up to 50 mm/s, in and out of
     contact; queries press random places. A generator that never sleeps sends each message when it
     is due, whatever became of those before. Windows of 0.25 s in which the machine's host took
-    time or the generator was late are not clean; latencies are told with and without them.
+    time or the generator was late are not clean; latencies are told with and without them. For
+    Linux and macOS.
 
     \b
     Examples:

@@ -64,7 +64,7 @@ def serve(settings: Settings, host: str, port: int, public: bool) -> None:
             f"no artifacts (*.h5) in {settings.artifacts}; make one with: "
             f"palpate train turbinate --out {settings.artifacts / 'turbinate.h5'}"
         )
-    if settings.token is None and not public and not is_loopback(host):
+    if not settings.token and not public and not is_loopback(host):
         raise PalpateError(
             f"--host {host or '(any)'} lets other machines in: set PALPATE_TOKEN, or say "
             "--public to serve anybody"

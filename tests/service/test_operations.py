@@ -35,11 +35,11 @@ def workers(url, **headers):
     return found
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "::"])
-def test_other_machines_are_not_let_in_without_a_token(artifact, host):
+@pytest.mark.parametrize("arguments", [("0.0.0.0",), ("::",), ("0.0.0.0", "--token", "")])
+def test_other_machines_are_not_let_in_without_a_token(artifact, arguments):
     environment = {k: v for k, v in os.environ.items() if k != "PALPATE_TOKEN"}
     result = subprocess.run(
-        [*PALPATE, "serve", "--artifacts", artifact.parent, "--host", host],
+        [*PALPATE, "serve", "--artifacts", artifact.parent, "--host", *arguments],
         capture_output=True,
         text=True,
         env=environment,
