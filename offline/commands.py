@@ -138,17 +138,21 @@ def picture(
     show_default=True,
     help="Of the random loads.",
 )
+@click.option("--tip", is_flag=True, help="Push with the rigid tip, not with pressures.")
 @click.option("--csv", type=OUTPUT, metavar="OUT", help="Write one row per query.")
 @json_option
-def validate(artifact: Path, queries: int, seed: int, csv: Path | None, as_json: bool) -> None:
+def validate(
+    artifact: Path, queries: int, seed: int, tip: bool, csv: Path | None, as_json: bool
+) -> None:
     """Compare the artifact F with the full model.
 
-    Both solve new random loads over the artifact's whole range. Errors are relative L2 norms, as
-    fractions.
+    Both solve new random loads, or positions of the tip, over the artifact's whole range. Errors
+    are relative L2 norms, as fractions.
     """
+    from offline.touches import validate_touches
     from offline.validate import validate
 
-    _show(validate(artifact, queries, seed, csv), as_json)
+    _show((validate_touches if tip else validate)(artifact, queries, seed, csv), as_json)
 
 
 @click.command()

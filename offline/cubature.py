@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr_delete, solve_triangular
 
+from shared.reduced import LANES, nonlinear_stress
+
 Array = NDArray[np.float64]
 
 EXACT = 1e-9
@@ -115,3 +117,37 @@ def _append(Q: Array, R: Array, column: Array) -> tuple[Array, Array]:
     grown[:k, k] = r + again
     grown[k, k] = norm
     return np.column_stack([Q, rest / norm]), grown
+
+
+def point_forces(
+    gradients: NDArray[np.float32], weights: Array, mu: Array, lam: Array, state: Array
+) -> NDArray[np.float32] | None:
+    """Nonlinear force of every point (c, r) at a state (r,) of a local model; None if inverted.
+
+    Parameters
+    ----------
+    gradients : ndarray, shape (c, 9, r), 1/mm
+        Of the modes; c is a multiple of ``LANES``.
+    weights : ndarray, shape (c,), mm^3
+    mu, lam : ndarray, shape (c,), kPa
+    state : ndarray, shape (r,)
+    """
+    H = np.dot(gradients, state.astype(np.float32)).reshape(-1, LANES, 9)
+    rows = np.ascontiguousarray(H.transpose(0, 2, 1)).reshape(-1)
+    P, (J, trace, linear) = np.empty_like(rows), np.empty((3, len(gradients)))
+    nonlinear_stress(rows, weights, mu, lam, J, trace, linear, P)
+    if not J.min() > 0.0:
+        return None
+    points = P.reshape(-1, 9, LANES).transpose(0, 2, 1).reshape(-1, 1, 9)
+    return (points @ gradients)[:, 0]
+
+
+def damped_fit(A: Array, B: Array) -> Array:
+    """Least squares ``A X ~ B``, each column of A scaled to one and slightly damped."""
+    scale = np.sqrt(np.mean(A**2, axis=0)) + 1e-300
+    A = A / scale
+    ridge = 1e-4 * np.sqrt(len(A)) * np.eye(A.shape[1])
+    X = np.linalg.lstsq(np.vstack([A, ridge]), np.vstack([B, np.zeros((len(ridge), B.shape[1]))]))[
+        0
+    ]
+    return X / scale[:, None]

@@ -111,7 +111,7 @@ class TipContact:
         force = -self._touching.force[:count].sum(axis=(0, 1))
         return force, self._touching.own, coupling.reshape(len(displacement), 3)
 
-    def _touch(self, displacement: Array, wanted: int) -> tuple[int, float, float]:
+    def _touch(self, displacement: Array, wanted: float) -> tuple[int, float, float]:
         found: tuple[int, float, float] = tip.touch(
             self.tip, self.surface, self._near, self.position, displacement.reshape(-1, 3),
             self._touching, wanted,

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offline.cubature import compress, nonnegative
+from offline.cubature import compress, damped_fit, nonnegative, point_forces
 from offline.sampling import cone, tangents
 from offline.spaces import Footprint, local_modes
+from offline.tips import TipResult, compile_tip_query, train_tip
 from shared import equilibrium
 from shared.atlas import Body, LocalModels, State, assemble_patches
 from shared.bound import bind
-from shared.endoscope import LIMIT_FIELDS, pressure_limit
+from shared.endoscope import LIMIT_FIELDS, TIP_DEPTH, pressure_limit
 from shared.reduced import (
     ERROR_FEATURES,
     FEATURES,
@@ -27,7 +30,6 @@ from shared.reduced import (
     Patches,
     Terms,
     load_features,
-    nonlinear_stress,
     query,
 )
 from shared.scene import Scene, Size
@@ -98,7 +100,7 @@ class PatchTask:
         In and round the patch; it learns from their Ritz vectors.
     contacts, normals : ndarray, shape (c, 3)
         Contact points the patch answers for.
-    ranges : ndarray, shape (c, 7)
+    ranges : ndarray, shape (c, LIMIT_FIELDS)
         Load range there.
     extent, blend : float, mm
     size : Size
@@ -129,6 +131,20 @@ class PatchResult:
     path: NDArray[np.float16]
     guess: NDArray[np.float16]
     error: float
+    tip: TipResult | None = None
+
+    def arrays(self) -> dict[str, Any]:
+        """All by name, those under the tip after ``tip_``."""
+        tip = {} if self.tip is None else vars(self.tip)
+        own = {name: value for name, value in vars(self).items() if name != "tip"}
+        return own | {f"tip_{name}": value for name, value in tip.items()}
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, Any]) -> PatchResult:
+        """Inverse of ``arrays``."""
+        tip = {k.removeprefix("tip_"): v for k, v in arrays.items() if k.startswith("tip_")}
+        own = {k: v for k, v in arrays.items() if not k.startswith("tip_")}
+        return cls(**own, tip=TipResult(**tip) if tip else None)
 
 
 class LocalTrainer:
@@ -207,9 +223,12 @@ def compile_query(scene: Scene, body: Body, surface: Surface) -> None:
         errors=np.zeros(1),
         extent=1.0,
         blend=1.0,
+        tips=None,
     )
     trainer = LocalTrainer(scene, body, surface, models)
     trainer.solve(surface.vertices[0], surface.normals[0], 0.0)
+    if scene.endoscope.tip:
+        compile_tip_query(body, surface, models)
 
 
 def train_patch(
@@ -254,7 +273,13 @@ def train_patch(
     reduced = local_trainer(scene, body, surface, region, task, result)
     guess = _fit_guess(reduced, scene, task, frame, rng)
     error = _cubature_error(galerkin, reduced, scene, task, rng)
-    return replace(result, guess=guess.astype(np.float16), error=error)
+    tip = None
+    if scene.endoscope.tip:
+        tip = train_tip(
+            body, surface, weights, reduced.models, region.orthonormal,
+            task.contacts, task.normals, task.ranges[:, TIP_DEPTH], rng,
+        )  # fmt: skip
+    return replace(result, guess=guess.astype(np.float16), error=error, tip=tip)
 
 
 def local_trainer(
@@ -286,6 +311,7 @@ def local_trainer(
             errors=np.zeros(1),
             extent=task.extent,
             blend=task.blend,
+            tips=None,
         ),
     )
 
@@ -306,21 +332,10 @@ def _fit_path(ritz: Array, task: PatchTask, frame: Array) -> Array:
     A = np.array(rows)
     return np.vstack(
         [
-            _fit(A[:, :SECOND_FEATURES], np.vstack(second)),
-            _fit(A[:, SECOND_FEATURES:], np.vstack(third)),
+            damped_fit(A[:, :SECOND_FEATURES], np.vstack(second)),
+            damped_fit(A[:, SECOND_FEATURES:], np.vstack(third)),
         ]
     )
-
-
-def _fit(A: Array, B: Array) -> Array:
-    """Least squares ``A X ~ B``, each column of A scaled to one and slightly damped."""
-    scale = np.sqrt(np.mean(A**2, axis=0)) + 1e-300
-    A = A / scale
-    ridge = 1e-4 * np.sqrt(len(A)) * np.eye(A.shape[1])
-    X = np.linalg.lstsq(np.vstack([A, ridge]), np.vstack([B, np.zeros((len(ridge), B.shape[1]))]))[
-        0
-    ]
-    return X / scale[:, None]
 
 
 def _cubature_error(
@@ -377,7 +392,9 @@ def _training_forces(
     leads to the residual.
     """
     columns = []
-    gradients = _point_gradients(trainer.patches)
+    patches = trainer.patches
+    gradients = _point_gradients(patches)
+    law = patches.weights[0], patches.mu[0], patches.lam[0]
     for _ in range(LOADS):
         draw = extreme_load if rng.random() < EXTREME else random_load
         if not trainer.solve(*draw(scene, task, rng)):
@@ -386,7 +403,7 @@ def _training_forces(
         compliance = trainer.narrow_compliance / np.linalg.norm(wide)
         departure = OFF_EQUILIBRIUM * np.abs(wide) * rng.standard_normal(len(wide))
         for state in (wide, wide + departure):
-            force = _contributions(trainer.patches, gradients, state)
+            force = point_forces(gradients, *law, state)
             if force is not None:
                 wide_part = rng.standard_normal((len(wide), WIDE_SKETCH)) / np.sqrt(WIDE_SKETCH)
                 looks = np.hstack([compliance, WIDE / load * wide_part])
@@ -399,21 +416,6 @@ def _point_gradients(patches: Patches) -> NDArray[np.float32]:
     rows = patches.gradients[0] * patches.steps[0][:, None]
     tiles = rows.reshape(len(rows), -1, 9, LANES)
     return np.ascontiguousarray(tiles.transpose(1, 3, 2, 0).reshape(-1, 9, len(rows)))
-
-
-def _contributions(
-    patches: Patches, gradients: NDArray[np.float32], state: Array
-) -> NDArray[np.float32] | None:
-    """Nonlinear force of every point (c, r) at wide coefficients; None where one is inverted."""
-    H = np.dot(gradients, state.astype(np.float32)).reshape(-1, LANES, 9)
-    rows = np.ascontiguousarray(H.transpose(0, 2, 1)).reshape(-1)
-    P, (J, trace, linear) = np.empty_like(rows), np.empty((3, len(gradients)))
-    weights, mu, lam = patches.weights[0], patches.mu[0], patches.lam[0]
-    nonlinear_stress(rows, weights, mu, lam, J, trace, linear, P)
-    if not J.min() > 0.0:
-        return None
-    points = P.reshape(-1, 9, LANES).transpose(0, 2, 1).reshape(-1, 1, 9)
-    return (points @ gradients)[:, 0]
 
 
 def _cubature(
@@ -437,4 +439,4 @@ def _fit_guess(
             load_features(frame, task.centre, x, direction * pressure / task.pressure, features)
             rows.append(features.copy())
             targets.append(trainer.beyond_linear)
-    return _fit(np.array(rows), np.array(targets))
+    return damped_fit(np.array(rows), np.array(targets))

@@ -44,12 +44,17 @@ def spread_points(surface: Surface, count: int, rng: np.random.Generator) -> Arr
     Farthest-point sampling among the vertices and random points.
     """
     candidates = np.vstack([surface.vertices, random_points(surface, CANDIDATES * count, rng)])
-    chosen = [int(np.argmin(candidates.sum(axis=1)))]
-    distance = np.linalg.norm(candidates - candidates[chosen[0]], axis=1)
+    return candidates[farthest(candidates, count)]
+
+
+def farthest(points: Array, count: int) -> list[int]:
+    """Indices of so many of the points (n, 3), each as far from the earlier ones as can be."""
+    chosen = [int(np.argmin(points.sum(axis=1)))]
+    distance = np.linalg.norm(points - points[chosen[0]], axis=1)
     while len(chosen) < count:
         chosen.append(int(np.argmax(distance)))
-        distance = np.minimum(distance, np.linalg.norm(candidates - candidates[chosen[-1]], axis=1))
-    return candidates[chosen]
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return chosen
 
 
 def centred_points(surface: Surface, count: int, rng: np.random.Generator) -> Array:

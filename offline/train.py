@@ -45,13 +45,23 @@ from offline.sampling import (
 )
 from offline.scenes import default_artifact, find_scene
 from offline.spaces import Footprint
-from offline.validate import Comparison, compare, random_loads, summarise
+from offline.tips import TipResult
+from offline.touches import (
+    TouchComparison,
+    calibrate_touches,
+    compare_touch,
+    random_positions,
+    summarise_touches,
+)
+from offline.validate import Comparison, compare, random_loads, summarise, write_rows
 from offline.workers import Tasks, resume, worker_pool
-from offline.workshop import Load, Workshop, open_workshop, run
+from offline.workshop import Load, TouchSample, Workshop, open_workshop, run
 from shared.artifact import Dataset, write_artifact
 from shared.atlas import Atlas, Estimator, LocalModels
+from shared.endoscope import TIP_DEPTH
 from shared.reduced import ERROR_FEATURES, NARROW
 from shared.scene import Scene, Size, Tolerance
+from shared.touch import TIP_ERROR_FEATURES, LocalTips
 
 Array = NDArray[np.float64]
 
@@ -68,6 +78,9 @@ BATCH, LEAST = 60, 180
 CONTACTS_PER_PATCH = 400
 
 TRIAL_PATCHES = 8
+
+TIP_SAMPLES = 120
+"""Full solutions under the tip that validate and calibrate."""
 
 REFINED_LOADS = 4
 COVERAGE = 0.97
@@ -166,6 +179,11 @@ class Pipeline:
         layout = self.layout(size)
         models = self.local_models(layout, limits)
         estimator, documents, rows = self._validate(models, limits)
+        tip_estimator = Estimator(np.zeros((3, TIP_ERROR_FEATURES)))
+        tip_rows: list[TouchComparison] = []
+        if models.tips is not None:
+            tip_estimator, tip_rows = self._validate_tip(models, limits)
+            documents["validation_tip"] = summarise_touches(tip_rows)
         if 3 * len(self.workshop.mesh.nodes) <= MOST_DOFS:
             documents["mesh_error"] = self._mesh_error(limits)
         documents["training"] |= {"layout": self._describe(layout, models)}
@@ -173,10 +191,12 @@ class Pipeline:
             documents["training"]["choice"] = choice.document
         if mesh_choice is not None:
             documents["training"]["mesh_choice"] = mesh_choice
-        self._write(path, models, limits, estimator, documents)
+        self._write(path, models, limits, estimator, tip_estimator, documents)
         report = path.parent / path.stem / "report"
         report.mkdir(parents=True, exist_ok=True)
-        Comparison.write_csv(report / "validation.csv", rows)
+        write_rows(report / "validation.csv", rows)
+        if tip_rows:
+            write_rows(report / "validation_tip.csv", tip_rows)
 
     def untested_atlas(self, limits: Array, layout: Layout) -> Atlas:
         """An atlas without error estimate: stages 2 and 3 only."""
@@ -186,17 +206,17 @@ class Pipeline:
     # --- stages --------------------------------------------------------------------------------
 
     def _load_range(self) -> Array:
-        """Load range (v, 7) at the vertices of the surface."""
+        """Load range (v, LIMIT_FIELDS) at the vertices of the surface."""
         rng = np.random.default_rng([self.scene.seed, 1])
         count = spacing_count(self.surface, self.scene.training.limit_spacing)
         points = spread_points(self.surface, max(count, 16), rng)
         tasks = {f"range-{i}": (Workshop.load_range, x) for i, x in enumerate(points)}
         found = self._stage("load range", tasks, lambda fields: {"fields": fields})
         fields = np.array([found[name]["fields"] for name in tasks])
-        fields[:, 0] = np.log(fields[:, 0])
+        fields[:, [0, TIP_DEPTH]] = np.log(fields[:, [0, TIP_DEPTH]])
         smooth = RBFInterpolator(points, fields, neighbors=16, kernel="linear")
         at_vertices = smooth(self.surface.vertices)
-        at_vertices[:, 0] = np.exp(at_vertices[:, 0])
+        at_vertices[:, [0, TIP_DEPTH]] = np.exp(at_vertices[:, [0, TIP_DEPTH]])
         return at_vertices
 
     def _trial(self, size: Size, limits: Array) -> Trial:
@@ -309,8 +329,8 @@ class Pipeline:
                 replace(result, ritz=result.ritz[chosen]),
                 self._patch_task(layout, footprints, limits, k),
             )
-        found = self._stage("local models", tasks, asdict)
-        results = [PatchResult(**found[name]) for name in tasks]
+        found = self._stage("local models", tasks, PatchResult.arrays)
+        results = [PatchResult.of(found[name]) for name in tasks]
         return LocalModels(
             basis=np.stack([result.basis for result, _ in regions]),
             steps=np.stack([result.steps for result, _ in regions]),
@@ -327,7 +347,32 @@ class Pipeline:
             errors=np.array([float(r.error) for r in results]),
             extent=layout.extent,
             blend=self.scene.training.blend,
+            tips=_gather([r.tip for r in results]),
         )
+
+    def _validate_tip(
+        self, models: LocalModels, limits: Array
+    ) -> tuple[Estimator, list[TouchComparison]]:
+        """Validate under the tip, and calibrate its error estimate, as ``_validate`` does."""
+        rng = np.random.default_rng([self.scene.seed, 6])
+        atlas = self._atlas(models, limits, Estimator(np.zeros((2, ERROR_FEATURES))), {})
+        positions = random_positions(self.surface, limits, self.scene, TIP_SAMPLES, rng)
+        answers = [atlas.touch(x) for x in positions]
+        tasks = {
+            f"touch-{i}": (Workshop.touch, answer.position, atlas.displacement(answer))
+            for i, answer in enumerate(answers)
+        }
+        found = self._stage("full solutions under the tip", tasks, vars)
+        rows = [
+            compare_touch(self.workshop, atlas, answer, TouchSample(**found[name]))
+            for name, answer in zip(tasks, answers, strict=True)
+            if found[name]["displacement"].size
+        ]
+        for half, other in ((rows[::2], rows[1::2]), (rows[1::2], rows[::2])):
+            estimator = calibrate_touches(other)
+            for row in half:
+                row.estimate(estimator)
+        return calibrate_touches(rows), rows
 
     def _validate(
         self, models: LocalModels, limits: Array
@@ -433,7 +478,7 @@ class Pipeline:
     ) -> Atlas:
         return Atlas(
             self.scene.name, self.scene, documents, self.workshop.body, self.surface, limits,
-            models, estimator,
+            models, estimator, Estimator(np.zeros((3, TIP_ERROR_FEATURES))),
         )  # fmt: skip
 
     def _write(
@@ -442,6 +487,7 @@ class Pipeline:
         models: LocalModels,
         limits: Array,
         estimator: Estimator,
+        tip_estimator: Estimator,
         documents: dict[str, Any],
     ) -> None:
         mesh, surface = self.workshop.mesh, self.surface
@@ -456,7 +502,9 @@ class Pipeline:
             "surface_triangles": Dataset(surface.triangles, one, "triangles of it, outward"),
             "surface_normals": Dataset(surface.normals, one, "outward unit normals at vertices"),
             "load_range": Dataset(
-                limits, "kPa, mm/kPa", "at vertices: limit along the normal, compliance"
+                limits,
+                "kPa, mm/kPa, mm",
+                "at vertices: limit along the normal, compliance, depth of the tip",
             ),
             "basis": Dataset(
                 models.basis, "basis_steps", "modes of each region, (r, M, 3 n)", compress=True
@@ -485,6 +533,22 @@ class Pipeline:
                 estimator.coefficients, one, "log error = c . features; displacement, von Mises"
             ),
         }
+        if models.tips is not None:
+            tips = models.tips
+            datasets |= {
+                "tip_modes": Dataset(
+                    tips.modes.astype(np.float16), one, "modes under the tip, as patch_modes"
+                ),
+                "tip_from": Dataset(tips.point_from, one, "first point of each, under the tip"),
+                "tip_points": Dataset(tips.points, one, "quadrature point, by element"),
+                "tip_weights": Dataset(tips.weights, "mm^3", "weight of each point"),
+                "tip_guess": Dataset(
+                    tips.guess.astype(np.float16), one, "answer as polynomials of place and depth"
+                ),
+                "tip_error_coefficients": Dataset(
+                    tip_estimator.coefficients, one, "as error_coefficients; third row: force"
+                ),
+            }
         documents["provenance"]["wall_seconds"] = round(sum(self.seconds.values()), 1)
         write_artifact(path, self.scene.text, documents, datasets)
 
@@ -498,6 +562,20 @@ def _accurate(rows: Sequence[Comparison], tolerance: Tolerance) -> bool:
         for row in rows
     )
     return bool(betaincinv(missed + 1, len(rows) - missed, 0.95) <= 0.05)
+
+
+def _gather(results: Sequence[TipResult | None]) -> LocalTips | None:
+    """Local models of the tip, if they were trained."""
+    trained = [result for result in results if result is not None]
+    if not trained:
+        return None
+    return LocalTips(
+        modes=np.stack([r.modes for r in trained]).astype(np.float32),
+        point_from=np.concatenate([[0], np.cumsum([len(r.points) for r in trained])]),
+        points=np.concatenate([r.points for r in trained]),
+        weights=np.concatenate([r.weights for r in trained]),
+        guess=np.stack([r.guess for r in trained]).astype(np.float32),
+    )
 
 
 def calibrate(rows: Sequence[Comparison]) -> Estimator:

@@ -77,16 +77,16 @@ class Comparison:
         """Fill in the estimated errors."""
         self.estimated_displacement, self.estimated_von_mises = estimator(self.features)
 
-    @staticmethod
-    def write_csv(path: Path, rows: Sequence[Comparison]) -> None:
-        """Write one row per load."""
-        with path.open("w", newline="") as file:
-            names = [name for name in asdict(rows[0]) if name != "features"]
-            writer = csv_format.DictWriter(file, names, lineterminator="\n")
-            writer.writeheader()
-            for row in rows:
-                values = ((name, getattr(row, name)) for name in names)
-                writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in values})
+
+def write_rows(path: Path, rows: Sequence[Any]) -> None:
+    """Write dataclasses, one row each, but for their ``features``."""
+    with path.open("w", newline="") as file:
+        names = [name for name in asdict(rows[0]) if name != "features"]
+        writer = csv_format.DictWriter(file, names, lineterminator="\n")
+        writer.writeheader()
+        for row in rows:
+            values = ((name, getattr(row, name)) for name in names)
+            writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in values})
 
 
 def validate(artifact: Path, queries: int, seed: int, csv: Path | None = None) -> dict[str, Any]:
@@ -122,7 +122,7 @@ def validate(artifact: Path, queries: int, seed: int, csv: Path | None = None) -
         raise PalpateError(f"{artifact}: the full model has no equilibrium under any of the loads")
     if csv:
         csv.parent.mkdir(parents=True, exist_ok=True)
-        Comparison.write_csv(csv, compared)
+        write_rows(csv, compared)
     return summarise(compared) | {"without_equilibrium": queries - len(compared)}
 
 

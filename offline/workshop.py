@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offline.choose import TrialResult
-from offline.full_model import Equilibrium, FullModel, NoEquilibrium
+from offline.full_model import Equilibrium, FullModel, NoEquilibrium, TipContact
 from offline.load_path import LoadPath, pressure_that_moves
 from offline.mesh import Mesh, build_mesh, local_thickness
 from offline.norms import relative
@@ -42,6 +42,7 @@ from shared.quadrature import stress_recovery
 from shared.scene import Scene, parse_scene
 from shared.stress import StressRecovery, nodal_von_mises
 from shared.surface import Surface
+from shared.tip import tip_of, tip_surface
 
 Array = NDArray[np.float64]
 
@@ -56,6 +57,24 @@ TRIAL_LOADS = 10
 RESOLUTION = 2e-6
 """Displacement (mm) that a step of a stored mode amounts to where the mode is at work: a mode of
 small amplitude is stored in coarse steps, which compress well."""
+
+
+DEEPEST = 0.8
+"""Largest depth of the tip, in radii: its centre must stay outside the undeformed body."""
+
+SHALLOWEST = 0.02
+"""Millimetres that the range of depths has at least."""
+
+
+@dataclass(frozen=True)
+class TouchSample:
+    """Full solution under the tip; empty arrays where there is no equilibrium."""
+
+    displacement: NDArray[np.float32]  # (n, 3) mm
+    force: Array  # (3,) mN
+    tangent: Array  # (3, 3) mN/mm
+    energy: Array  # () mN mm
+    penetration: Array  # () mm
 
 
 @dataclass(frozen=True)
@@ -95,16 +114,9 @@ class Workshop:
     @cached_property
     def body(self) -> Body:
         """Mesh and tissue as the reduced model sees them."""
-        mesh, model = self.mesh, self.model
-        return Body(
-            mesh.nodes,
-            mesh.elements,
-            mesh.faces,
-            mesh.clamped,
-            mesh.accessible,
-            model.mu,
-            model.lam,
-        )
+        parts = {part.name: getattr(self.mesh, part.name) for part in fields(Mesh)}
+        tip = tip_of(self.scene.endoscope.radius, self.scene.tissue.young)
+        return Body(**parts, mu=self.model.mu, lam=self.model.lam, tip=tip)
 
     @cached_property
     def beyond_clamped_layer(self) -> NDArray[np.bool_]:
@@ -147,10 +159,10 @@ class Workshop:
     # --- tasks ---------------------------------------------------------------------------------
 
     def load_range(self, position: Array) -> Array:
-        """Load range at a surface point: fields (7,) of ``shared.endoscope.pressure_limit``.
+        """Load range at a surface point: fields (8,) of ``shared.endoscope.pressure_limit``.
 
         The limit along the normal is where the tissue moves by the scene's indentation, or beyond
-        which it has no equilibrium.
+        which it has no equilibrium; the depth of the tip is how far the footprint has sunk then.
         """
         nodal, normal = self.unit_load(position)
         unit = np.einsum("n,ij->nij", nodal, np.eye(3)).reshape(-1, 3)[self.model.free]
@@ -167,8 +179,10 @@ class Workshop:
             force = -pressure * nodal[:, None] * normal
             return self.model.solve(force, start, smallest_step=1.0).displacement
 
-        limit, _, _ = pressure_that_moves(full, wanted, *near)
-        return np.array([limit, *np.diag(C), C[0, 1], C[0, 2], C[1, 2]])
+        limit, _, moved = pressure_that_moves(full, wanted, *near)
+        depth = 0.0 if moved is None else -float(nodal @ moved @ normal) / nodal.sum()
+        depth = min(max(depth, SHALLOWEST), DEEPEST * self.scene.endoscope.radius)
+        return np.array([limit, *np.diag(C), C[0, 1], C[0, 2], C[1, 2], depth])
 
     def region(self, footprints: list[Footprint], modes: int) -> RegionResult:
         """Basis of a region and the Ritz vectors of footprints in it."""
@@ -261,6 +275,31 @@ class Workshop:
             displacement = body.model.solve(force).displacement
             moved.append(np.linalg.norm(nodal @ displacement) / nodal.sum())
         return np.array([body.mesh.nodes.size for body in bodies]), np.array(moved)
+
+    @cached_property
+    def contact(self) -> TipContact:
+        """The rigid tip against the full model."""
+        mesh, tip = self.mesh, self.body.tip
+        surface = tip_surface(mesh.nodes, mesh.faces, mesh.accessible, tip.radius)
+        return TipContact(self.model, surface, tip)
+
+    def touch(self, position: Array, start: Array | None = None) -> TouchSample:
+        """Full solution with the tip at a position (3,) mm, from a first guess (n, 3)."""
+        foot, normal, _ = self.surface.project(position)
+        out = position - foot
+        depth = self.body.tip.radius - float(np.copysign(np.linalg.norm(out), out @ normal))
+        try:
+            first = None if start is None else start.astype(float)
+            found = self.model.touch(self.contact, position, -max(depth, 0.0) * normal, first)
+        except NoEquilibrium:
+            return TouchSample(np.empty(0, np.float32), *[np.empty(0)] * 4)
+        return TouchSample(
+            found.displacement.astype(np.float32),
+            found.force,
+            found.tangent,
+            np.array(found.energy),
+            np.array(found.penetration),
+        )
 
     def sample(self, load: Load) -> NDArray[np.float32] | None:
         """Full displacement (n, 3) mm, None where there is no equilibrium."""

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from shared import equilibrium, touch
 from shared.artifact import Artifact, ArtifactError, read_artifact
 from shared.bound import bind
-from shared.endoscope import LIMIT_FIELDS, SurfaceQuadrature
+from shared.endoscope import LIMIT_FIELDS, TIP_DEPTH, SurfaceQuadrature
 from shared.errors import QueryError
 from shared.quadrature import stress_recovery, surface_quadrature, volume_quadrature
 from shared.reduced import (
@@ -49,19 +49,17 @@ from shared.reduced import (
 )
 from shared.scene import Scene, SceneError, parse_scene
 from shared.stress import nodal_von_mises
-from shared.surface import Surface, boundary_triangles
-from shared.tip import tip_of, tip_surface
+from shared.surface import Ground, Surface, boundary_triangles
+from shared.tip import Tip, TipSurface, tip_of, tip_surface
 from shared.tissue import lame
-from shared.touch import (
-    TipModels,
-    TipState,
-    Touch,
-    assemble_tip_models,
-)
+from shared.touch import TIP_ERROR_FEATURES, LocalTips, Points, TipModels, TipState, Touch
 
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
 Region = Literal["surface", "all"]
+
+REACH = 0.8
+"""Radius of a contact at most, in radii of the tip: nearer faces count."""
 
 BESIDE = 0.1
 """Millimetres beyond the rim of the surface at which the answer is not to the question any more."""
@@ -92,6 +90,8 @@ class Body:
     accessible : ndarray, shape (f,), bool
         Faces an endoscope can touch.
     mu, lam : ndarray, shape (e,), kPa
+    tip : Tip
+        That touches it.
     """
 
     nodes: Array
@@ -101,6 +101,15 @@ class Body:
     accessible: NDArray[np.bool_]
     mu: Array
     lam: Array
+    tip: Tip
+
+    @cached_property
+    def touchable(self) -> tuple[TipSurface, NDArray[np.int32]]:
+        """Faces that the tip can touch, their nodes counted anew, and these nodes (s,)."""
+        surface = tip_surface(self.nodes, self.faces, self.accessible, self.tip.radius)
+        nodes, faces = np.unique(surface.faces, return_inverse=True)
+        own = faces.reshape(surface.faces.shape).astype(np.int32)
+        return surface._replace(nodes=self.nodes[nodes], faces=own), nodes
 
     @cached_property
     def gradients(self) -> Array:
@@ -144,6 +153,8 @@ class LocalModels:
     extent : float, mm
         Largest distance of a contact point from the centre of a patch that answers for it.
     blend : float, mm
+    tips : LocalTips, optional
+        The same patches under the rigid tip.
     """
 
     basis: NDArray[np.int16]
@@ -161,6 +172,7 @@ class LocalModels:
     errors: Array
     extent: float
     blend: float
+    tips: LocalTips | None
 
 
 def assemble_patches(body: Body, models: LocalModels, radius: float) -> Patches:
@@ -216,6 +228,79 @@ def assemble_patches(body: Body, models: LocalModels, radius: float) -> Patches:
         guess=np.pad(models.guess, ((0, 0), (0, 0), (0, NARROW - models.guess.shape[2]))),
         blend=models.blend,
     )
+
+
+def assemble_tips(
+    body: Body, models: LocalModels, tips: LocalTips, tangent: LocalTips | None = None
+) -> TipModels:
+    """Everything the compiled query of the tip needs.
+
+    The cubature of ``tangent``, which has the same modes, serves the tangent if given.
+    """
+    surface, surface_nodes = body.touchable
+    reach = models.extent + REACH * body.tip.radius
+    bases = models.basis.reshape(*models.steps.shape, len(body.nodes), 3)
+    count = len(models.centres)
+    points = _no_points(count, tips)
+    tangent_points = points if tangent is None else _no_points(count, tangent)
+    modes: list[Field] = [np.empty(0, np.float32)] * count
+    near: list[NDArray[np.int32]] = [np.empty(0, np.int32)] * count
+    own: list[tuple[NDArray[np.int32], NDArray[np.int64]]] = [(near[0], np.empty(0, int))] * count
+    for region, steps in enumerate(models.steps):
+        # one row of memory to a node, so that gathering nodes reads rows
+        basis = np.ascontiguousarray(np.moveaxis(bases[region], 0, -1)).astype(np.float32)
+        for k in np.flatnonzero(models.region == region):
+            C = steps[:, None] * tips.modes[k]
+            _place_points(body, basis, C, tips, int(k), points)
+            if tangent is not None:
+                _place_points(body, basis, C, tangent, int(k), tangent_points)
+            away = np.linalg.norm(surface.nodes[surface.faces] - models.centres[k], axis=2)
+            near[k] = np.flatnonzero((away < reach).any(axis=1)).astype(np.int32)
+            own[k] = np.unique(surface.faces[near[k]], return_inverse=True)
+            modes[k] = _rows(basis, surface_nodes[own[k][0]], C)
+    normals = models.frames[:, 0]
+    return TipModels(
+        centres=np.ascontiguousarray((models.centres + body.tip.radius * normals).T),
+        frames=models.frames,
+        blend=models.blend,
+        points=points,
+        tangent_points=tangent_points,
+        guess=tips.guess,
+        tip=body.tip,
+        surface=surface,
+        node_from=_offsets([nodes for nodes, _ in own]),
+        nodes=np.concatenate([nodes for nodes, _ in own]).astype(np.int32),
+        modes=np.vstack(modes),
+        face_from=_offsets(near),
+        faces=np.concatenate(near),
+        corners=np.vstack(
+            [local.reshape(len(f), -1) for f, (_, local) in zip(near, own, strict=True)]
+        ).astype(np.int32),
+    )
+
+
+def _no_points(count: int, tips: LocalTips) -> Points:
+    """Room for the points of so many models."""
+    most = -(-int(np.diff(tips.point_from).max()) // LANES) * LANES
+    return Points(
+        np.zeros((count, tips.modes.shape[2], 9 * most), np.float32),
+        *(np.zeros((count, most)) for _ in range(3)),
+    )
+
+
+def _place_points(
+    body: Body, basis: Field, C: Field, tips: LocalTips, k: int, points: Points
+) -> None:
+    """Fill in the points of model k, of modes ``basis @ C``; basis (n, 3, M), C (M, m)."""
+    rows = slice(tips.point_from[k], tips.point_from[k + 1])
+    element, q = np.divmod(tips.points[rows], body.gradients.shape[1])
+    nodes, local = np.unique(body.elements[element], return_inverse=True)
+    V = _rows(basis, nodes, C)[local.reshape(len(element), -1)]
+    G = _mode_gradients(V, body.gradients[element, q])
+    points.gradients[k] = _tiles(G, points.weights.shape[1])
+    points.weights[k, : len(element)] = tips.weights[rows]
+    points.mu[k, : len(element)] = body.mu[element]
+    points.lam[k, : len(element)] = body.lam[element]
 
 
 def _rows(basis: Field, nodes: NDArray[np.int32], C: Field) -> Field:
@@ -391,12 +476,12 @@ class Estimator:
     For the features see ``shared.reduced``.
     """
 
-    coefficients: Array  # (2, ERROR_FEATURES): displacement, von Mises
+    coefficients: Array  # (2, ERROR_FEATURES): displacement, von Mises; under the tip also force
 
-    def __call__(self, features: Array) -> tuple[float, float]:
-        """Estimated relative errors of displacement and von Mises stress."""
-        displacement, von_mises = np.exp(self.coefficients @ features).tolist()
-        return displacement, von_mises
+    def __call__(self, features: Array) -> list[float]:
+        """Estimated relative errors, one for each row."""
+        errors: list[float] = np.exp(self.coefficients @ features).tolist()
+        return errors
 
 
 class Atlas:
@@ -411,7 +496,7 @@ class Atlas:
     body : Body
     surface : Surface
         Accessible surface.
-    limits : ndarray, shape (v, 7)
+    limits : ndarray, shape (v, LIMIT_FIELDS)
         Load range at the surface's vertices; see ``shared.endoscope.pressure_limit``.
     models : LocalModels
     estimator : Estimator
@@ -427,6 +512,7 @@ class Atlas:
         limits: Array,
         models: LocalModels,
         estimator: Estimator,
+        tip_estimator: Estimator,
     ) -> None:
         self.name = name
         self.scene = scene
@@ -436,6 +522,7 @@ class Atlas:
         self.limits = limits
         self.models = models
         self.estimator = estimator
+        self.tip_estimator = tip_estimator
         self.patches = assemble_patches(body, models, scene.endoscope.radius)
         terms = Terms(
             ground=surface.ground(limits),
@@ -486,6 +573,7 @@ class Atlas:
                 arrays["accessible"],
                 np.full(count, mu),
                 np.full(count, lam),
+                tip_of(scene.endoscope.radius, scene.tissue.young),
             ),
             surface=Surface(
                 arrays["surface_vertices"], arrays["surface_triangles"], arrays["surface_normals"]
@@ -507,8 +595,14 @@ class Atlas:
                 errors=arrays["patch_errors"],
                 extent=float(arrays["patch_extent"]),
                 blend=float(arrays["patch_blend"]),
+                tips=_local_tips(arrays) if scene.endoscope.tip else None,
             ),
             estimator=Estimator(arrays["error_coefficients"]),
+            tip_estimator=Estimator(
+                arrays["tip_error_coefficients"]
+                if scene.endoscope.tip
+                else np.zeros((3, TIP_ERROR_FEATURES))
+            ),
         )
 
     @property
@@ -633,26 +727,10 @@ class Atlas:
         )
 
     @cached_property
-    def tips(self) -> TipModels:
-        """Local models of the rigid tip."""
-        body, models = self.body, self.models
-        radius = self.scene.endoscope.radius
-        surface = tip_surface(body.nodes, body.faces, body.accessible, radius)
-        nodes, faces = np.unique(surface.faces, return_inverse=True)
-        surface = surface._replace(
-            nodes=body.nodes[nodes],
-            faces=faces.reshape(surface.faces.shape).astype(np.int32),
-        )
-        bases = models.basis.reshape(*models.steps.shape, len(body.nodes), 3)
-        wide = []
-        for k, region in enumerate(models.region):
-            rows = np.moveaxis(bases[region][:, nodes], 0, -1).astype(np.float32)
-            C = models.steps[region][:, None] * models.modes[k]
-            wide.append((rows.reshape(-1, len(C)) @ C).reshape(len(nodes), 3, -1))
-        reach = models.extent + radius
-        return assemble_tip_models(
-            self.patches, surface, tip_of(radius, self.scene.tissue.young), wide, reach
-        )
+    def tips(self) -> TipModels | None:
+        """Local models of the rigid tip, if the artifact has any."""
+        tips = self.models.tips
+        return None if tips is None else assemble_tips(self.body, self.models, tips)
 
     def touch(self, position: ArrayLike, state: State | None = None) -> Touch:
         """Answer a position of the rigid tip.
@@ -671,68 +749,29 @@ class Atlas:
         """
         started = time.perf_counter()
         at = _vector("position", position)
+        if self.tips is None:
+            raise QueryError("position", f"scene {self.name!r} was trained without a tip")
         if state is None:
             state = self._state
             state.forget()
         if state.tip is None:
-            state.tip = TipState(self.tips, self.surface.ground(self.limits[:, :0]))
-        touch.query(state.tip.bound, at)
-        outcome, memory = state.tip.outcome, state.tip.memory
-        scalars = outcome.scalars.tolist()
-        depth, distance = scalars[touch.DEPTH], scalars[touch.DISTANCE]
-        radius = self.scene.endoscope.radius
-        if depth > radius:
-            raise QueryError(
-                "position", f"the tip's centre lies {depth - radius:.2f} mm below the surface"
-            )
-        limit = 0.5 * radius
-        foot, normal, force = outcome.foot.copy(), outcome.normal.copy(), outcome.force.copy()
-        contact = scalars[touch.TOUCHED] > 0
-        out_of_range: tuple[str, ...] = ()
-        if contact and distance > BESIDE and _beside(at, foot, normal, distance):
-            out_of_range += ("position",)
-        if depth > limit:
-            out_of_range += ("depth",)
-        pushed = math.sqrt(float(force @ force))
-        if pushed > 0:
-            normal = force / pushed
-            foot = at - radius * normal
-        patches = tuple(
-            [
-                (_number(int(memory.patch[slot])), weight, memory.q[slot].copy())
-                for slot, weight in enumerate(outcome.weight.tolist())
-                if weight > 0 and contact
-            ]
-        )
-        return Touch(
-            position=at,
-            contact=contact,
-            force=force,
-            tangent=outcome.tangent.copy(),
-            contact_point=foot,
-            normal=normal,
-            depth=depth,
-            depth_limit=limit,
-            penetration=scalars[touch.PENETRATION],
-            energy=scalars[touch.ENERGY],
-            converged=scalars[touch.STATUS] == equilibrium.CONVERGED,
-            iterations=int(scalars[touch.ITERATIONS]),
-            in_range=not out_of_range,
-            out_of_range=out_of_range,
-            error_displacement=math.inf,
-            error_von_mises=math.inf,
-            error_force=math.inf,
-            min_jacobian=scalars[touch.SMALLEST_J],
-            patches=patches,
-            solve_seconds=time.perf_counter() - started,
-        )
+            state.tip = TipState(self.tips, self._tip_ground, self.tip_estimator.coefficients)
+        return touch.answer(state.tip, at, started)
+
+    @cached_property
+    def _tip_ground(self) -> Ground:
+        return self.surface.ground(self.limits[:, [TIP_DEPTH]])
 
     def coefficients(self, solution: Solution | Touch) -> dict[int, Field]:
         """Displacement as coefficients (M,) in the basis of each region that takes part."""
         total: dict[int, Field] = {}
+        modes = self.models.modes
+        if isinstance(solution, Touch):
+            assert self.models.tips is not None, "or there would be no such answer"
+            modes = self.models.tips.modes
         for k, weight, c in solution.patches:
             region = int(self.models.region[k])
-            share = self.models.modes[k] @ (weight * c).astype(np.float32)
+            share = modes[k] @ (weight * c).astype(np.float32)
             total[region] = total[region] + share if region in total else share
         return total
 
@@ -755,6 +794,16 @@ class Atlas:
         # an answer that did not converge may be beyond single precision
         with np.errstate(over="ignore"):
             return stress.astype(np.float32)
+
+
+def _local_tips(arrays: dict[str, NDArray[Any]]) -> LocalTips:
+    return LocalTips(
+        modes=arrays["tip_modes"].astype(np.float32),
+        point_from=arrays["tip_from"],
+        points=arrays["tip_points"],
+        weights=arrays["tip_weights"],
+        guess=arrays["tip_guess"].astype(np.float32),
+    )
 
 
 def _beside(position: Array, contact: Array, normal: Array, distance: float) -> bool:

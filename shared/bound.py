@@ -58,12 +58,13 @@ def _new_compiled(content):
 
 
 @njit(cache=True)
-def _bind(content):
+def bind_compiled(content):
+    """Bind a named tuple whose nested ones are bound, in compiled code."""
     return _new(content)
 
 
 def bind(content: NamedTuple) -> Any:
     """Bind a named tuple, and every one nested in it, to a value of one machine word."""
-    return _bind(
+    return bind_compiled(
         type(content)(*(bind(part) if hasattr(part, "_fields") else part for part in content))
     )

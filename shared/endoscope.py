@@ -69,18 +69,21 @@ def footprint(surface, x, normal, radius, nodal):
     return area
 
 
-LIMIT_FIELDS = 7
+LIMIT_FIELDS = 8
 """Values that describe the load range at a surface point: see ``pressure_limit``."""
+
+TIP_DEPTH = 7
+"""Which of them is the largest trained depth of the rigid tip, mm."""
 
 
 @njit(cache=True, error_model="numpy")
 def pressure_limit(fields, normal, direction):
     """Largest trained pressure (kPa) at a surface point, for a load along ``direction``.
 
-    ``fields`` (7,) holds the limit along the inward normal and the compliance of the contact
-    (xx, yy, zz, xy, xz, yz: mm/kPa): mean displacement under the footprint per pressure at rest.  A
-    direction in which the tissue is more compliant than along the normal has a limit lower in
-    proportion, so that the tissue moves about as far.
+    ``fields`` (8,) holds the limit along the inward normal and the compliance of the contact
+    (xx, yy, zz, xy, xz, yz: mm/kPa), the mean displacement under the footprint per pressure at
+    rest; the last value is the tip's.  A direction in which the tissue is more compliant than along
+    the normal has a limit lower in proportion, so that the tissue moves about as far.
     """
     along = across = 0.0
     for i in range(3):

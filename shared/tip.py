@@ -43,7 +43,7 @@ HARDNESS = 4000.0
 ONSET = 2.5e-4
 """Penetration over which the penalty sets in, in radii of the tip."""
 
-SPACING = 0.05
+SPACING = 0.075
 """Largest distance of integration points, in radii of the tip."""
 
 SMOOTH = np.cos(np.radians(45.0))
@@ -53,8 +53,8 @@ REACH = 1.25
 """A curved face stays in the box of its nodes stretched by this factor."""
 
 
-FORCE, STIFFNESS, CONVEX = 0, 1, 2
-"""What is wanted of ``touch``."""
+FORCE, STIFFNESS, CONVEX = 0.0, 1.0, 2.0
+"""What is wanted of ``touch``; for integers the compiler would make a version of it each."""
 
 
 class Tip(NamedTuple):
@@ -82,6 +82,8 @@ class Touching(NamedTuple):
     force: Array  # (f, k, 3) mN, on their nodes
     stiffness: Array  # (f, 3, 3, k, k) mN/mm, second derivative in the places of the nodes
     own: Array  # (3, 3) mN/mm, in the place of the tip
+    count: NDArray[np.int64]  # (1,) faces touched
+    deepest: Array  # (1,) mm, largest penetration
     gap: Array  # (4, q) scratch: points of a face from the tip's centre, mm, and their distance
 
 
@@ -163,6 +165,8 @@ def room_for(surface: TipSurface, f: int) -> Touching:
         force=np.zeros((f, k, 3)),
         stiffness=np.zeros((f, 3, 3, k, k)),
         own=np.zeros((3, 3)),
+        count=np.zeros(1, np.int64),
+        deepest=np.zeros(1),
         gap=np.zeros((4, surface.shape.shape[1])),
     )
 
@@ -202,14 +206,18 @@ def _within_reach(tip, surface, face, x, moved):
 @njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc", "nsz"})
 def _gaps(surface, face, x, moved, gap):
     """Points of a deformed face relative to x and their squared distances, into ``gap`` (4, q)."""
-    own = surface.faces[face]
+    own, nodes, shape = surface.faces[face], surface.nodes, surface.shape
     for i in range(3):
         row = gap[i]
-        row[:] = -x[i]
-        for k in range(len(own)):
-            at, N = surface.nodes[own[k], i] + moved[own[k], i], surface.shape[k]
+        for q in range(len(row)):
+            row[q] = -x[i]
+        for k in range(0, len(own), 4):  # a face has 4 or 8 nodes
+            a, b = nodes[own[k], i] + moved[own[k], i], nodes[own[k + 1], i] + moved[own[k + 1], i]
+            c = nodes[own[k + 2], i] + moved[own[k + 2], i]
+            d = nodes[own[k + 3], i] + moved[own[k + 3], i]
+            K, L, M, N = shape[k], shape[k + 1], shape[k + 2], shape[k + 3]
             for q in range(len(row)):
-                row[q] += N[q] * at
+                row[q] += K[q] * a + L[q] * b + M[q] * c + N[q] * d
     y0, y1, y2, square = gap[0], gap[1], gap[2], gap[3]
     for q in range(len(square)):
         square[q] = y0[q] * y0[q] + y1[q] * y1[q] + y2[q] * y2[q]
@@ -231,7 +239,7 @@ def touch(tip, surface, near, x, moved, touching, wanted):
         Displacement of the surface's nodes.
     touching : Touching, out
         The first ``count`` faces are overwritten.
-    wanted : int
+    wanted : float
         ``FORCE``, ``STIFFNESS`` (second derivatives, too) or ``CONVEX`` (second derivatives without
         their negative part, that of the normal's turning: positive definite far from equilibrium).
 
@@ -279,6 +287,7 @@ def touch(tip, surface, near, x, moved, touching, wanted):
                 along = areas[q] * slope
                 across = -areas[q] * pressure / distance if wanted == STIFFNESS else 0.0
                 _stiffen(surface.shape, q, along, across, n, touching.stiffness[count - 1], H)
+    touching.count[0], touching.deepest[0] = count, deepest
     return count, energy, deepest
 
 

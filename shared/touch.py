@@ -20,24 +20,28 @@ centre lies that just touches the surface at the model's middle.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+import time
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit, types
+from numba import njit
 from numba.extending import overload
 from numpy.typing import NDArray
 
 from shared import equilibrium, tissue
-from shared.bound import bind
+from shared.bound import bind, bind_compiled
+from shared.errors import QueryError
 from shared.reduced import (
+    FAST,
     LANES,
     MAX_ACTIVE,
     REUSE,
     ROUND_OFF,
     STATE,
     TILE,
-    Patches,
     _cholesky,
+    _is,
     _lower_products,
     activate,
     increments,
@@ -64,7 +68,7 @@ Array = NDArray[np.float64]
 Field = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
-TOLERANCE = 3e-4
+TOLERANCE = 1e-3
 """Residual at equilibrium relative to the response, both in the energy norm of the rest state."""
 
 LEAST = 1e-6
@@ -76,15 +80,48 @@ RAMP = 8
 """Steps of the way in when an equilibrium cannot be found in one jump."""
 
 
-class TipModels(NamedTuple):
-    """Local models of the tip; ``*_from[k] : *_from[k + 1]`` are the rows of model k."""
+@dataclass(frozen=True)
+class LocalTips:
+    """What training finds out about p patches under the tip, from regions of M modes each.
 
-    centres: Array  # (3, p) mm, sites
-    blend: float  # mm
+    Attributes
+    ----------
+    modes : ndarray, shape (p, M, m), float32
+        Of each patch, in the basis of its region.
+    point_from : ndarray, shape (p + 1,), int64
+        Cubature points of patch k are rows ``point_from[k] : point_from[k + 1]``.
+    points : ndarray, shape (c,), int32
+        Quadrature point, counted element by element.
+    weights : ndarray, shape (c,), mm^3
+    guess : ndarray, shape (p, TIP_FEATURES, m), float32
+        Answer as a polynomial in place and depth.
+    """
+
+    modes: Field
+    point_from: Ints
+    points: NDArray[np.int32]
+    weights: Array
+    guess: Field
+
+
+class Points(NamedTuple):
+    """Cubature points of all models, filled up with points of no weight."""
+
     gradients: Field  # (p, m, 9 c) 1/mm, in tiles
     weights: Array  # (p, c) mm^3
     mu: Array  # (p, c) kPa
     lam: Array  # (p, c) kPa
+
+
+class TipModels(NamedTuple):
+    """Local models of the tip; ``*_from[k] : *_from[k + 1]`` are the rows of model k."""
+
+    centres: Array  # (3, p) mm, of a tip that just touches the middle of the model
+    frames: Array  # (p, 3, 3) rows: outward normal and two tangents
+    blend: float  # mm
+    points: Points
+    tangent_points: Points  # the same, or fewer for a tangent that need not be exact
+    guess: Field  # (p, TIP_FEATURES, m) of the answer
     tip: Tip
     surface: TipSurface
     node_from: Ints  # (p + 1,)
@@ -93,6 +130,27 @@ class TipModels(NamedTuple):
     face_from: Ints  # (p + 1,)
     faces: NDArray[np.int32]  # (t,) of the surface, near the model
     corners: NDArray[np.int32]  # (t, k) their nodes, counted from the model's first
+
+
+TIP_DEGREE = 3
+"""Of the first guess in the depth."""
+
+TIP_FEATURES = 6 * TIP_DEGREE
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def tip_features(frame, centre, x, depth, out):
+    """Polynomials in the depth (degree 1-3) and the place along the surface (0-2), mm."""
+    s = t = 0.0
+    for i in range(3):
+        s += frame[1, i] * (x[i] - centre[i])
+        t += frame[2, i] * (x[i] - centre[i])
+    power = 1.0
+    for degree in range(TIP_DEGREE):
+        power *= depth
+        k = 6 * degree
+        out[k], out[k + 1], out[k + 2] = power, power * s, power * t
+        out[k + 3], out[k + 4], out[k + 5] = power * s * s, power * s * t, power * t * t
 
 
 class TipMemory(NamedTuple):
@@ -122,7 +180,11 @@ class TipScratch(NamedTuple):
     touching: Touching
     distance: Array  # (p,)
     fade: Array  # (MAX_ACTIVE, 3) 1/mm, gradients of the weights
+    features: Array  # (TIP_FEATURES,)
     ground: Array  # (clusters + 6,)
+
+
+TIP_ERROR_FEATURES = 9
 
 
 class TipOutcome(NamedTuple):
@@ -135,6 +197,8 @@ class TipOutcome(NamedTuple):
     tangent: Array  # (3, 3) mN/mm
     forces: Array  # (MAX_ACTIVE, 3) of the models
     tangents: Array  # (MAX_ACTIVE, 3, 3)
+    limit: Array  # (1,) mm, largest trained depth there
+    features: Array  # (TIP_ERROR_FEATURES,) of the error estimate
     scalars: Array  # (SCALARS,)
 
 
@@ -159,6 +223,10 @@ class TipSystem(NamedTuple):
     weights: Array
     mu: Array
     lam: Array
+    tangent_gradients: Field
+    tangent_weights: Array
+    tangent_mu: Array
+    tangent_lam: Array
     H: Field
     P: Field
     J: Array
@@ -175,32 +243,34 @@ class TipSystem(NamedTuple):
     faces: NDArray[np.int32]
     corners: NDArray[np.int32]
     x: Array
+    step: Array  # (m,) scratch
     moved: Array
     folded: Array
     touching: Touching
 
 
-def _is_tip_system(system: object) -> bool:
-    return isinstance(system, types.NamedTuple) and system.instance_class is TipSystem
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def _move(nodes, modes, q, moved):
+    """Displacement of the nodes, into the rows of ``moved`` that are theirs."""
+    for a in range(len(nodes)):
+        for i in range(3):
+            row, total = modes[a, i], 0.0
+            for j in range(len(q)):
+                total += row[j] * q[j]
+            moved[nodes[a], i] = total
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _contact(system, q, wanted):
     """What the tip does to the state q: (faces touched, energy, largest penetration)."""
-    nodes, modes, moved = system.nodes, system.modes, system.moved
-    for a in range(len(nodes)):
-        for i in range(3):
-            row = modes[a, i]
-            total = 0.0
-            for j in range(len(q)):
-                total += row[j] * q[j]
-            moved[nodes[a], i] = total
+    moved = system.moved
+    _move(system.nodes, system.modes, q, moved)
     return touch(system.tip, system.surface, system.faces, system.x, moved, system.touching, wanted)
 
 
 @overload(equilibrium.potential, jit_options={"error_model": "numpy"})
 def _potential(system, u, residual):
-    if not _is_tip_system(system):
+    if not _is(TipSystem, system):
         return None
 
     def potential(system, u, residual):
@@ -232,14 +302,16 @@ def _potential(system, u, residual):
 
 @overload(equilibrium.factorise, jit_options={"error_model": "numpy"})
 def _factorise(system, u, shift):
-    if not _is_tip_system(system):
+    if not _is(TipSystem, system):
         return None
 
     def factorise(system, u, shift):
-        superpose(system.gradients, u, system.H)
-        linearise(system.H, system.weights, system.mu, system.lam, system.state)
-        increments(system.state, system.gradients, system.increments)
-        _lower_products(system.gradients, system.increments, system.tangent)
+        gradients = system.tangent_gradients
+        H = system.H[: gradients.shape[1]]
+        superpose(gradients, u, H)
+        linearise(H, system.tangent_weights, system.tangent_mu, system.tangent_lam, system.state)
+        increments(system.state, gradients, system.increments)
+        _lower_products(gradients, system.increments, system.tangent)
         for j in range(len(u)):
             system.tangent[j, j] += 1.0
         count, _, _ = _contact(system, u, CONVEX if shift > 0.0 else STIFFNESS)
@@ -277,7 +349,7 @@ def _add_face(system, c):
 
 @overload(equilibrium.correct, jit_options={"error_model": "numpy"})
 def _correct(system, residual, step):
-    if not _is_tip_system(system):
+    if not _is(TipSystem, system):
         return None
 
     def correct(system, residual, step):
@@ -306,7 +378,7 @@ def _back_substitute(L, x):
 descend = njit(equilibrium.descend, error_model="numpy", nogil=True, cache=True)
 
 
-@njit(inline="always")
+@njit(cache=True, error_model="numpy", nogil=True)
 def _settle(system, q, work, least):
     """Equilibrium near q, in place: (status, iterations, energy, smallest det F).
 
@@ -327,51 +399,92 @@ def _settle(system, q, work, least):
         size = max(found, LEAST)
 
 
-@njit(inline="always")
+@njit(cache=True, error_model="numpy", nogil=True)
 def _system(models, k, slot, x, memory, scratch):
+    """Local model k under the tip at x, by reference."""
     nodes = slice(models.node_from[k], models.node_from[k + 1])
     faces = slice(models.face_from[k], models.face_from[k + 1])
-    return TipSystem(
-        models.gradients[k],
-        models.weights[k],
-        models.mu[k],
-        models.lam[k],
-        scratch.H,
-        scratch.P,
-        scratch.J,
-        scratch.trace,
-        scratch.linear,
-        scratch.state,
-        scratch.increments,
-        scratch.tangent,
-        memory.factor[slot],
-        models.tip,
-        models.surface,
-        models.nodes[nodes],
-        models.modes[nodes],
-        models.faces[faces],
-        models.corners[faces],
-        x,
-        scratch.moved,
-        scratch.folded,
-        scratch.touching,
+    return bind_compiled(
+        TipSystem(
+            models.points.gradients[k],
+            models.points.weights[k],
+            models.points.mu[k],
+            models.points.lam[k],
+            models.tangent_points.gradients[k],
+            models.tangent_points.weights[k],
+            models.tangent_points.mu[k],
+            models.tangent_points.lam[k],
+            scratch.H,
+            scratch.P,
+            scratch.J,
+            scratch.trace,
+            scratch.linear,
+            scratch.state,
+            scratch.increments,
+            scratch.tangent,
+            memory.factor[slot],
+            models.tip,
+            models.surface,
+            models.nodes[nodes],
+            models.modes[nodes],
+            models.faces[faces],
+            models.corners[faces],
+            x,
+            scratch.newton[1],
+            scratch.moved,
+            scratch.folded,
+            scratch.touching,
+        )
     )
 
 
-@njit(inline="always")
+@njit(cache=True, error_model="numpy", nogil=True)
+def _guess(models, k, x, depth, features, q):
+    tip_features(models.frames[k], models.centres[:, k], x, max(depth, 0.0), features)
+    q[:] = 0.0
+    for f in range(TIP_FEATURES):
+        row = models.guess[k, f]
+        for j in range(len(q)):
+            q[j] += features[f] * row[j]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _predict(memory, slot, x, q, step):
+    """Follow the last answer's derivatives to the position x."""
+    if not memory.factor[slot, 0, 0] > 0.0:
+        return
+    for i in range(3):
+        step[:] = memory.coupling[slot, i]
+        _back_substitute(memory.factor[slot], step)
+        for j in range(len(q)):
+            q[j] += step[j] * (x[i] - memory.position[slot, i])
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _settle_on_the_way(system, q, work, least, depth, normal):
+    """As ``_settle``, from rest along the way in, for where a jump fails."""
+    at = system.x
+    away = depth * normal
+    at += away
+    q[:] = 0.0
+    status, iterations, energy, smallest = equilibrium.CONVERGED, 0, 0.0, 1.0
+    for _ in range(RAMP):
+        if status == equilibrium.CONVERGED:
+            at -= away / RAMP
+            system.factor[0, 0] = 0.0
+            status, more, energy, smallest = _settle(system, q, work, least)
+            iterations += more
+    return status, iterations, energy, smallest
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def _solve(models, k, slot, warm, x, normal, depth, memory, scratch, outcome):
     """Equilibrium of model k, its force and tangent into memory's slot and the outcome."""
-    q, at = memory.q[slot], memory.position[slot]
-    factor = memory.factor[slot]
+    q, at, factor = memory.q[slot], memory.position[slot], memory.factor[slot]
     if warm:
-        for i in range(3):
-            step = scratch.newton[1]
-            step[:] = memory.coupling[slot, i]
-            _back_substitute(factor, step)
-            for j in range(len(q)):
-                q[j] += step[j] * (x[i] - at[i])
+        _predict(memory, slot, x, q, scratch.newton[1])
     else:
-        q[:] = 0.0
+        _guess(models, k, x, depth, scratch.features, q)
         factor[0, 0] = 0.0
     at[:] = x
     tip = models.tip
@@ -379,48 +492,50 @@ def _solve(models, k, slot, warm, x, normal, depth, memory, scratch, outcome):
     system = _system(models, k, slot, at, memory, scratch)
     status, iterations, energy, smallest = _settle(system, q, scratch.newton, least)
     if status != equilibrium.CONVERGED and depth > 0.0:
-        # once more from rest, along the way in
-        q[:] = 0.0
-        for step in range(1, RAMP + 1):
-            factor[0, 0] = 0.0
-            for i in range(3):
-                at[i] = x[i] + (1.0 - step / RAMP) * depth * normal[i]
-            status, more, energy, smallest = _settle(system, q, scratch.newton, least)
-            iterations += more
-            if status != equilibrium.CONVERGED:
-                break
+        status, more, energy, smallest = _settle_on_the_way(
+            system, q, scratch.newton, least, depth, normal
+        )
+        iterations += more
         at[:] = x
-    scalars = outcome.scalars
     if status == equilibrium.CONVERGED and not equilibrium.factorise(system, q, 0.0):
         status = equilibrium.STALLED  # a saddle
-    count, _, deepest = _contact(system, q, STIFFNESS)
-    reaction(scratch.touching, count, outcome.forces[slot])
-    coupling, tangent = memory.coupling[slot], outcome.tangents[slot]
-    coupling[:] = 0.0
-    for c in range(count):
-        own = system.corners[scratch.touching.face[c]]
-        for i in range(3):
-            for j in range(3):
-                block = scratch.touching.stiffness[c, min(i, j), max(i, j)]
-                for a in range(len(own)):
-                    total = block[a].sum()
-                    row = system.modes[own[a], j]
-                    for n in range(len(q)):
-                        coupling[i, n] += total * row[n]
     if status == equilibrium.CONVERGED:
-        for i in range(3):
-            step = scratch.newton[1]
-            step[:] = coupling[i]
-            _back_substitute(factor, step)
-            for j in range(3):
-                tangent[j, i] = np.dot(coupling[j], step) - scratch.touching.own[j, i]
+        _react(system, memory.coupling[slot], outcome.forces[slot], outcome.tangents[slot])
+    else:
+        outcome.forces[slot] = 0.0
+        outcome.tangents[slot] = 0.0
     memory.patch[slot] = k if status == equilibrium.CONVERGED else -2 - k
+    scalars, touching = outcome.scalars, scratch.touching
     scalars[STATUS] = max(scalars[STATUS], float(status))
     scalars[ITERATIONS] = max(scalars[ITERATIONS], float(iterations))
     scalars[SMALLEST_J] = min(scalars[SMALLEST_J], smallest)
     scalars[ENERGY] += outcome.weight[slot] * energy
-    scalars[PENETRATION] = max(scalars[PENETRATION], deepest)
-    scalars[TOUCHED] += count
+    scalars[PENETRATION] = max(scalars[PENETRATION], touching.deepest[0])
+    scalars[TOUCHED] += touching.count[0]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _react(system, coupling, force, tangent):
+    """Force, its derivative and B of an equilibrium whose tangent has just been factorised."""
+    touching, modes = system.touching, system.modes
+    count = touching.count[0]
+    reaction(touching, count, force)
+    coupling[:] = 0.0
+    for c in range(count):
+        own = system.corners[touching.face[c]]
+        for i in range(3):
+            for j in range(3):
+                block = touching.stiffness[c, min(i, j), max(i, j)]
+                for a in range(len(own)):
+                    total, row = block[a].sum(), modes[own[a], j]
+                    for n in range(coupling.shape[1]):
+                        coupling[i, n] += total * row[n]
+    step = system.step
+    for i in range(3):
+        step[:] = coupling[i]
+        _back_substitute(system.factor, step)
+        for j in range(3):
+            tangent[j, i] = np.dot(coupling[j], step) - touching.own[j, i]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -467,7 +582,7 @@ def query(solver, x):
     outcome.force[:] = 0.0
     outcome.tangent[:] = 0.0
     outcome.weight[:] = 0.0
-    distance = locate(solver.ground, x, scratch.ground, foot, normal, outcome.force[:0])
+    distance = locate(solver.ground, x, scratch.ground, foot, normal, outcome.limit)
     above = 0.0
     for i in range(3):
         above += (x[i] - foot[i]) * normal[i]
@@ -493,17 +608,53 @@ def query(solver, x):
                         + outcome.forces[slot, i] * scratch.fade[slot, j]
                     )
 
+    _features(outcome)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _features(outcome):
+    """What the error estimate is made of.
+
+    1, the depth over its limit and its log, smallest det F, the normal (where on the body), and the
+    logs of force over depth (mN/mm) and of the energy over that of a linear spring.
+    """
+    scalars, features = outcome.scalars, outcome.features
+    depth = max(scalars[DEPTH], 1e-6)
+    share = depth / max(outcome.limit[0], 1e-6)
+    pushed = math.sqrt(np.dot(outcome.force, outcome.force))
+    features[0], features[1], features[2] = 1.0, share, math.log(share)
+    features[3] = scalars[SMALLEST_J]
+    features[4:7] = outcome.normal
+    features[7] = math.log(max(pushed / depth, 1e-6))
+    features[8] = math.log(max(2.0 * scalars[ENERGY] / max(pushed * depth, 1e-9), 1e-3))
+
 
 SKIN = 0.02
 """Distance from the surface, in radii of the tip, at which contact is looked for: the triangles
 that say where the surface is cut its curves."""
 
 
-class TipState:
-    """Working memory and last answer of one caller under the tip."""
+UPRIGHT = 0.7
+"""Cosine between normal and way to the tip's centre below which it is beside the surface."""
 
-    def __init__(self, models: TipModels, ground: Ground) -> None:
-        count, m, entries = models.gradients.shape
+
+class TipState:
+    """Working memory and last answer of one caller under the tip.
+
+    Parameters
+    ----------
+    models : TipModels
+    ground : Ground
+        Accessible surface with the largest depth (v, 1) mm at its vertices.
+    coefficients : ndarray, shape (3, TIP_ERROR_FEATURES)
+        Of the error estimate: displacement, von Mises stress, force.
+    """
+
+    def __init__(self, models: TipModels, ground: Ground, coefficients: Array) -> None:
+        self.tip = models.tip
+        self.coefficients = coefficients
+        count, m, entries = models.points.gradients.shape
+        tangent_entries = models.tangent_points.gradients.shape[2]
         points = LANES * (entries // TILE)
         self.memory = TipMemory(
             patch=np.full(MAX_ACTIVE, -1, np.int64),
@@ -518,8 +669,8 @@ class TipState:
             J=np.zeros(points),
             trace=np.zeros(points),
             linear=np.zeros(points),
-            state=np.zeros(STATE * points, np.float32),
-            increments=np.zeros((m, entries), np.float32),
+            state=np.zeros(STATE * LANES * (tangent_entries // TILE), np.float32),
+            increments=np.zeros((m, tangent_entries), np.float32),
             tangent=np.zeros((m, m)),
             newton=np.zeros((4, m)),
             moved=np.zeros(models.surface.nodes.shape),
@@ -527,6 +678,7 @@ class TipState:
             touching=room_for(models.surface, int(np.diff(models.face_from).max())),
             distance=np.zeros(count),
             fade=np.zeros((MAX_ACTIVE, 3)),
+            features=np.zeros(TIP_FEATURES),
             ground=np.zeros(len(ground.radii) + 6),
         )
         self.outcome = TipOutcome(
@@ -537,6 +689,8 @@ class TipState:
             tangent=np.zeros((3, 3)),
             forces=np.zeros((MAX_ACTIVE, 3)),
             tangents=np.zeros((MAX_ACTIVE, 3, 3)),
+            limit=np.zeros(1),
+            features=np.zeros(TIP_ERROR_FEATURES),
             scalars=np.zeros(SCALARS),
         )
         self.bound = bind(TipSolver(models, ground, self.memory, scratch, self.outcome))
@@ -581,8 +735,11 @@ class Touch(NamedTuple):
         Estimated relative errors against the full model, calibrated to cover 95 % of cases.
     min_jacobian : float
         Smallest det F among the cubature points.
+    features : ndarray, shape (TIP_ERROR_FEATURES,)
+        What the error estimate is made of.
     patches : tuple of (int, float, ndarray)
-        Active patches: number, weight, answer (r,) in the wide space; for ``Atlas.displacement``.
+        Active patches: number, weight, answer (m,) in the patch's modes under
+        the tip; see ``Atlas.displacement``.
     solve_seconds : float
     """
 
@@ -604,52 +761,66 @@ class Touch(NamedTuple):
     error_von_mises: float
     error_force: float
     min_jacobian: float
+    features: Array
     patches: tuple[tuple[int, float, Array], ...]
     solve_seconds: float
 
 
-def assemble_tip_models(
-    patches: Patches, surface: TipSurface, tip: Tip, wide: list[Field], reach: float
-) -> TipModels:
-    """Local models of the tip in the wide spaces of the patches.
+def answer(state: TipState, position: Array, started: float) -> Touch:
+    """Answer a finite position of the tip; ``started`` is when the clock began to run, s.
 
-    Parameters
-    ----------
-    patches : Patches
-    surface : TipSurface
-        With n nodes.
-    tip : Tip
-    wide : list of ndarray, shape (n, 3, r), mm
-        Modes of each patch at the surface's nodes.
-    reach : float, mm
-        From a patch's centre within which faces may be touched.
+    Raises
+    ------
+    QueryError
+        If the tip's centre lies below the surface.
     """
-    near = [
-        np.flatnonzero(
-            (np.linalg.norm(surface.nodes[surface.faces] - centre, axis=2) < reach).any(axis=1)
-        ).astype(np.int32)
-        for centre in patches.centres.T
-    ]
-    own = [np.unique(surface.faces[faces], return_inverse=True) for faces in near]
-
-    def offsets(parts: list[Any]) -> Ints:
-        return np.concatenate([[0], np.cumsum([len(part) for part in parts])]).astype(np.int64)
-
-    return TipModels(
-        centres=np.ascontiguousarray(patches.centres + tip.radius * patches.frames[:, 0].T),
-        blend=patches.blend,
-        gradients=patches.gradients * patches.steps[:, :, None],
-        weights=patches.weights,
-        mu=patches.mu,
-        lam=patches.lam,
-        tip=tip,
-        surface=surface,
-        node_from=offsets([nodes for nodes, _ in own]),
-        nodes=np.concatenate([nodes for nodes, _ in own]).astype(np.int32),
-        modes=np.vstack([modes[nodes] for modes, (nodes, _) in zip(wide, own, strict=True)]),
-        face_from=offsets(near),
-        faces=np.concatenate(near),
-        corners=np.vstack(
-            [local.reshape(len(f), -1) for f, (_, local) in zip(near, own, strict=True)]
-        ).astype(np.int32),
+    query(state.bound, position)
+    outcome, memory, radius = state.outcome, state.memory, state.tip.radius
+    scalars = outcome.scalars.tolist()
+    depth, limit = scalars[DEPTH], float(outcome.limit[0])
+    if depth > radius:
+        raise QueryError(
+            "position",
+            f"the tip's centre lies {depth - radius:.2f} mm below the accessible surface",
+        )
+    contact = scalars[TOUCHED] > 0
+    force, point, normal = outcome.force.copy(), outcome.foot.copy(), outcome.normal.copy()
+    out_of_range: tuple[str, ...] = ()
+    if contact and abs(float((position - point) @ normal)) < UPRIGHT * scalars[DISTANCE]:
+        out_of_range += ("position",)
+    if depth > limit * (1 + 1e-9):
+        out_of_range += ("depth",)
+    pushed = math.sqrt(float(force @ force))
+    if pushed > 0:
+        normal = force / pushed
+        point = position - radius * normal
+    errors = np.exp(state.coefficients @ outcome.features).tolist() if contact else [0.0] * 3
+    patches = []
+    if contact:
+        for slot, weight in enumerate(outcome.weight.tolist()):
+            if weight > 0:
+                k = int(memory.patch[slot])
+                patches.append((k if k >= 0 else -2 - k, weight, memory.q[slot].copy()))
+    return Touch(
+        position=position,
+        contact=contact,
+        force=force,
+        tangent=outcome.tangent.copy(),
+        contact_point=point,
+        normal=normal,
+        depth=depth,
+        depth_limit=limit,
+        penetration=scalars[PENETRATION],
+        energy=scalars[ENERGY],
+        converged=scalars[STATUS] == equilibrium.CONVERGED,
+        iterations=int(scalars[ITERATIONS]),
+        in_range=not out_of_range,
+        out_of_range=out_of_range,
+        error_displacement=errors[0],
+        error_von_mises=errors[1],
+        error_force=errors[2],
+        min_jacobian=scalars[SMALLEST_J],
+        features=outcome.features.copy(),
+        patches=tuple(patches),
+        solve_seconds=time.perf_counter() - started,
     )

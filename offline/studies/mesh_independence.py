@@ -18,6 +18,7 @@ from offline.scenes import find_scene
 from offline.train import Pipeline
 from offline.workshop import Workshop
 from shared.atlas import Atlas
+from shared.endoscope import LIMIT_FIELDS
 from shared.scene import Size
 
 SIZE = Size(patch_spacing=9.0, modes=64, cubature_points=128, region_modes=150)
@@ -39,10 +40,11 @@ class _Inline(ThreadPoolExecutor):
 def _sparse_atlas(name: str, checkpoint: Checkpoint) -> Atlas:
     scene = find_scene(name)
     training = scene.training.model_copy(update={"region_spacing": REGION_SPACING})
-    scene = scene.model_copy(update={"training": training})
+    endoscope = scene.endoscope.model_copy(update={"tip": False})
+    scene = scene.model_copy(update={"training": training, "endoscope": endoscope})
     pipeline = Pipeline(scene, None, checkpoint)  # type: ignore[arg-type]
     pipeline.executor = _Inline(pipeline.workshop)
-    limits = np.zeros((len(pipeline.surface.vertices), 7))
+    limits = np.zeros((len(pipeline.surface.vertices), LIMIT_FIELDS))
     limits[:, 0], limits[:, 1:4] = PRESSURE, 1.0
     layout = pipeline.layout(SIZE)
     return pipeline.untested_atlas(limits, layout)

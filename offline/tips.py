@@ -1,0 +1,289 @@
+"""Training of a local model under the rigid tip: modes, cubature, first guess.
+
+The full model is too slow to be asked for enough states.  The patch is asked instead, in a space
+that holds nearly all that a tip can do to it: the modes that footprints gave it, and the linear
+responses to forces at single nodes of the surface.  Of what it answers at contacts and depths all
+over its range, and of how that changes with the position, come the few modes that it keeps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offline.cubature import compress, damped_fit, nonnegative, point_forces
+from offline.sampling import farthest
+from shared import equilibrium
+from shared.atlas import Body, LocalModels, assemble_tips
+from shared.reduced import LANES
+from shared.surface import Surface
+from shared.touch import (
+    STATUS,
+    TIP_ERROR_FEATURES,
+    TIP_FEATURES,
+    LocalTips,
+    TipModels,
+    TipState,
+    query,
+    tip_features,
+)
+
+Array = NDArray[np.float64]
+
+TIP_MODES = 24
+TIP_POINTS = 96
+"""Modes and cubature points under the tip."""
+
+NODAL = 36
+"""Directions that responses to forces at nodes add to the modes of the patch."""
+
+NODES = 0.6
+"""Distance beyond the patch's extent within which nodes count, in radii of the tip."""
+
+PRESSED, DEPTHS = 12, 3
+"""Contacts that a patch learns from, and depths at each."""
+
+STEP = 0.15
+"""Millimetres by which a state's derivatives in the position are followed."""
+
+DEPARTURE = 0.03
+"""Size of the random departure from equilibrium, relative to each mode's part in the states."""
+
+EQUATIONS = 250
+
+
+@dataclass(frozen=True)
+class TipResult:
+    """A trained local model of the tip; shapes as in ``shared.touch.LocalTips``."""
+
+    modes: NDArray[np.float16]
+    points: NDArray[np.int32]
+    weights: Array
+    guess: NDArray[np.float16]
+
+
+class TipTrainer:
+    """Local models of the tip that solve training positions by the query of the service."""
+
+    def __init__(
+        self,
+        body: Body,
+        surface: Surface,
+        models: LocalModels,
+        tips: LocalTips,
+        tangent: LocalTips | None = None,
+    ) -> None:
+        self.models = assemble_tips(body, models, tips, tangent)
+        depths = np.full((len(surface.vertices), 1), np.inf)
+        none = np.zeros((3, TIP_ERROR_FEATURES))
+        self.state = TipState(self.models, surface.ground(depths), none)
+
+    def solve(self, position: Array) -> bool:
+        """Solve a position, from the last one if that was solved."""
+        query(self.state.bound, position)
+        return bool(self.state.outcome.scalars[STATUS] == equilibrium.CONVERGED)
+
+    @property
+    def gradients(self) -> NDArray[np.float32]:
+        """Gradients (c, 9, m) of the modes at the points."""
+        rows = self.models.points.gradients[0]
+        tiles = rows.reshape(len(rows), -1, 9, LANES)
+        return np.ascontiguousarray(tiles.transpose(1, 3, 2, 0).reshape(-1, 9, len(rows)))
+
+    def last(self, position: Array, depth: float) -> _State:
+        """The last answer, which was to this position."""
+        memory = self.state.memory
+        return _State(
+            position=position,
+            depth=depth,
+            q=memory.q[0].copy(),
+            factor=np.tril(memory.factor[0]),
+            coupling=memory.coupling[0].T.copy(),
+            force=self.state.outcome.force.copy(),
+        )
+
+
+@dataclass(frozen=True)
+class _State:
+    """Answer of a local model."""
+
+    position: Array  # (3,)
+    depth: float
+    q: Array  # (m,)
+    factor: Array  # (m, m)
+    coupling: Array  # (m, 3)
+    force: Array  # (3,)
+
+    def within(self, V: Array) -> _State:
+        """Its part in orthonormal modes V (m, k)."""
+        factor = np.asarray(np.linalg.cholesky(V.T @ self.factor @ self.factor.T @ V), float)
+        return replace(self, q=V.T @ self.q, factor=factor, coupling=V.T @ self.coupling)
+
+    @property
+    def slope(self) -> Array:
+        """Derivative (m, 3) of the answer in the position."""
+        L = self.factor
+        return np.asarray(np.linalg.solve(L.T, np.linalg.solve(L, self.coupling)))
+
+
+def train_tip(
+    body: Body,
+    surface: Surface,
+    weights: Array,
+    models: LocalModels,
+    orthonormal: NDArray[np.float32],
+    contacts: Array,
+    normals: Array,
+    depths: Array,
+    rng: np.random.Generator,
+) -> TipResult:
+    """Train one local model of the tip.
+
+    Parameters
+    ----------
+    body : Body
+    surface : Surface
+        Accessible.
+    weights : ndarray, shape (quadrature points,), mm^3
+    models : LocalModels
+        The patch by itself, trained for footprints.
+    orthonormal : ndarray, shape (M, M)
+        Orthonormal modes in the basis of its region.
+    contacts, normals : ndarray, shape (c, 3)
+        Points that it answers for.
+    depths : ndarray, shape (c,), mm
+        Largest depths there.
+    """
+    space = _generous(body, models, orthonormal)
+    trainer = TipTrainer(
+        body,
+        surface,
+        models,
+        _untrained(space, np.arange(len(weights)), weights),
+        _untrained(space, models.points, models.weights),
+    )
+    pressed = _press(trainer, contacts, normals, depths, body.tip.radius, rng)
+    V = _modes(pressed)
+    states = [state.within(V) for state in pressed]
+    modes = (space @ V).astype(np.float16)
+    gradients = trainer.gradients @ V.astype(np.float32)
+    law = trainer.models.points
+    forces = _training_forces(gradients, (law.weights[0], law.mu[0], law.lam[0]), states, rng)[
+        : len(weights)
+    ]
+    A, b = compress(forces, EQUATIONS, rng)
+    points, chosen = nonnegative(A, b, TIP_POINTS)
+    return TipResult(
+        modes=modes,
+        points=points.astype(np.int32),
+        weights=chosen * weights[points],
+        guess=_fit_guess(trainer.models, states).astype(np.float16),
+    )
+
+
+def compile_tip_query(body: Body, surface: Surface, models: LocalModels) -> None:
+    """Compile what ``train_tip`` runs, on a model of nothing."""
+    modes = np.zeros((models.basis.shape[1], 4))
+    trainer = TipTrainer(body, surface, models, _untrained(modes, models.points, models.weights))
+    trainer.solve(surface.vertices[0] + 2 * body.tip.radius * surface.normals[0])
+
+
+def _untrained(modes: Array, points: NDArray[np.integer[Any]], weights: Array) -> LocalTips:
+    """A model in modes (M, m) with given points and no first guess."""
+    return LocalTips(
+        modes=modes[None].astype(np.float32),
+        point_from=np.array([0, len(points)]),
+        points=points.astype(np.int32),
+        weights=weights,
+        guess=np.zeros((1, TIP_FEATURES, modes.shape[1]), np.float32),
+    )
+
+
+def _generous(body: Body, models: LocalModels, orthonormal: NDArray[np.float32]) -> Array:
+    """Modes of a patch (M, r + NODAL) with its responses to forces at nodes of its surface.
+
+    In the energy of the rest state, the response to a force at a node has the components of the
+    orthonormal modes there.
+    """
+    _, nodes = body.touchable
+    away = np.linalg.norm(body.nodes[nodes] - models.centres[0], axis=1)
+    near = nodes[(away < models.extent + NODES * body.tip.radius) & ~body.clamped[nodes]]
+    basis = models.basis[0].reshape(len(orthonormal), -1, 3)[:, near].reshape(len(orthonormal), -1)
+    responses = orthonormal.T.astype(float) @ (models.steps[0][:, None] * basis)
+    leading = np.linalg.solve(orthonormal.astype(float), models.modes[0].astype(float))
+    rest = responses / np.linalg.norm(responses, axis=0)
+    rest -= leading @ np.linalg.lstsq(leading, rest)[0]
+    count = min(NODAL, rest.shape[1]) // 4 * 4  # compiled loops take modes four at a time
+    U = np.linalg.svd(rest, full_matrices=False)[0][:, :count]
+    Q = np.linalg.qr(np.hstack([leading, U]))[0]
+    return (orthonormal @ Q).astype(np.float32)
+
+
+def _press(
+    trainer: TipTrainer,
+    contacts: Array,
+    normals: Array,
+    depths: Array,
+    radius: float,
+    rng: np.random.Generator,
+) -> list[_State]:
+    """Push the tip in at contacts far apart, step by step to about the largest depth."""
+    states = []
+    for i in farthest(contacts, min(PRESSED, len(contacts))):
+        trainer.state.forget()
+        for share in (np.arange(DEPTHS) + rng.uniform(0.3, 1.0, DEPTHS)) / DEPTHS:
+            depth = float(share * depths[i])
+            position = contacts[i] + (radius - depth) * normals[i]
+            if not trainer.solve(position):
+                break
+            states.append(trainer.last(position, depth))
+    return states
+
+
+def _modes(states: list[_State]) -> Array:
+    """Leading directions (r, TIP_MODES) of states and their slopes, each state of size one."""
+    vectors = [
+        np.column_stack([state.q, STEP * state.slope]) / np.linalg.norm(state.q) for state in states
+    ]
+    return np.linalg.svd(np.hstack(vectors), full_matrices=False)[0][:, :TIP_MODES]
+
+
+def _training_forces(
+    gradients: NDArray[np.float32],
+    law: tuple[Array, Array, Array],
+    states: list[_State],
+    rng: np.random.Generator,
+) -> NDArray[np.float32]:
+    """What each point (row) contributes to displacement and force of answers (columns).
+
+    Times the square root of the compliance, an error of the internal force counts by the
+    displacement it causes in the energy norm; times the slope, by the change of the force on the
+    tool.
+    """
+    columns = []
+    for state in states:
+        looks = np.hstack(
+            [
+                np.linalg.inv(state.factor).T / np.linalg.norm(state.q),
+                state.slope / np.linalg.norm(state.force),
+            ]
+        )
+        departure = DEPARTURE * np.abs(state.q) * rng.standard_normal(len(state.q))
+        for q in (state.q, state.q + departure):
+            force = point_forces(gradients, *law, q)
+            if force is not None:
+                columns.append(force @ looks.astype(np.float32))
+    return np.hstack(columns)
+
+
+def _fit_guess(models: TipModels, states: list[_State]) -> Array:
+    """Polynomials (TIP_FEATURES, m) of the answers."""
+    features = np.zeros(TIP_FEATURES)
+    rows = []
+    for state in states:
+        tip_features(models.frames[0], models.centres[:, 0], state.position, state.depth, features)
+        rows.append(features.copy())
+    return damped_fit(np.array(rows), np.array([state.q for state in states]))

@@ -1,0 +1,227 @@
+"""The reduced against the full model under the rigid tip, at positions it has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from offline.norms import relative, statistics
+from offline.sampling import random_points
+from offline.validate import UNSEEN, write_rows
+from offline.workers import completed, worker_pool
+from offline.workshop import TouchSample, Workshop, open_artifact
+from shared.artifact import read_artifact
+from shared.atlas import Atlas, Estimator
+from shared.endoscope import TIP_DEPTH
+from shared.errors import PalpateError
+from shared.scene import Scene
+from shared.surface import Surface
+from shared.touch import Touch
+
+Array = NDArray[np.float64]
+
+QUANTITIES = ("displacement", "von_mises", "force")
+
+COVERAGE = 0.97
+"""Share of known positions whose errors the estimate must cover: above 95 %, as unseen ones are."""
+
+DAMPING = 3.0
+
+
+@dataclass
+class TouchComparison:
+    """One position answered by both models; errors are relative L2 norms.
+
+    Attributes
+    ----------
+    x, y, z : float, mm
+        Centre of the tip.
+    depth, depth_limit, penetration : float, mm
+    displacement, von_mises, force, tangent : float
+        Errors over all nodes, over all nodes outside the clamped layer, and of the force and the
+        matrix.
+    features : ndarray
+        Of the error estimate.
+    estimated_displacement, estimated_von_mises, estimated_force : float
+    converged, in_range : bool
+    iterations : int
+    """
+
+    x: float
+    y: float
+    z: float
+    depth: float
+    depth_limit: float
+    penetration: float
+    displacement: float
+    von_mises: float
+    force: float
+    tangent: float
+    converged: bool
+    in_range: bool
+    iterations: int
+    features: Array = field(repr=False)
+    estimated_displacement: float = field(default=float("nan"))
+    estimated_von_mises: float = field(default=float("nan"))
+    estimated_force: float = field(default=float("nan"))
+
+    def estimate(self, estimator: Estimator) -> None:
+        """Fill in the estimated errors."""
+        self.estimated_displacement, self.estimated_von_mises, self.estimated_force = estimator(
+            self.features
+        )
+
+
+def random_positions(
+    surface: Surface, limits: Array, scene: Scene, count: int, rng: np.random.Generator
+) -> Array:
+    """Centres of the tip (count, 3) mm over the whole surface and range of depths.
+
+    Contact points are uniform over the area, one in eight on the rim of the surface; depths are
+    denser towards the limit.
+    """
+    points = random_points(surface, count, rng)
+    rim = surface.rim()
+    radius = scene.endoscope.radius
+    positions = []
+    for i, point in enumerate(points):
+        if i % 8 == 0:
+            point = surface.vertices[rng.choice(rim)]
+        x, normal, _, fields = surface.locate(point, limits)
+        positions.append(x + (radius - fields[TIP_DEPTH] * np.sqrt(rng.random())) * normal)
+    return np.array(positions)
+
+
+def compare_touch(
+    workshop: Workshop, atlas: Atlas, answer: Touch, sample: TouchSample
+) -> TouchComparison:
+    """Compare an answer with the full solution."""
+    displacement = atlas.displacement(answer).astype(float)
+    stress = atlas.von_mises(answer).astype(float)
+    reference = sample.displacement.astype(float)
+    exact = workshop.von_mises(reference)
+    kept = workshop.beyond_clamped_layer
+    x, y, z = answer.position.tolist()
+    return TouchComparison(
+        x=x,
+        y=y,
+        z=z,
+        depth=answer.depth,
+        depth_limit=answer.depth_limit,
+        penetration=answer.penetration,
+        displacement=relative(displacement, reference),
+        von_mises=relative(stress[kept], exact[kept]),
+        force=relative(answer.force, sample.force),
+        tangent=relative(answer.tangent, sample.tangent),
+        converged=answer.converged,
+        in_range=answer.in_range,
+        iterations=answer.iterations,
+        features=answer.features,
+        estimated_displacement=answer.error_displacement,
+        estimated_von_mises=answer.error_von_mises,
+        estimated_force=answer.error_force,
+    )
+
+
+def summarise_touches(rows: Sequence[TouchComparison]) -> dict[str, Any]:
+    """Errors of the converged answers; ``covered``: the share within all three estimates."""
+    unconverged = sum(not r.converged for r in rows)
+    rows = [r for r in rows if r.converged]
+    covered = [
+        all(getattr(r, name) <= getattr(r, f"estimated_{name}") for name in QUANTITIES)
+        for r in rows
+    ]
+    return {
+        "queries": len(rows) + unconverged,
+        "unconverged": unconverged,
+        "covered": float(np.mean(covered)),
+        **{name: statistics([getattr(r, name) for r in rows]) for name in (*QUANTITIES, "tangent")},
+        "penetration_over_depth": statistics([r.penetration / r.depth for r in rows]),
+        "estimate_over_error_median": {
+            name: float(
+                np.median(
+                    [getattr(r, f"estimated_{name}") / max(getattr(r, name), 1e-12) for r in rows]
+                )
+            )
+            for name in QUANTITIES
+        },
+    }
+
+
+def calibrate_touches(rows: Sequence[TouchComparison]) -> Estimator:
+    """Fit the error estimate to known errors: it covers ``COVERAGE`` of them in all quantities.
+
+    A least-squares fit of their logs, raised by one constant for each quantity: so far that each
+    alone is covered as often as all are to be, then all alike until they are.
+    """
+    rows = [r for r in rows if r.converged]
+    X = np.array([r.features for r in rows])
+    varies = X.std(axis=0) > 0
+    middle, scale = np.where(varies, X.mean(axis=0), 0.0), np.where(varies, X.std(axis=0), 1.0)
+    A = (X - middle) / scale
+    # few rows for many features: hold the coefficients back
+    damping = np.diag(np.where(varies, DAMPING, 0.0))
+    needed = int(np.ceil(COVERAGE * len(rows))) - 1
+    coefficients, rests = [], []
+    for name in QUANTITIES:
+        y = np.log([max(getattr(r, name), 1e-8) for r in rows])
+        c = np.linalg.lstsq(np.vstack([A, damping]), np.append(y, np.zeros(len(damping))))[0]
+        c = c / scale
+        c[0] -= middle @ c
+        c[0] += np.sort(y - X @ c)[needed]
+        coefficients.append(c)
+        rests.append(y - X @ c)
+    missing = max(float(np.sort(np.max(rests, axis=0))[needed]), 0.0)
+    for c in coefficients:
+        c[0] += missing
+    return Estimator(np.array(coefficients))
+
+
+def validate_touches(
+    artifact: Path, queries: int, seed: int, csv: Path | None = None
+) -> dict[str, Any]:
+    """Compare an artifact with its full model at new random positions of the tip.
+
+    Parameters
+    ----------
+    artifact : Path
+    queries : int
+        Positions, over the whole surface and range of depths.
+    seed : int
+        Of the positions; those of training come from none.
+    csv : Path, optional
+        Where to write one row per position.
+
+    Returns
+    -------
+    dict
+        As ``summarise_touches``, and ``without_equilibrium``: positions at which the full model
+        found none, and which count in nothing else.
+    """
+    atlas = Atlas.load(artifact)
+    workshop = Workshop.of_artifact(read_artifact(artifact))
+    rng = np.random.default_rng([atlas.scene.seed, UNSEEN, seed])
+    positions = random_positions(atlas.surface, atlas.limits, atlas.scene, queries, rng)
+    answers = [atlas.touch(position) for position in positions]
+    tasks = {
+        str(i): (Workshop.touch, answer.position, atlas.displacement(answer))
+        for i, answer in enumerate(answers)
+    }
+    rows = {}
+    with worker_pool(open_artifact, artifact) as pool:
+        for name, sample in tqdm(completed(pool, tasks), "full solutions", len(tasks)):
+            if sample.displacement.size:
+                rows[int(name)] = compare_touch(workshop, atlas, answers[int(name)], sample)
+    compared = [rows[i] for i in sorted(rows)]
+    if not compared:
+        raise PalpateError(f"{artifact}: the full model has no equilibrium at any position")
+    if csv:
+        csv.parent.mkdir(parents=True, exist_ok=True)
+        write_rows(csv, compared)
+    return summarise_touches(compared) | {"without_equilibrium": queries - len(compared)}
