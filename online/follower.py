@@ -180,6 +180,7 @@ def _nothing(position: Array) -> Touch:
         error_von_mises=0.0,
         error_force=0.0,
         min_jacobian=1.0,
+        features=np.zeros(0),
         patches=(),
         solve_seconds=0.0,
     )

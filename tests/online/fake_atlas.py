@@ -150,6 +150,7 @@ class FakeAtlas:
             error_von_mises=0.002,
             error_force=0.003,
             min_jacobian=1.0 - 0.1 * max(depth, 0.0),
+            features=np.ones(1),
             patches=((3, 1.0, np.array([depth, 0.5])),) * contact,
             solve_seconds=time.perf_counter() - start,
         )
