@@ -1,18 +1,20 @@
-"""From a request to the bytes of its answer: solve, recover, encode. The service's hot path.
+"""From the bytes of a request to those of its answer: decode, solve, recover, encode.
 
-Nothing here awaits: an answer has the model for itself from its first line to its last.
+The service's hot path. Nothing here awaits: an answer has the model for itself from its first line
+to its last.
 """
 
 import math
-from time import perf_counter_ns
+from time import perf_counter
 
 import numpy as np
 from starlette.responses import Response
 
 from online import wire
 from online.errors import Refusal
+from online.metrics import PHASES, Metrics
 from online.negotiation import JSON
-from online.schemas import SolveRequest
+from online.schemas import SolveRequest, parse_request
 from online.store import Model
 from shared.answer import describe
 from shared.atlas import Atlas, Solution
@@ -22,7 +24,9 @@ ABSURD = 10.0
 """Multiple of the largest trained pressure from which on there is no answer at all."""
 
 
-def answer(model: Model, request: SolveRequest, media_type: str, max_json_numbers: int) -> Response:
+def answer(
+    model: Model, body: bytes, media_type: str, max_json_numbers: int, metrics: Metrics
+) -> Response:
     """Solve a request from rest and write the answer.
 
     Each request is answered on its own: the same request has the same answer, whatever came
@@ -31,8 +35,11 @@ def answer(model: Model, request: SolveRequest, media_type: str, max_json_number
     Raises
     ------
     Refusal
-        If the load is not one the model can be asked about, or it has no equilibrium.
+        If the request is malformed, the load is not one the model can be asked about, or it has
+        no equilibrium.
     """
+    received = perf_counter()
+    request = parse_request(body)
     atlas = model.atlas
     contact = request.contacts[0]
     if media_type == JSON:
@@ -45,14 +52,14 @@ def answer(model: Model, request: SolveRequest, media_type: str, max_json_number
             {"le": ABSURD * atlas.pressure_max},
         )
 
-    start = perf_counter_ns()
+    start = perf_counter()
     try:
         solution = atlas.solve(
             contact.position, contact.pressure, contact.direction, contact.radius
         )
     except QueryError as error:
         raise Refusal("unanswerable_query", f"contacts.0.{error.field}", error.message) from None
-    solved = perf_counter_ns()
+    solved = perf_counter()
     if not solution.converged:
         raise Refusal(
             "no_equilibrium",
@@ -70,22 +77,23 @@ def answer(model: Model, request: SolveRequest, media_type: str, max_json_number
             fields["displacement"] = displacement[nodes]
         if "von_mises" in request.outputs:
             fields["von_mises"] = atlas.von_mises(solution, request.region, displacement)
-    recovered = perf_counter_ns()
+    recovered = perf_counter()
 
     head = describe(atlas.name, solution)
     _check_finite(solution, fields)
     head["timing"] = {
-        "solve_us": (solved - start) / 1e3,
-        "recover_us": (recovered - solved) / 1e3,
+        "solve_us": 1e6 * (solved - start),
+        "recover_us": 1e6 * (recovered - solved),
     }
-    body = wire.encode(media_type, head, fields)
-    encoded = perf_counter_ns()
-    timing = (
-        f"solve;dur={(solved - start) / 1e6:.4f}, "
-        f"recover;dur={(recovered - solved) / 1e6:.4f}, "
-        f"encode;dur={(encoded - recovered) / 1e6:.4f}"
+    content = wire.encode(media_type, head, fields)
+    encoded = perf_counter()
+    borders = (received, start, solved, recovered, encoded)
+    metrics.count_query(borders, solution.in_range)
+    timing = ", ".join(
+        f"{phase};dur={1e3 * (end - begin):.4f}"
+        for phase, begin, end in zip(PHASES, borders, borders[1:], strict=False)
     )
-    return Response(body, media_type=media_type, headers={"server-timing": timing})
+    return Response(content, media_type=media_type, headers={"server-timing": timing})
 
 
 def _check_size(atlas: Atlas, request: SolveRequest, limit: int) -> None:

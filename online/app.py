@@ -8,11 +8,13 @@ from contextlib import asynccontextmanager
 from importlib.metadata import version
 from typing import Any
 
+import orjson
 from fastapi import FastAPI
 from pydantic.json_schema import models_json_schema
 
-from online import errors, session
+from online import errors, guard, session
 from online.answer import answer
+from online.metrics import Metrics
 from online.negotiation import OFFERED
 from online.routes import add_routes
 from online.schemas import SolveRequest
@@ -26,11 +28,12 @@ def create_app(
     settings: Settings,
     store: Store | None = None,
     on_ready: Callable[[Store], None] | None = None,
+    metrics: Metrics | None = None,
 ) -> FastAPI:
     """Make the service.
 
     It answers at once; the models are loaded and warmed meanwhile, and ``/ready`` says when that
-    is done.
+    is done. One of several workers leaves all clients to the others until it is ready.
 
     Parameters
     ----------
@@ -38,13 +41,18 @@ def create_app(
     store : Store, optional
         Where models come from; by default the artifacts of `settings`.
     on_ready : callable, optional
-        Called once, when every model is warm.
+        Called once, on the thread that answers, when every model is warm.
+    metrics : Metrics, optional
+        Where to count; by default in a table of its own.
     """
     models = Store(settings.artifacts) if store is None else store
+    counts = Metrics() if metrics is None else metrics
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         preparing = asyncio.create_task(_prepare(models, on_ready))
+        if settings.workers > 1:
+            await preparing
         yield
         await preparing
 
@@ -59,8 +67,10 @@ def create_app(
         # Even unused it looks for a tracer in every request; the service times itself.
         telemetry={"tracing": False, "metrics": False, "logs": False},
     )
+    app.state.metrics = counts
     errors.install(app)
-    add_routes(app, models, settings)
+    guard.install(app, settings, counts)
+    add_routes(app, models, settings, counts)
     _describe_request(app)
     return app
 
@@ -81,11 +91,12 @@ async def _prepare(store: Store, on_ready: Callable[[Store], None] | None) -> No
 
 def _warm(model: Model) -> None:
     """Call every kernel and encoder once, so that no client pays for a first time."""
+    uncounted = Metrics()
     for region in ("none", "surface", "all"):
-        request = SolveRequest.model_validate({"contacts": [model.example], "region": region})
+        body = orjson.dumps({"contacts": [model.example], "region": region})
         for media_type in OFFERED:
-            answer(model, request, media_type, max_json_numbers=10**9)
-    session.warm(model)
+            answer(model, body, media_type, 10**9, uncounted)
+    session.warm(model, uncounted)
 
 
 def _describe_request(app: FastAPI) -> None:

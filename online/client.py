@@ -68,6 +68,22 @@ class Mesh:
     clamped: NDArray[np.uint8]
 
 
+@dataclass(frozen=True)
+class Accessible:
+    """The surface that the endoscope can touch.
+
+    Parameters
+    ----------
+    vertices, normals : ndarray, shape (v, 3), float32, mm and unit
+    triangles : ndarray, shape (t, 3), int32
+        Indices into `vertices`, outward.
+    """
+
+    vertices: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    triangles: NDArray[np.int32]
+
+
 class Client:
     """One connection to a service.
 
@@ -120,6 +136,12 @@ class Client:
         path = f"/scenes/{quote(name, safe='')}/mesh?region={quote(region)}"
         _, arrays = wire.decode(self._request("GET", path, BINARY))
         return Mesh(**arrays)
+
+    def accessible(self, name: str) -> Accessible:
+        """Get the undeformed surface that the endoscope can touch."""
+        path = f"/scenes/{quote(name, safe='')}/accessible"
+        _, arrays = wire.decode(self._request("GET", path, BINARY))
+        return Accessible(**arrays)
 
     def solve(
         self,

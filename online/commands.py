@@ -4,109 +4,119 @@ Each imports what it runs when it runs, so that ``--help`` is instant.
 """
 
 import json
-import logging
-import signal
-import sys
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import click
 
-from shared.errors import PalpateError
+from online.logs import FORMATS, LEVELS
+from online.settings import Settings
 
-if TYPE_CHECKING:
-    from online.store import Store
+_option = partial(click.option, show_default=True, show_envvar=True)
 
 
-@click.command()
-@click.option(
+@click.command(context_settings={"auto_envvar_prefix": "PALPATE"})
+@_option(
     "--artifacts",
     type=click.Path(file_okay=False, path_type=Path),
     default=Path("artifacts"),
-    envvar="PALPATE_ARTIFACTS",
-    show_default=True,
-    show_envvar=True,
     help="Directory whose *.h5 are served.",
 )
-@click.option(
-    "--host", default="127.0.0.1", envvar="PALPATE_HOST", show_default=True, show_envvar=True
+@_option("--host", default="127.0.0.1", help="Address to listen on.")
+@_option("--port", type=click.IntRange(0, 65535), default=8000, help="0 takes a free one.")
+@_option(
+    "--workers",
+    type=click.IntRange(1, 64),
+    default=1,
+    help="Processes that share the work, each with the models in memory. A session stays with the "
+    "worker that opened it; limits hold per worker; one that dies is replaced.",
 )
-@click.option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    default=8000,
-    envvar="PALPATE_PORT",
-    show_default=True,
-    show_envvar=True,
-    help="0 takes a free one.",
+@_option(
+    "--realtime/--no-realtime",
+    default=False,
+    help="Run before the machine's ordinary work and stay in memory, if the system allows it; the "
+    "log says whether it does.",
 )
-@click.option(
+@_option(
+    "--token",
+    show_default=False,
+    help="What clients must present, as Authorization: Bearer TOKEN. Rather set the variable: "
+    "the command line is there for all to read.",
+)
+@_option(
+    "--public/--no-public",
+    default=False,
+    help="Serve other machines even though no token is set.",
+)
+@_option(
+    "--origin",
+    "origins",
+    multiple=True,
+    envvar="PALPATE_ORIGINS",
+    show_default=False,
+    help="Origin whose web pages may use the service, such as https://example.org, or * for any; "
+    "may be repeated (in the variable: separated by spaces). Its own pages always may.",
+)
+@_option(
+    "--rate-limit",
+    type=click.FloatRange(0),
+    default=Settings.rate_limit,
+    help="Requests per second and client address; more are refused. 0: no limit.",
+)
+@_option(
+    "--max-wait",
+    type=click.FloatRange(0.001),
+    default=Settings.max_wait,
+    help="Seconds after which a waiting request is refused rather than answered late.",
+)
+@_option(
+    "--max-body",
+    type=click.IntRange(1024),
+    default=Settings.max_body,
+    help="Most bytes of a request.",
+)
+@_option(
+    "--max-json-numbers",
+    type=click.IntRange(0),
+    default=Settings.max_json_numbers,
+    help="Most numbers in a JSON answer's fields; the binary formats have no such limit.",
+)
+@_option(
     "--max-sessions",
     type=click.IntRange(0),
-    default=16,
-    envvar="PALPATE_MAX_SESSIONS",
-    show_default=True,
-    show_envvar=True,
-    help="Most sessions at a time; more are refused.",
+    default=Settings.max_sessions,
+    help="Most sessions at a time; further ones are refused.",
 )
-@click.option(
+@_option(
     "--session-idle",
     type=click.FloatRange(0.1),
-    default=60.0,
-    envvar="PALPATE_SESSION_IDLE",
-    show_default=True,
-    show_envvar=True,
-    help="Seconds after which a silent session is closed.",
+    default=Settings.session_idle,
+    help="Seconds after which a session that sends nothing is closed.",
 )
-@click.option("--echo", is_flag=True, help="Answer WS /echo, for palpate latency --session.")
-def serve(
-    artifacts: Path, host: str, port: int, max_sessions: int, session_idle: float, echo: bool
-) -> None:
-    """Answer loads over HTTP and tools in sessions.
+@_option(
+    "--echo/--no-echo",
+    default=False,
+    help="Answer /echo, for palpate latency --session.",
+)
+@_option("--log-format", type=click.Choice(FORMATS), default=Settings.log_format)
+@_option("--log-level", type=click.Choice(LEVELS), default=Settings.log_level)
+@_option("--access-log/--no-access-log", default=False, help="Log every request.")
+def serve(host: str, port: int, public: bool, **settings: Any) -> None:
+    r"""Answer loads over HTTP and in sessions.
 
-    Prints a request to try once every model is loaded and warm.
+    Prints a request to try once every model is loaded and warm. Every option can also be set by
+    the variable named beside it. On loopback anybody on this machine is served; on any other
+    address a token is asked for, unless --public says not to.
+
+    \b
+    Examples:
+      palpate serve --artifacts artifacts --realtime
+      PALPATE_TOKEN=$(openssl rand -hex 32) palpate serve --host 0.0.0.0 --workers 2
     """
-    if not any(artifacts.glob("*.h5")):
-        raise PalpateError(
-            f"no artifacts (*.h5) in {artifacts}; make one with: "
-            f"palpate train turbinate --out {artifacts / 'turbinate.h5'}"
-        )
-    import uvicorn
+    from online.serving import serve
 
-    from online.app import create_app
-    from online.settings import Settings
-    from online.websocket import OPTIONS
-
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s: %(message)s")
-    settings = Settings(artifacts, max_sessions=max_sessions, session_idle=session_idle, echo=echo)
-    config = uvicorn.Config(
-        lambda: create_app(settings, on_ready=lambda store: _invite(store, url)),
-        factory=True,
-        host=host,
-        port=port,
-        access_log=False,
-        log_level="warning",
-        **OPTIONS,
-    )
-    bound = config.bind_socket()
-    url = f"http://{f'[{host}]' if ':' in host else host}:{bound.getsockname()[1]}"
-    # The server shuts down on a signal and then raises it again, for us to end cleanly.
-    for stop in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(stop, lambda *_: sys.exit(0))
-    uvicorn.Server(config).run(sockets=[bound])
-
-
-def _invite(store: "Store", url: str) -> None:
-    """Print what is served and a request to try."""
-    for refused in store.refused:
-        click.echo(f"Refused {refused.reason}")
-    click.echo(f"Serving {', '.join(store.models) or 'nothing'} on {url} (API: {url}/docs)")
-    for name, model in store.models.items():
-        click.echo(
-            f"Try: curl {url}/scenes/{name}/solve -H 'Content-Type: application/json' "
-            f"-d '{json.dumps({'contacts': [model.example]})}'"
-        )
-        break
+    serve(Settings(**settings), host, port, public)
 
 
 @click.command()
@@ -134,6 +144,98 @@ def latency(url: str, scene: str, rounds: int, session: bool, as_json: bool) -> 
         return
     for name, value in report.items():
         click.echo(f"{name:<16}{value:8.2f}")
+
+
+@click.command()
+@click.argument("url")
+@click.argument("scene", default="turbinate")
+@click.option(
+    "--sessions", type=click.IntRange(0), default=1, show_default=True, help="Tools at once."
+)
+@click.option(
+    "--rate",
+    type=click.FloatRange(1, 100_000),
+    default=1000.0,
+    show_default=True,
+    help="Frames per second of each session.",
+)
+@click.option(
+    "--output",
+    "outputs",
+    multiple=True,
+    type=click.Choice(["coordinates", "displacement", "von_mises", "stress", "half"]),
+    help="What frames ask for beyond force and tangent; may be repeated.",
+)
+@click.option(
+    "--queries-per-second",
+    "queries",
+    type=click.FloatRange(0, 100_000),
+    default=0.0,
+    show_default=True,
+    help="Solves over HTTP, in all, with fields in binary.",
+)
+@click.option(
+    "--region",
+    type=click.Choice(["none", "surface", "all"]),
+    default="all",
+    show_default=True,
+    help="Nodes that queries ask fields for.",
+)
+@click.option(
+    "--connections",
+    type=click.IntRange(1, 1000),
+    default=4,
+    show_default=True,
+    help="Connections that queries share.",
+)
+@click.option("--duration", type=click.FloatRange(0.5), default=10.0, show_default=True, help="s")
+@click.option(
+    "--overload",
+    type=click.FloatRange(1),
+    default=1.0,
+    help="Multiply the rates for a second DURATION, go back to them for a third, and say how soon "
+    "all is as before.",
+)
+@click.option(
+    "--depth",
+    type=click.FloatRange(0),
+    default=1.0,
+    show_default=True,
+    help="How deep the tools press, mm.",
+)
+@click.option("--seed", type=int, default=0, show_default=True, help="Of the paths.")
+@click.option("--token", envvar="PALPATE_TOKEN", show_envvar=True)
+@click.option(
+    "--out",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="PNG of latency over time and of its distribution.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def loadtest(outputs: tuple[str, ...], out: Path | None, as_json: bool, **plan: Any) -> None:
+    r"""Put a load on the service at URL and time it from when each message was due.
+
+    Sessions move a tip over the whole accessible surface of SCENE at up to 50 mm/s, in and out of
+    contact; queries press random places. A generator that never sleeps sends each message when it
+    is due, whatever became of those before. Windows of 0.25 s in which the machine's host took
+    time or the generator was late are not clean; latencies are told with and without them. For
+    Linux and macOS.
+
+    \b
+    Examples:
+      palpate loadtest http://127.0.0.1:8000 --sessions 4 --queries-per-second 20
+      palpate loadtest http://127.0.0.1:8000 --sessions 0 --queries-per-second 200 --region none
+      palpate loadtest http://127.0.0.1:8000 --sessions 4 --overload 10 --out overload.png
+    """
+    from online.frames import Output
+    from online.loadtest.report import table
+    from online.loadtest.run import Plan, run
+
+    outcome = run(Plan(**plan, outputs=sum(Output[name.upper()] for name in outputs)))
+    click.echo(json.dumps(outcome.summary) if as_json else table(outcome.summary))
+    if out is not None:
+        from online.loadtest.picture import draw
+
+        draw(outcome, out)
 
 
 @click.command()

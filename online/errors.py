@@ -18,6 +18,8 @@ from starlette.requests import ClientDisconnect
 from shared.errors import PalpateError
 
 STATUS = {
+    "unauthorized": 401,
+    "foreign_origin": 403,
     "unknown_scene": 404,
     "not_found": 404,
     "method_not_allowed": 405,
@@ -30,7 +32,9 @@ STATUS = {
     "unanswerable_query": 422,
     "no_equilibrium": 422,
     "too_large_for_json": 422,
+    "too_many_requests": 429,
     "internal": 500,
+    "overloaded": 503,
     "not_ready": 503,
     "too_many_sessions": 503,
 }
@@ -49,16 +53,26 @@ class Refusal(PalpateError):
         What is wrong with it.
     allowed : JSON-able, optional
         What would be right.
+    headers : mapping from str to str, optional
+        Headers of the response, such as ``Retry-After``.
     """
 
-    def __init__(self, code: str, field: str, message: str, allowed: Any = None) -> None:
+    def __init__(
+        self,
+        code: str,
+        field: str,
+        message: str,
+        allowed: Any = None,
+        headers: Mapping[str, str] | None = None,
+    ) -> None:
         super().__init__(message)
         self.code = code
         self.field = field
         self.message = message
         self.allowed = allowed
+        self.headers = headers
 
-    def response(self, headers: Mapping[str, str] | None = None) -> Response:
+    def response(self) -> Response:
         """Make the HTTP response that says so."""
         error = {
             "code": self.code,
@@ -67,7 +81,7 @@ class Refusal(PalpateError):
             "allowed": self.allowed,
         }
         return Response(
-            orjson.dumps({"error": error}), STATUS[self.code], headers, "application/json"
+            orjson.dumps({"error": error}), STATUS[self.code], self.headers, "application/json"
         )
 
 
@@ -94,16 +108,22 @@ def invalid(details: Sequence[Any], names: Mapping[str, Sequence[str]] | None = 
     return Refusal("invalid_value", field, first["msg"], allowed)
 
 
+def _refuse(request: Request, refusal: Refusal) -> Response:
+    """Count a refusal and answer with it."""
+    request.app.state.metrics.count_refusal(refusal.code)
+    return refusal.response()
+
+
 async def _refusal(request: Request, error: Exception) -> Response:
     assert isinstance(error, Refusal)
-    return error.response()
+    return _refuse(request, error)
 
 
 async def _parameters(request: Request, error: Exception) -> Response:
     """Answer wrong path and query parameters, all that FastAPI checks here."""
     assert isinstance(error, RequestValidationError)
     details = [{**detail, "loc": detail["loc"][1:]} for detail in error.errors()]
-    return invalid(details).response()
+    return _refuse(request, invalid(details))
 
 
 async def _http(request: Request, error: Exception) -> Response:
@@ -111,10 +131,19 @@ async def _http(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     if error.status_code == 405:
         methods = Headers(error.headers).get("allow", "").split(", ")
-        refusal = Refusal("method_not_allowed", "method", "Not a method of this path", methods)
-    else:
-        refusal = Refusal("not_found", "path", "There is nothing at this path; see /docs")
-    return refusal.response(error.headers)
+        return _refuse(
+            request,
+            Refusal(
+                "method_not_allowed",
+                "method",
+                "Not a method of this path",
+                methods,
+                error.headers,
+            ),
+        )
+    return _refuse(
+        request, Refusal("not_found", "path", "There is nothing at this path; see /docs")
+    )
 
 
 async def _gone(request: Request, error: Exception) -> Response:
@@ -124,11 +153,11 @@ async def _gone(request: Request, error: Exception) -> Response:
 
 async def _bug(request: Request, error: Exception) -> Response:
     """Answer anything else without details; it is raised on to the server, which logs it."""
-    return Refusal("internal", "", "The service failed; its log says why").response()
+    return _refuse(request, Refusal("internal", "", "The service failed; its log says why"))
 
 
 def install(app: FastAPI) -> None:
-    """Make `app` answer every error in the one shape."""
+    """Make `app` answer every error in the one shape, and count it in ``app.state.metrics``."""
     app.add_exception_handler(Refusal, _refusal)
     app.add_exception_handler(RequestValidationError, _parameters)
     app.add_exception_handler(HTTPException, _http)

@@ -5,14 +5,18 @@ from typing import Annotated, Any
 import numpy as np
 import orjson
 from fastapi import FastAPI, Path, Request, Response
+from fastapi.responses import PlainTextResponse
 from starlette.routing import WebSocketRoute
 
 from online import frames, wire
 from online.answer import answer
 from online.echo import ECHO, Echo
 from online.errors import Refusal
+from online.guard import METRICS
+from online.metrics import CONTENT_TYPE, Metrics
 from online.negotiation import BINARY, JSON, MSGPACK, negotiate
 from online.schemas import (
+    Accessible,
     Answer,
     Checked,
     Mesh,
@@ -47,7 +51,8 @@ _BY_HAND: dict[str, Any] = {"parameters": [_NAME], "requestBody": _BODY}
 
 
 def _problems(*codes: int) -> dict[int | str, dict[str, Any]]:
-    return {code: {"model": Problem} for code in codes}
+    """Describe the refusals of an endpoint: its own `codes` and those of the guard."""
+    return {code: {"model": Problem} for code in sorted({401, 403, 429, 503, *codes})}
 
 
 def _document(model: type, what: str) -> dict[int | str, dict[str, Any]]:
@@ -67,7 +72,7 @@ def _document(model: type, what: str) -> dict[int | str, dict[str, Any]]:
     }
 
 
-def add_routes(app: FastAPI, store: Store, settings: Settings) -> None:
+def add_routes(app: FastAPI, store: Store, settings: Settings, metrics: Metrics) -> None:
     """Give `app` its endpoints, the hot ones first: the router tries them in this order."""
 
     @app.post(
@@ -76,7 +81,7 @@ def add_routes(app: FastAPI, store: Store, settings: Settings) -> None:
         response_model=None,
         responses={
             **_document(Answer, "How the tissue answers"),
-            **_problems(404, 406, 413, 415, 422, 503),
+            **_problems(404, 406, 413, 415, 422),
         },
         openapi_extra=_BY_HAND,
     )
@@ -84,18 +89,18 @@ def add_routes(app: FastAPI, store: Store, settings: Settings) -> None:
         """Press the tissue: force, displacement and stress under a load.
 
         Every request is answered from rest, independently of those before it. The header
-        Server-Timing tells the time taken to solve, recover and encode, in ms.
+        Server-Timing tells the time taken to decode, solve, recover and encode, in ms.
         """
         media_type = _media_type(request)
         model = store.model(request.path_params["name"])
-        query = parse_request(await _read(request, settings.max_body))
-        return answer(model, query, media_type, settings.max_json_numbers)
+        body = await _read(request, settings.max_body)
+        return answer(model, body, media_type, settings.max_json_numbers, metrics)
 
     @app.post(
         "/scenes/{name}/check",
         tags=["scenes"],
         response_model=None,
-        responses={200: {"model": Checked}, **_problems(404, 413, 415, 422, 503)},
+        responses={200: {"model": Checked}, **_problems(404, 413, 415, 422)},
         openapi_extra=_BY_HAND,
     )
     async def check(request: Request) -> Response:
@@ -109,7 +114,7 @@ def add_routes(app: FastAPI, store: Store, settings: Settings) -> None:
         """Tell that the process lives."""
         return {"status": "ok"}
 
-    @app.get("/ready", tags=["service"], response_model=Status, responses=_problems(503))
+    @app.get("/ready", tags=["service"], response_model=Status, responses={503: {"model": Problem}})
     async def ready() -> Any:
         """Tell whether every model is loaded and warm."""
         store.require_ready()
@@ -118,7 +123,12 @@ def add_routes(app: FastAPI, store: Store, settings: Settings) -> None:
             raise Refusal("not_ready", "", f"No artifact could be loaded: {reasons}")
         return {"status": "ready"}
 
-    @app.get("/scenes", tags=["scenes"], response_model=SceneList, responses=_problems(503))
+    @app.get(METRICS, tags=["service"], response_class=PlainTextResponse, responses=_problems())
+    async def tell_metrics() -> Response:
+        """Tell what was counted and timed, of every worker, in the text format of Prometheus."""
+        return Response(metrics.text(), media_type=CONTENT_TYPE)
+
+    @app.get("/scenes", tags=["scenes"], response_model=SceneList, responses=_problems())
     async def scenes() -> Any:
         """List the scenes that are served, and the files that had to be refused."""
         store.require_ready()
@@ -133,7 +143,7 @@ def add_routes(app: FastAPI, store: Store, settings: Settings) -> None:
         "/scenes/{name}",
         tags=["scenes"],
         response_model=SceneSummary,
-        responses=_problems(404, 422, 503),
+        responses=_problems(404, 422),
     )
     async def scene(name: SceneName) -> Any:
         """Say what may be asked of a scene, and how well it is answered."""
@@ -143,7 +153,7 @@ def add_routes(app: FastAPI, store: Store, settings: Settings) -> None:
         "/scenes/{name}/mesh",
         tags=["scenes"],
         response_model=None,
-        responses={**_document(Mesh, "The mesh"), **_problems(404, 406, 422, 503)},
+        responses={**_document(Mesh, "The mesh"), **_problems(404, 406, 422)},
     )
     async def mesh(name: SceneName, request: Request, region: MeshRegion = "surface") -> Response:
         """Get the undeformed mesh that the fields of a region belong to.
@@ -159,12 +169,36 @@ def add_routes(app: FastAPI, store: Store, settings: Settings) -> None:
         return Response(body, media_type=media_type)
 
     @app.get(
+        "/scenes/{name}/accessible",
+        tags=["scenes"],
+        response_model=None,
+        responses={
+            **_document(Accessible, "The accessible surface"),
+            **_problems(404, 406, 422),
+        },
+    )
+    async def accessible(name: SceneName, request: Request) -> Response:
+        """Get the part of the surface that the endoscope can touch, undeformed.
+
+        It is finer than the mesh of the fields. In the binary formats vertices and normals are
+        float32, triangles int32.
+        """
+        media_type = _media_type(request)
+        atlas = store.model(name).atlas
+        arrays = {
+            "vertices": atlas.surface.vertices.astype(np.float32),
+            "normals": atlas.surface.normals.astype(np.float32),
+            "triangles": np.ascontiguousarray(atlas.surface.triangles, np.int32),
+        }
+        return Response(wire.encode(media_type, {"scene": name}, arrays), media_type=media_type)
+
+    @app.get(
         "/scenes/{name}/session",
         tags=["scenes"],
         response_model=None,
         responses={
             101: {"description": frames.__doc__ + "\n\n" + frames.tables()},
-            **_problems(404, 422, 426, 503),
+            **_problems(404, 422, 426),
         },
     )
     async def session(name: SceneName) -> Response:
@@ -176,7 +210,9 @@ def add_routes(app: FastAPI, store: Store, settings: Settings) -> None:
         store.model(name)
         raise Refusal("upgrade_required", "upgrade", "A session is opened by a WebSocket handshake")
 
-    app.router.routes.append(WebSocketRoute("/scenes/{name}/session", Sessions(store, settings)))
+    app.router.routes.append(
+        WebSocketRoute("/scenes/{name}/session", Sessions(store, settings, metrics))
+    )
     if settings.echo:
         app.router.routes.append(WebSocketRoute(ECHO, Echo()))
 

@@ -208,6 +208,23 @@ class Mesh(BaseModel):
     fields: MeshFields
 
 
+class AccessibleFields(BaseModel):
+    """A triangulated surface with a normal that varies linearly over each triangle."""
+
+    vertices: list[Vector] = Field(description="mm")
+    normals: list[Vector] = Field(description="Outward unit normals at the vertices.")
+    triangles: list[Annotated[list[int], Field(min_length=3, max_length=3)]] = Field(
+        description="Indices into vertices, counter-clockwise from outside."
+    )
+
+
+class Accessible(BaseModel):
+    """The surface that the endoscope can touch."""
+
+    scene: str
+    fields: AccessibleFields
+
+
 class Refused(BaseModel):
     """A file that is not served."""
 

@@ -22,10 +22,11 @@ from online import frames
 from online.errors import Refusal
 from online.follower import Follower, Step
 from online.frames import Extras, Flag, FrameError, Output, Request, VersionError
+from online.metrics import Metrics
 from online.schemas import parse_session_request
 from online.settings import Settings
 from online.store import Model, Store
-from online.websocket import LINGER, PENDING, STOPPING
+from online.websocket import LINGER, PENDING, READ_AT, STOPPING
 from shared.atlas import Atlas
 from shared.touch import Touch
 
@@ -59,11 +60,13 @@ class Sessions:
     ----------
     store : Store
     settings : Settings
+    metrics : Metrics
     """
 
-    def __init__(self, store: Store, settings: Settings) -> None:
+    def __init__(self, store: Store, settings: Settings, metrics: Metrics) -> None:
         self._store = store
         self._settings = settings
+        self._metrics = metrics
         self._open = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -75,11 +78,14 @@ class Sessions:
                 "too_many_sessions", "", f"{self._open} sessions are open", {"max_sessions": most}
             )
         self._open += 1
+        self._metrics.count_session(opened=True)
         follower = model.followers.pop() if model.followers else Follower(model.atlas)
         try:
-            await Session(model, follower, self._settings, scope, receive, send).run()
+            session = Session(model, follower, self._settings, self._metrics, scope, receive, send)
+            await session.run()
         finally:
             self._open -= 1
+            self._metrics.count_session(opened=False)
             follower.restart()
             model.followers.append(follower)
 
@@ -93,6 +99,7 @@ class Session:
     follower : Follower
         Fresh or restarted.
     settings : Settings
+    metrics : Metrics
     scope, receive, send
         As ASGI gives them; of `online.websocket.Protocol`.
     """
@@ -102,6 +109,7 @@ class Session:
         model: Model,
         follower: Follower,
         settings: Settings,
+        metrics: Metrics,
         scope: Scope,
         receive: Receive,
         send: Send,
@@ -109,9 +117,11 @@ class Session:
         self._model = model
         self._atlas = model.atlas
         self._settings = settings
+        self._metrics = metrics
         self._receive = receive
         self._send = send
         self._pending: Callable[[], bool] = scope["extensions"][PENDING]
+        self._read_at: Callable[[], float] = scope["extensions"][READ_AT]
         self._follower = follower
         self._received = perf_counter()
         self._superseded = 0
@@ -158,7 +168,8 @@ class Session:
 
     async def _note(self) -> None:
         """Note that a message has come; wait if there are too many."""
-        now = self._received = perf_counter()
+        now = perf_counter()
+        self._received = self._read_at()
         self._full_at = max(self._full_at, now) + 1.0 / MOST_FRAMES
         if self._full_at - now > BURST:
             await asyncio.sleep(self._full_at - now - BURST)
@@ -192,39 +203,52 @@ class Session:
             return {"type": "websocket.send", "text": self._answer_text(message["text"])}
         except VersionError as error:
             self._farewell = WRONG_VERSION, str(error)
-            return _complain("unknown_version", error.field, error.message)
+            return self._complain("unknown_version", error.field, error.message)
         except FrameError as error:
-            return _complain("invalid_frame", error.field, error.message)
+            return self._complain("invalid_frame", error.field, error.message)
         except Refusal as refusal:
-            return _complain(refusal.code, refusal.field, refusal.message, refusal.allowed)
+            return self._complain(refusal.code, refusal.field, refusal.message, refusal.allowed)
         except Exception:
             logger.exception("a session failed")
             self._farewell = FAILED, "the service failed; its log says why"
-            return _complain("internal", "", "The service failed; its log says why")
+            return self._complain("internal", "", "The service failed; its log says why")
 
     def _answer_frame(self, frame: bytes) -> bytes:
-        request = frames.decode_request(frame)
-        step = self._follower.follow(request.position, BUDGET)
-        return self._encode(request, step)
+        start = perf_counter()
+        return self._solve(frames.decode_request(frame), start)[0]
 
     def _answer_text(self, text: str) -> str:
         """Answer in JSON: the same fields by name, bits as lists of names, and a reason."""
+        start = perf_counter()
         request = parse_session_request(text)
         self._check_size(request.outputs)
-        step = self._follower.follow(request.position, BUDGET)
-        reply = frames.decode_reply(self._encode(request, step))
+        frame, step = self._solve(request, start)
+        reply = frames.decode_reply(frame)
         document = {name: value for name, value in reply._asdict().items() if value is not None}
         document["flags"] = _names(Flag(reply.flags))
         document["outputs"] = _names(Output(reply.outputs))
         document["reason"] = step.reason
         return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY).decode()
 
-    def _encode(self, request: Request, step: Step) -> bytes:
+    def _solve(self, request: Request, start: float) -> tuple[bytes, Step]:
+        """Answer a request whose decoding began at `start`: the reply's frame and its content."""
+        decoded = perf_counter()
+        step = self._follower.follow(request.position, BUDGET)
+        solved = perf_counter()
         extras = recover(self._atlas, step.touch, request.outputs)
+        recovered = perf_counter()
         superseded, self._superseded = self._superseded, 0
-        return frames.encode_reply(
+        frame = frames.encode_reply(
             request, step, extras, superseded, self._received, perf_counter()
         )
+        borders = (start, decoded, solved, recovered, perf_counter())
+        self._metrics.count_frame(start - self._received, borders, step.flags, superseded)
+        return frame, step
+
+    def _complain(self, code: str, field: str, message: str, allowed: Any = None) -> Message:
+        self._metrics.count_refused_frame()
+        error = {"code": code, "field": field, "message": message, "allowed": allowed}
+        return {"type": "websocket.send", "text": orjson.dumps({"error": error}).decode()}
 
     def _check_size(self, outputs: int) -> None:
         """Refuse fields that would keep the event loop busy writing decimals."""
@@ -254,7 +278,7 @@ class Session:
         return orjson.dumps(document).decode()
 
 
-def warm(model: Model) -> None:
+def warm(model: Model, metrics: Metrics) -> None:
     """Call all that a session calls once, and keep what the first sessions need at hand."""
     x, y, z = model.tip
     request = Request(0, 0.0, (x, y, z), sum(Output))
@@ -262,6 +286,7 @@ def warm(model: Model) -> None:
         follower = Follower(model.atlas)
         step = follower.follow(request.position, BUDGET)
         frames.encode_reply(request, step, recover(model.atlas, step.touch, request.outputs))
+        metrics.count_frame(0.0, (0.0, 0.0, 0.0, 0.0, 0.0), step.flags, 0)
         follower.restart()
         model.followers.append(follower)
 
@@ -299,8 +324,3 @@ def _coordinates(touch: Touch) -> np.ndarray:
 
 def _names(bits: Any) -> list[str]:
     return [bit.name.lower() for bit in bits]
-
-
-def _complain(code: str, field: str, message: str, allowed: Any = None) -> Message:
-    error = {"code": code, "field": field, "message": message, "allowed": allowed}
-    return {"type": "websocket.send", "text": orjson.dumps({"error": error}).decode()}

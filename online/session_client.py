@@ -21,6 +21,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.client import ClientProtocol
 from websockets.exceptions import ConnectionClosed, InvalidState, InvalidStatus
 from websockets.frames import Frame, Opcode
+from websockets.protocol import State
 from websockets.uri import parse_uri
 
 from online import frames
@@ -177,7 +178,7 @@ class Session(_Dialogue):
 
     def close(self) -> None:
         """End the session."""
-        if self._protocol.close_sent is None:
+        if self._protocol.state is State.OPEN:
             self._protocol.send_close(1000)
             with suppress(OSError):  # it may have ended already
                 self._flush()

@@ -2,6 +2,7 @@
 
 import asyncio
 import socket
+from time import perf_counter
 from typing import Any
 
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
@@ -13,6 +14,10 @@ STOPPING = 1012
 PENDING = "palpate.pending"
 """Key of the ASGI scope's extensions: a function that tells whether a message can be received
 without waiting."""
+
+READ_AT = "palpate.read_at"
+"""Key of the ASGI scope's extensions: a function that tells when the newest message was read, s of
+`time.perf_counter`."""
 
 RECEIVE_BUFFER = 16 * 1024
 """Bytes the system keeps for a client that sends faster than it is read.
@@ -28,18 +33,19 @@ LINGER = 1.0
 
 
 class Protocol(WebSocketsSansIOProtocol):
-    """Like uvicorn's, but for six things.
+    """Like uvicorn's, but for seven things.
 
-    An application can tell whether there is more to read. The system's buffers are small, so that
-    what waits in them is recent. A service that stops lets its applications answer what they have
-    and close with a reason. Closing does not wait long for a client that says nothing. A connection
-    whose application has ended is cut even if its client never reads what is left. A refusal is no
-    error of the application, and not logged as one.
+    An application can tell whether there is more to read, and when it was read. The system's
+    buffers are small, so that what waits in them is recent. A service that stops lets its
+    applications answer what they have and close with a reason. Closing does not wait long for a
+    client that says nothing. A connection whose application has ended is cut even if its client
+    never reads what is left. A refusal is no error of the application, and not logged as one.
     """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self.close_timeout = LINGER
+        self.read_at = 0.0
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Take over a connection."""
@@ -48,12 +54,18 @@ class Protocol(WebSocketsSansIOProtocol):
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
 
+    def data_received(self, data: bytes) -> None:
+        """Take what the client sent."""
+        self.read_at = perf_counter()
+        super().data_received(data)
+
     def handle_connect(self, event: Request) -> None:
         """Begin a session, if the handshake is right."""
         super().handle_connect(event)
         if self.response.status_code == 101:
             extensions: dict[str, Any] = self.scope["extensions"]
             extensions[PENDING] = lambda: not self.queue.empty()
+            extensions[READ_AT] = lambda: self.read_at
 
     def shutdown(self) -> None:
         """Ask the application to end the connection."""

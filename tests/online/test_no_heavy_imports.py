@@ -1,7 +1,7 @@
 import subprocess
 import sys
 
-HEAVY = ["felupe", "matplotlib", "offline", "pyvista", "scipy.sparse.linalg", "tqdm"]
+HEAVY = ["felupe", "hdrh", "matplotlib", "offline", "pyvista", "scipy.sparse.linalg", "tqdm"]
 
 
 def test_the_server_carries_nothing_that_only_training_needs():

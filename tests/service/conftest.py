@@ -17,20 +17,20 @@ class Server:
     has ended.
     """
 
-    def __init__(self, directory, *arguments):
+    def __init__(self, directory, *arguments, **environment):
         self.process = subprocess.Popen(
             [*PALPATE, "serve", "--artifacts", directory, "--port", "0", *arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            env={**os.environ, "PYTHONUNBUFFERED": "1"},
+            env={**os.environ, "PYTHONUNBUFFERED": "1", **environment},
         )
         self.greeting = ""
         while "Try:" not in self.greeting:
             line = self.process.stdout.readline()
             assert line, self.process.communicate()
             self.greeting += line
-        self.url = re.search(r"http://127\.0\.0\.1:\d+", self.greeting)[0]
+        self.url = re.search(r"http://[\d.]+:\d+", self.greeting)[0]
         self.log = ""
 
     def stop(self, number=signal.SIGTERM):
@@ -42,11 +42,14 @@ class Server:
 
 @pytest.fixture(scope="session")
 def serve():
-    """Return a context manager that serves a directory of artifacts from a process of its own."""
+    """Return a context manager that serves a directory of artifacts from a process of its own.
+
+    Further arguments are options of `palpate serve`, keywords are environment variables.
+    """
 
     @contextmanager
-    def serving(directory):
-        server = Server(directory)
+    def serving(directory, *arguments, **environment):
+        server = Server(directory, *arguments, **environment)
         try:
             yield server
         finally:

@@ -1,0 +1,1 @@
+"""Load on a service, timed from when each message was due."""

@@ -1,0 +1,156 @@
+"""A generator of load that is on time: one loop that never sleeps.
+
+Every message has a time at which it is due, whatever became of those before it, and its latency
+counts from then: a service that stalls is charged with all that should have been sent meanwhile
+(no "coordinated omission"). Asyncio's timers tick in milliseconds; this loop looks at the clock
+every few microseconds. How late it sent nevertheless is recorded, as is the time that the machine's
+host took from it.
+"""
+
+import gc
+import os
+import select
+import socket
+from collections.abc import Sequence
+from dataclasses import dataclass
+from time import perf_counter_ns
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+WINDOW = 0.25
+"""Seconds over which it is judged whether machine and generator were on time."""
+
+DRAIN = 1.5
+"""Seconds that are waited for answers after the last message."""
+
+CHUNK = 1 << 18
+"""Most bytes taken from a socket at once."""
+
+LOST, DROPPED, SUPERSEDED, ANSWERED = 0, 1, 2, 200
+"""What became of a message; other numbers are HTTP statuses of refusals.
+
+A query is dropped that never went out, for want of a connection; a frame is superseded if the
+service says that it left it for a newer one.
+"""
+
+
+class Log:
+    """What became of every message of a stream; times in ns from the start.
+
+    Attributes
+    ----------
+    due : list of int
+        When a message should have been sent.
+    sent, received : list of int
+        When it was its turn, and when its answer was whole; 0 if never.
+    outcome : list of int
+    solve_us : list of float, µs
+        What the server says it took to solve.
+    flags : list of int
+        Of sessions' frames: `online.frames.Flag`.
+    """
+
+    def __init__(self, due: NDArray[np.float64]) -> None:
+        self.due: list[int] = (1e9 * due).astype(np.int64).tolist()
+        count = len(self.due)
+        self.sent, self.received, self.outcome, self.flags = ([0] * count for _ in range(4))
+        self.solve_us = [0.0] * count
+
+
+class Stream(Protocol):
+    """A source of messages, with a socket or several.
+
+    Attributes
+    ----------
+    log : Log
+    sockets : sequence of socket
+        Not blocking.
+    """
+
+    log: Log
+    sockets: Sequence[socket.socket]
+
+    @property
+    def waiting(self) -> bool:
+        """Whether an answer may still come."""
+
+    def send(self, number: int, now: int) -> None:
+        """Send a message, now being `now` (ns)."""
+
+    def receive(self, connection: socket.socket, now: int) -> bool:
+        """Take what has come at `now` (ns); tell whether more may come on this socket."""
+
+    def close(self) -> None:
+        """Hang up."""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """How the machine did, window by window.
+
+    Parameters
+    ----------
+    borders : ndarray, shape (w + 1,), ns
+    steal : ndarray, shape (w,), s
+        Time that the host took from all cores; 0 where the system does not tell.
+    """
+
+    borders: NDArray[np.int64]
+    steal: NDArray[np.float64]
+
+
+def drive(streams: Sequence[Stream]) -> Machine:
+    """Send every message of every stream when it is due, and take the answers."""
+    due, owners, numbers = _timetable(streams)
+    sends = [stream.send for stream in streams]
+    poll = select.poll()
+    receivers = {}
+    for stream in streams:
+        for connection in stream.sockets:
+            poll.register(connection, select.POLLIN)
+            receivers[connection.fileno()] = (stream.receive, connection)
+    limit = due[-1] + int(1e9 * DRAIN)
+    window = int(1e9 * WINDOW)
+    samples = [(0, _steal())]
+    k, count = 0, len(due)
+    gc.collect()
+    gc.disable()
+    try:
+        start = perf_counter_ns()
+        now = 0
+        while now < limit and (k < count or any(stream.waiting for stream in streams)):
+            while k < count and due[k] <= now:
+                sends[owners[k]](numbers[k], now)
+                k += 1
+                now = perf_counter_ns() - start
+            for descriptor, _ in poll.poll(0):
+                receive, connection = receivers[descriptor]
+                if not receive(connection, perf_counter_ns() - start):
+                    poll.unregister(descriptor)
+            if now - samples[-1][0] >= window:
+                samples.append((now, _steal()))
+            now = perf_counter_ns() - start
+    finally:
+        gc.enable()
+    borders, ticks = zip(*samples, (now, _steal()), strict=True)
+    return Machine(np.array(borders), np.diff(ticks) / os.sysconf("SC_CLK_TCK"))
+
+
+def _timetable(streams: Sequence[Stream]) -> tuple[list[int], list[int], list[int]]:
+    """Merge the streams' messages by time: when, whose, which."""
+    due = np.concatenate([stream.log.due for stream in streams])
+    owners = np.repeat(np.arange(len(streams)), [len(stream.log.due) for stream in streams])
+    numbers = np.concatenate([np.arange(len(stream.log.due)) for stream in streams])
+    order = np.argsort(due, kind="stable")
+    return due[order].tolist(), owners[order].tolist(), numbers[order].tolist()
+
+
+def _steal() -> int:
+    """Ticks that the host took from this machine's cores since it started (Linux, proc(5))."""
+    try:
+        with open("/proc/stat", "rb", buffering=0) as file:
+            return int(file.read(256).split(None, 9)[8])
+    except OSError:
+        return 0

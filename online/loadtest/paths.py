@@ -1,0 +1,110 @@
+"""Where a tool goes: over the whole accessible surface, in and out of contact, fast as a hand."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+
+from online.client import Accessible
+
+Array = NDArray[np.float64]
+
+SPEED = 50.0
+"""Largest speed of the tip, mm/s: a hand in a hurry."""
+
+STEP = 0.05
+"""Spacing of the points of a path, mm."""
+
+SMOOTHING = 1.0
+"""Standard deviation, mm along the path, of the filter that rounds the mesh's corners off."""
+
+WAVE = 12.0
+"""Way over the surface from one lifting of the tip to the next, mm."""
+
+LIFTED = 1.0
+"""How far the tip is lifted, mm."""
+
+
+class Tip(NamedTuple):
+    """A spherical tip: its radius and how deep it presses at most, mm."""
+
+    radius: float
+    depth: float
+
+
+def tool_path(surface: Accessible, tip: Tip, times: Array, rng: np.random.Generator) -> Array:
+    """Move a tip over a surface.
+
+    It goes the shortest way from one random vertex to the next, ``LIFTED`` above the surface and
+    ``tip.depth`` below it in turn, and slows down and speeds up between a tenth of `SPEED` and
+    all of it.
+
+    Parameters
+    ----------
+    surface : Accessible
+    tip : Tip
+    times : ndarray, shape (n,), s
+        Not decreasing, from 0.
+    rng : Generator
+
+    Returns
+    -------
+    ndarray, shape (n, 3), mm
+        Centre of the tip at `times`.
+    """
+    period, phase = 5.0, rng.uniform(0.0, 2 * np.pi)
+    # The integral of SPEED (0.55 - 0.45 cos(2 pi t / period + phase)).
+    angle = 2 * np.pi * times / period + phase
+    way = SPEED * (0.55 * times - 0.45 * period / (2 * np.pi) * (np.sin(angle) - np.sin(phase)))
+    feet, normals = _walk(surface, float(way[-1]), rng)
+    along = _lengths(feet)
+    swing = np.sin(2 * np.pi * along / WAVE + rng.uniform(0.0, 2 * np.pi))
+    depth = (tip.depth - LIFTED) / 2 + (tip.depth + LIFTED) / 2 * swing
+    centres = feet + (tip.radius - depth)[:, None] * normals
+    reached = _lengths(centres)
+    return np.stack([np.interp(way, reached, axis) for axis in centres.T], axis=1)
+
+
+def _walk(surface: Accessible, length: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Walk over a surface so far that a tip above it has gone at least `length` mm.
+
+    Returns points (k, 3) mm about `STEP` apart, smoothed, and the unit normals there.
+    """
+    vertices = surface.vertices.astype(np.float64)
+    edges = np.vstack([surface.triangles[:, [i, (i + 1) % 3]] for i in range(3)])
+    weights = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
+    graph = coo_array((weights, edges.T), (len(vertices), len(vertices))).tocsr()
+    # Where the surface is hollow the tip takes a shorter way than its foot.
+    way = [int(rng.integers(len(vertices)))]
+    walked = 0.0
+    while walked < 2.0 * length + 4 * WAVE:
+        distance, before = dijkstra(
+            graph, directed=False, indices=way[-1], return_predecessors=True
+        )
+        target = int(rng.choice(np.flatnonzero(np.isfinite(distance))))
+        walked += float(distance[target])
+        leg = [target]
+        while leg[-1] != way[-1]:
+            leg.append(int(before[leg[-1]]))
+        way += leg[-2::-1]
+    corners, normals = vertices[way], surface.normals[way].astype(np.float64)
+    along = _lengths(corners)
+    at = np.arange(0.0, along[-1], STEP)
+    points, directions = (
+        np.stack([_smooth(np.interp(at, along, axis)) for axis in field.T], axis=1)
+        for field in (corners, normals)
+    )
+    return points, directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def _smooth(values: Array) -> Array:
+    reach = int(3 * SMOOTHING / STEP)
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) * STEP / SMOOTHING) ** 2)
+    return np.convolve(np.pad(values, reach, "edge"), kernel / kernel.sum(), "valid")
+
+
+def _lengths(points: Array) -> Array:
+    """Length of a polyline from its start to each of its points."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])

@@ -1,0 +1,248 @@
+"""What a load test found: quantiles of latency, in all windows and in the clean ones."""
+
+import os
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from hdrh.histogram import HdrHistogram
+from numpy.typing import NDArray
+
+from online.frames import Flag
+from online.loadtest.generator import ANSWERED, DROPPED, LOST, SUPERSEDED, WINDOW, Log, Machine
+from online.loadtest.queries import Queries
+from online.loadtest.sessions import Session
+
+ON_TIME = 100.0
+"""Latest that a message may be sent in a clean window, µs after it was due."""
+
+LONGEST = 6_000_000_000
+"""Longest latency that is told from longer ones: a minute, in steps of 10 ns."""
+
+QUANTILES = {"p50_us": 50.0, "p90_us": 90.0, "p99_us": 99.0, "p999_us": 99.9, "max_us": 100.0}
+
+Array = NDArray[np.float64]
+
+
+class Messages(NamedTuple):
+    """What became of some messages, in the order in which they were due.
+
+    Parameters
+    ----------
+    due : ndarray, shape (n,), s
+    lateness : ndarray, shape (n,), µs
+        From when it was due to when its turn came; NaN if that never was.
+    latency : ndarray, shape (n,), µs
+        From due to answered; NaN without an answer.
+    solve : ndarray, shape (n,), µs
+        What the server says; NaN without an answer.
+    outcome, flags : ndarray, shape (n,), int
+    """
+
+    due: Array
+    lateness: Array
+    latency: Array
+    solve: Array
+    outcome: NDArray[np.int64]
+    flags: NDArray[np.int64]
+
+    def where(self, chosen: NDArray[Any]) -> "Messages":
+        """Return some of them, by number or by mask."""
+        columns: tuple[Any, ...] = self
+        return Messages(*(column[chosen] for column in columns))
+
+
+def gather(logs: Sequence[Log]) -> Messages:
+    """Put the messages of several streams in one order."""
+    due, sent, received, outcome, solve, flags = (
+        np.concatenate([getattr(log, name) for log in logs])
+        for name in ("due", "sent", "received", "outcome", "solve_us", "flags")
+    )
+    answered = outcome == ANSWERED
+    messages = Messages(
+        1e-9 * due,
+        np.where(sent > 0, 1e-3 * (sent - due), np.nan),
+        np.where(answered, 1e-3 * (received - due), np.nan),
+        np.where(answered, solve, np.nan),
+        outcome,
+        flags,
+    )
+    return messages.where(np.argsort(due, kind="stable"))
+
+
+def clean_windows(machine: Machine, messages: Messages) -> NDArray[np.bool_]:
+    """Tell in which windows (w,) the host took no time and every message was sent on time."""
+    window = window_of(machine, messages)
+    late = ~(messages.lateness <= ON_TIME)  # also those never sent
+    count = len(machine.steal)
+    return (machine.steal == 0) & (np.bincount(window[late], minlength=count) == 0)
+
+
+def window_of(machine: Machine, messages: Messages) -> NDArray[np.int64]:
+    """Find the window in which each message was due."""
+    found = np.searchsorted(1e-9 * machine.borders[1:-1], messages.due, "right")
+    return found.astype(np.int64)
+
+
+def histogram(microseconds: Array) -> HdrHistogram:
+    """Count durations up to `LONGEST` to three significant digits."""
+    counts = HdrHistogram(1, LONGEST, 3)
+    values, numbers = np.unique((100 * microseconds).round(), return_counts=True)
+    for value, number in zip(values.tolist(), numbers.tolist(), strict=True):
+        counts.record_value(min(int(value), LONGEST), number)
+    return counts
+
+
+def quantiles(microseconds: Array) -> dict[str, float | None]:
+    """Tell the `QUANTILES` of some durations that are not NaN; None if there are none."""
+    known = microseconds[np.isfinite(microseconds)]
+    if not len(known):
+        return dict.fromkeys(QUANTILES)
+    counts = histogram(known)
+    return {
+        name: counts.get_value_at_percentile(percentile) / 100.0
+        for name, percentile in QUANTILES.items()
+    }
+
+
+def summarize(messages: Messages, clean: NDArray[np.bool_]) -> dict[str, Any]:
+    """Say what became of messages, those marked `clean` apart."""
+    return {
+        "due": len(messages.due),
+        "answered": int((messages.outcome == ANSWERED).sum()),
+        "clean": quantiles(messages.latency[clean]),
+        "all": quantiles(messages.latency),
+        "solve_us": quantiles(messages.solve),
+        "clean_solve_us": quantiles(messages.solve[clean]),
+    }
+
+
+def summarize_sessions(
+    sessions: Sequence[Session], messages: Messages, clean: NDArray[np.bool_]
+) -> dict[str, Any]:
+    """Say what became of the frames of sessions."""
+    answered = messages.flags[messages.outcome == ANSWERED]
+    return {
+        "lost": int((messages.outcome == LOST).sum()),
+        "superseded": int((messages.outcome == SUPERSEDED).sum()),
+        **summarize(messages, clean),
+        "flags": {bit.name: int((answered & bit > 0).sum()) for bit in Flag},
+        "complaints": sorted({session.complaint for session in sessions if session.complaint}),
+    }
+
+
+def summarize_queries(
+    queries: Queries, messages: Messages, clean: NDArray[np.bool_]
+) -> dict[str, Any]:
+    """Say what became of queries.
+
+    Those refused are counted by status; dropped are those that found no free connection in time.
+    """
+    outcomes = Counter(messages.outcome.tolist())
+    return {
+        "lost": outcomes[LOST],
+        "dropped": outcomes[DROPPED],
+        "refused": {
+            str(status): number
+            for status, number in sorted(outcomes.items())
+            if status not in (LOST, DROPPED, ANSWERED)
+        },
+        **summarize(messages, clean),
+        "complaints": [queries.complaint] if queries.complaint else [],
+    }
+
+
+def summarize_machine(machine: Machine, messages: Messages) -> dict[str, Any]:
+    """Say how well machine and generator kept the time."""
+    clean = clean_windows(machine, messages)
+    return {
+        "window_s": WINDOW,
+        "windows": len(clean),
+        "clean_windows": int(clean.sum()),
+        "steal_s": round(float(machine.steal.sum()), 2),
+        "load_average": os.getloadavg()[0],
+        "lateness_us": quantiles(messages.lateness),
+    }
+
+
+def summarize_overload(messages: Messages, machine: Machine, borders: Array) -> dict[str, Any]:
+    """Say how a service bore an overload and how soon it was as before.
+
+    Parameters
+    ----------
+    messages : Messages
+    machine : Machine
+    borders : ndarray, shape (4,), s
+        Start and end of the times before, during and after the overload.
+
+    Returns
+    -------
+    dict
+        Latencies and answers ``before``, ``during`` and ``after``, and ``recovered_s``: from the
+        end of the overload to the first window from which on no window's 99th percentile is above
+        twice the worst before; None if that never came, or nothing was well before.
+    """
+    phases = np.searchsorted(borders[1:3], messages.due, "right")
+    report: dict[str, Any] = {}
+    for number, name in enumerate(("before", "during", "after")):
+        of_phase = messages.where(phases == number)
+        report[name] = {
+            "due": len(of_phase.due),
+            "answered": int((of_phase.outcome == ANSWERED).sum()),
+            **quantiles(of_phase.latency),
+        }
+    window = window_of(machine, messages)
+    bar = 2.0 * max(_worst(messages, window, w) for w in np.unique(window[phases == 0]))
+    recovered = None
+    for w in np.unique(window[phases == 2])[::-1]:
+        if np.isinf(bar) or _worst(messages, window, w) > bar:
+            break
+        recovered = max(0.0, round(1e-9 * float(machine.borders[w]) - borders[2], 3))
+    report["recovered_s"] = recovered
+    return report
+
+
+def _worst(messages: Messages, window: NDArray[np.int64], chosen: int) -> float:
+    """99th percentile of the latencies of a window; infinite if messages got no answer."""
+    latency = messages.latency[(window == chosen) & (messages.outcome != SUPERSEDED)]
+    if not len(latency):
+        return np.inf
+    return float(np.percentile(np.where(np.isnan(latency), np.inf, latency), 99, method="higher"))
+
+
+def table(summary: dict[str, Any]) -> str:
+    """Write a summary for people: a row of Markdown per kind of message and of windows."""
+    rows = [
+        "| | answered | lost | superseded or refused | p50 µs | p99 µs | p99.9 µs | max µs |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    kinds = {"frames" if summary["plan"]["sessions"] else "queries": summary}
+    if "queries" in summary:
+        kinds["queries"] = summary["queries"]
+    for name, kind in kinds.items():
+        shed = kind["superseded"] if "superseded" in kind else sum(kind["refused"].values())
+        counts = f"{kind['answered']} | {kind['lost']} | {shed}"
+        rows += [
+            f"| {name}, clean windows | | | | {_row(kind['clean'])} |",
+            f"| {name}, all windows | {counts} | {_row(kind['all'])} |",
+            f"| {name}, solve alone | | | | {_row(kind['solve_us'])} |",
+        ]
+    machine = summary["machine"]
+    rows += [
+        "",
+        f"{machine['clean_windows']} of {machine['windows']} windows clean; steal "
+        f"{machine['steal_s']} s; load average {machine['load_average']:.1f}; generator late by "
+        f"{machine['lateness_us']['p50_us']:.1f} µs (p50), {machine['lateness_us']['p99_us']:.1f} "
+        "µs (p99)",
+    ]
+    if "overload" in summary:
+        recovered = summary["overload"]["recovered_s"]
+        rows.append("not recovered" if recovered is None else f"recovered after {recovered} s")
+    rows += [complaint for kind in kinds.values() for complaint in kind["complaints"]]
+    return "\n".join(rows)
+
+
+def _row(values: dict[str, float | None]) -> str:
+    columns = ("p50_us", "p99_us", "p999_us", "max_us")
+    return " | ".join("" if (v := values[name]) is None else f"{v:.0f}" for name in columns)

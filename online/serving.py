@@ -1,0 +1,137 @@
+"""From settings to a running service: one process, or several under a supervisor.
+
+The supervisor is uvicorn's. It binds the socket, starts the workers, starts a new one for each that
+dies, and passes on the signal to end. All workers accept from the one socket, so a session belongs
+to the worker that accepted it and is none of the others' business.
+"""
+
+import json
+import logging
+import signal
+import sys
+import tempfile
+from functools import partial
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+import click
+import uvicorn
+from fastapi import FastAPI
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.supervisors.multiprocess import Multiprocess
+
+from online import logs, realtime
+from online.guard import RECEIVED
+from online.metrics import Metrics, make_table
+from online.settings import Settings, is_loopback
+from online.websocket import OPTIONS
+from shared.errors import PalpateError
+
+if TYPE_CHECKING:
+    from online.store import Store
+
+logger = logging.getLogger(__name__)
+
+
+class Protocol(HttpToolsProtocol):
+    """Uvicorn's HTTP, which also notes when it read a request."""
+
+    def on_message_begin(self) -> None:
+        """Begin a request."""
+        super().on_message_begin()
+        self.scope[RECEIVED] = perf_counter()  # type: ignore[literal-required]
+
+
+def serve(settings: Settings, host: str, port: int, public: bool) -> None:
+    """Serve until a signal says to end.
+
+    Parameters
+    ----------
+    settings : Settings
+    host, port
+        Where to listen; port 0 takes a free one.
+    public : bool
+        Whether other machines may be served without a token.
+
+    Raises
+    ------
+    PalpateError
+        If there is nothing to serve, or everybody would be served and nobody asked for a token.
+    """
+    if not any(settings.artifacts.glob("*.h5")):
+        raise PalpateError(
+            f"no artifacts (*.h5) in {settings.artifacts}; make one with: "
+            f"palpate train turbinate --out {settings.artifacts / 'turbinate.h5'}"
+        )
+    if not settings.token and not public and not is_loopback(host):
+        raise PalpateError(
+            f"--host {host or '(any)'} lets other machines in: set PALPATE_TOKEN, or say "
+            "--public to serve anybody"
+        )
+    logs.set_up(settings)
+    with tempfile.TemporaryDirectory(prefix="palpate-") as directory:
+        config = _config(settings, host, port)
+        bound = config.bind_socket()
+        # From here on clients wait for a worker that is ready rather than being turned away.
+        bound.listen(config.backlog)
+        url = f"http://{f'[{host}]' if ':' in host else host}:{bound.getsockname()[1]}"
+        table = None
+        if settings.workers > 1:
+            table = Path(directory) / "metrics"
+            make_table(table, settings.workers)
+        config.app = partial(_work, settings, url, table)
+        # A server shuts down on a signal and then raises it again, for us to end cleanly.
+        for stop in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(stop, lambda *_: sys.exit(0))
+        if settings.workers > 1:
+            Multiprocess(config, [bound]).run()
+        else:
+            uvicorn.Server(config).run([bound])
+
+
+def _config(settings: Settings, host: str, port: int) -> uvicorn.Config:
+    return uvicorn.Config(
+        "",  # known once the socket is bound
+        factory=True,
+        host=host,
+        port=port,
+        workers=settings.workers,
+        http=Protocol,
+        log_config=None,
+        access_log=settings.access_log,
+        **OPTIONS,
+    )
+
+
+def _work(settings: Settings, url: str, table: Path | None) -> FastAPI:
+    """Make the application of one worker, in its own process."""
+    # Not before: the supervisor has no use for the models' code.
+    from online.app import create_app
+
+    logs.set_up(settings)
+    # Uvicorn tells of every session that opens; that it starts and ends, the supervisor tells.
+    logging.getLogger("uvicorn.error").setLevel(logging.WARNING)
+    metrics = Metrics(table)
+
+    def greet(store: "Store") -> None:
+        if settings.realtime:
+            logger.info(realtime.enter())
+        logger.info("worker %d is ready", metrics.worker)
+        if metrics.worker == 0 and not metrics.restarted:
+            _invite(store, url)
+
+    return create_app(settings, on_ready=greet, metrics=metrics)
+
+
+def _invite(store: "Store", url: str) -> None:
+    """Print what is served and a request to try."""
+    for refused in store.refused:
+        click.echo(f"Refused {refused.reason}")
+    click.echo(f"Serving {', '.join(store.models) or 'nothing'} on {url} (API: {url}/docs)")
+    for name, model in store.models.items():
+        click.echo(
+            f"Try: curl {url}/scenes/{name}/solve -H 'Content-Type: application/json' "
+            f"-d '{json.dumps({'contacts': [model.example]})}'"
+        )
+        break

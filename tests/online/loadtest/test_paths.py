@@ -1,0 +1,56 @@
+import numpy as np
+import pytest
+
+from online.client import Accessible
+from online.loadtest.paths import LIFTED, SPEED, Tip, tool_path
+
+from ..fake_atlas import FakeAtlas
+
+TIP = Tip(radius=2.0, depth=0.8)
+
+
+@pytest.fixture(scope="module")
+def surface():
+    surface = FakeAtlas().surface
+    return Accessible(
+        surface.vertices.astype(np.float32), surface.normals.astype(np.float32), surface.triangles
+    )
+
+
+@pytest.fixture
+def path(surface, rng):
+    return tool_path(surface, TIP, np.arange(0.0, 20.0, 1e-3), rng)
+
+
+def test_it_moves_as_a_hand_does(path):
+    speed = np.linalg.norm(np.diff(path, axis=0), axis=1) / 1e-3
+    assert speed.max() <= SPEED * (1 + 1e-9)
+    assert speed.max() > 0.9 * SPEED
+    assert speed[-1000:].max() > 0.1 * SPEED  # to the end
+
+
+def test_it_goes_in_and_out_of_contact(path):
+    depth = TIP.radius - (path[:, 2] - 5.0)  # the block's top is at z = 5
+    assert depth.max() == pytest.approx(TIP.depth, abs=0.01)
+    assert depth.min() == pytest.approx(-LIFTED, abs=0.01)
+    assert np.count_nonzero(np.diff(np.sign(depth))) > 20
+
+
+def test_it_covers_the_surface(surface, path):
+    pressed = path[path[:, 2] < 5.0 + TIP.radius, :2]
+    distance = [np.linalg.norm(pressed - v, axis=1).min() for v in surface.vertices[:, :2]]
+    assert max(distance) < 2.0
+
+
+def test_equal_seeds_make_equal_paths(surface):
+    times = np.linspace(0.0, 2.0, 50)
+    one, two = (tool_path(surface, TIP, times, np.random.default_rng(3)) for _ in range(2))
+    np.testing.assert_array_equal(one, two)
+
+
+def test_the_rate_does_not_change_the_path(surface):
+    coarse, fine = np.linspace(0.0, 2.0, 51), np.linspace(0.0, 2.0, 501)
+    one, two = (
+        tool_path(surface, TIP, times, np.random.default_rng(3)) for times in (coarse, fine)
+    )
+    np.testing.assert_allclose(one, two[::10], atol=1e-9)

@@ -1,0 +1,123 @@
+import numpy as np
+import pytest
+
+from online.frames import Flag
+from online.loadtest.generator import ANSWERED, DROPPED, LOST, SUPERSEDED, Log, Machine
+from online.loadtest.report import (
+    clean_windows,
+    gather,
+    quantiles,
+    summarize_overload,
+    summarize_queries,
+    summarize_sessions,
+)
+
+
+def log(due, latency_ms=0.2, late_ms=0.0, outcome=ANSWERED):
+    """Return a log of messages due at some times (s), all of one fate or each of its own."""
+    log = Log(np.asarray(due, float))
+    shape = len(log.due)
+    due = np.array(log.due)
+    log.sent = (due + 1e6 * np.broadcast_to(late_ms, shape)).astype(int).tolist()
+    log.received = (due + 1e6 * np.broadcast_to(latency_ms, shape)).astype(int).tolist()
+    log.outcome = np.broadcast_to(outcome, shape).tolist()
+    log.solve_us = [50.0] * shape
+    log.flags = [int(Flag.CONTACT)] * shape
+    return log
+
+
+def machine(seconds, steal=()):
+    """Return a machine's record in windows of a second."""
+    stolen = np.zeros(seconds)
+    stolen[list(steal)] = 0.01
+    return Machine((1e9 * np.arange(seconds + 1)).astype(np.int64), stolen)
+
+
+def test_quantiles_are_those_of_the_values(rng):
+    values = rng.lognormal(5.0, 1.0, 100_000)
+    found = quantiles(np.append(values, np.nan))
+    for name, percentile in (("p50_us", 50), ("p99_us", 99), ("p999_us", 99.9), ("max_us", 100)):
+        assert found[name] == pytest.approx(np.percentile(values, percentile), rel=2e-3)
+    assert quantiles(np.full(3, np.nan))["p50_us"] is None
+
+
+def test_latency_counts_from_when_a_message_was_due():
+    messages = gather([log([0.5], latency_ms=3.0, late_ms=2.0)])
+    assert messages.latency == pytest.approx([3000.0])
+    assert messages.lateness == pytest.approx([2000.0])
+
+
+def test_streams_are_put_in_one_order():
+    messages = gather([log([0.1, 0.3], 1.0), log([0.2, 0.4], 2.0)])
+    assert messages.due == pytest.approx([0.1, 0.2, 0.3, 0.4])
+    assert messages.latency == pytest.approx([1000.0, 2000.0, 1000.0, 2000.0])
+
+
+def test_a_window_is_clean_if_host_and_generator_were_on_time():
+    due = np.arange(0.05, 5.0, 0.1)
+    late = np.where((due > 2.0) & (due < 2.1), 0.5, 0.01)
+    messages = gather([log(due, late_ms=late)])
+    assert clean_windows(machine(5, steal=[4]), messages).tolist() == [
+        True,
+        True,
+        False,
+        True,
+        False,
+    ]
+    messages.lateness[-12] = np.nan  # never sent
+    assert clean_windows(machine(5), messages).tolist() == [True, True, False, False, True]
+
+
+class Quiet:
+    complaint = ""
+
+
+def test_superseded_frames_are_not_lost_ones():
+    outcome = [ANSWERED, LOST, SUPERSEDED, SUPERSEDED, ANSWERED]
+    messages = gather([log(np.arange(5.0), outcome=outcome)])
+    clean = np.array([True, True, True, True, False])
+    found = summarize_sessions([Quiet()], messages, clean)
+    assert (found["lost"], found["superseded"], found["answered"]) == (1, 2, 2)
+    assert found["flags"]["CONTACT"] == 2
+    assert found["flags"]["FALLBACK"] == 0
+    assert found["clean"]["p50_us"] == pytest.approx(200.0, rel=1e-3)
+
+
+def test_what_became_of_queries_is_told_apart():
+    messages = gather([log(np.arange(5.0), outcome=[ANSWERED, 429, 503, DROPPED, LOST])])
+    found = summarize_queries(Quiet(), messages, np.ones(5, bool))
+    assert (found["answered"], found["dropped"], found["lost"]) == (1, 1, 1)
+    assert found["refused"] == {"429": 1, "503": 1}
+
+
+@pytest.mark.parametrize(("slow_until", "recovered"), [(4.0, 0.0), (5.5, 2.0), (9.0, None)])
+def test_recovery_is_when_latencies_are_as_before(slow_until, recovered):
+    due = np.arange(0.01, 8.0, 0.01)
+    slow = (due > 2.0) & (due < slow_until)
+    messages = gather([log(due, np.where(slow, 50.0, 0.2))])
+    found = summarize_overload(messages, machine(8), np.array([0.0, 2.0, 4.0, 8.0]))
+    assert found["recovered_s"] == recovered
+    assert found["before"]["p99_us"] == pytest.approx(200.0, rel=1e-3)
+    assert found["during"]["p50_us"] == pytest.approx(50_000.0, rel=1e-3)
+
+
+def test_a_lost_message_is_no_recovery():
+    due = np.arange(0.01, 6.0, 0.01)
+    outcome = np.full(len(due), ANSWERED)
+    outcome[-120:-110] = LOST  # in the last window but one
+    messages = gather([log(due, outcome=outcome)])
+    found = summarize_overload(messages, machine(6), np.array([0.0, 2.0, 4.0, 6.0]))
+    assert found["recovered_s"] == 1.0
+
+
+def test_superseded_frames_do_not_hide_a_recovery_nor_make_one():
+    due = np.arange(0.01, 6.0, 0.01)
+    outcome = np.full(len(due), ANSWERED)
+    outcome[(due > 2.0) & (due < 4.5)] = SUPERSEDED
+    messages = gather([log(due, outcome=outcome)])
+    found = summarize_overload(messages, machine(6), np.array([0.0, 2.0, 4.0, 6.0]))
+    assert found["recovered_s"] == 0.0
+    outcome[:] = LOST
+    messages = gather([log(due, outcome=outcome)])
+    found = summarize_overload(messages, machine(6), np.array([0.0, 2.0, 4.0, 6.0]))
+    assert found["recovered_s"] is None

@@ -1,0 +1,72 @@
+"""Load tests of a toy service on a real socket."""
+
+import json
+
+import pytest
+from click.testing import CliRunner
+
+from online.commands import loadtest
+from online.loadtest.run import Plan, run
+from online.settings import Settings
+from shared.errors import PalpateError
+
+
+@pytest.mark.parametrize("region", ["none", "all"])
+def test_queries_are_all_answered(url, region):
+    plan = Plan(url, "toy", sessions=0, queries=100.0, duration=0.5, region=region)
+    summary = run(plan).summary
+    assert (summary["due"], summary["answered"], summary["lost"]) == (50, 50, 0)
+    assert summary["refused"] == {}
+    assert summary["solve_us"]["p50_us"] < summary["all"]["p50_us"]
+
+
+def test_no_frame_of_a_session_is_lost(url):
+    plan = Plan(url, "toy", sessions=2, rate=200.0, queries=20.0, duration=0.5, outputs=2)
+    outcome = run(plan)
+    summary = outcome.summary
+    assert (summary["due"], summary["lost"], summary["complaints"]) == (200, 0, [])
+    assert summary["answered"] + summary["superseded"] == 200
+    assert 0 < summary["flags"]["CONTACT"] < summary["answered"]
+    assert summary["solve_us"]["p50_us"] < summary["all"]["p50_us"]
+    assert summary["queries"]["answered"] == 10
+    assert len(outcome.sessions.due) == 200
+    assert len(outcome.queries.due) == 10
+
+
+def test_superseded_frames_are_told_from_lost_ones(url):
+    plan = Plan(url, "toy", sessions=1, rate=9000.0, duration=0.5)
+    summary = run(plan).summary
+    assert summary["answered"] + summary["superseded"] == summary["due"] == 4500
+    assert summary["lost"] == 0
+
+
+def test_a_session_that_is_refused_says_why(url):
+    with pytest.raises(PalpateError, match="too_many_sessions"):
+        run(Plan(url, "toy", sessions=Settings.max_sessions + 1))
+
+
+def test_too_much_is_refused_and_told_apart(url):
+    plan = Plan(url, "toy", sessions=0, queries=100.0, duration=0.5, overload=60.0, region="none")
+    summary = run(plan).summary
+    counted = summary["answered"] + summary["dropped"] + sum(summary["refused"].values())
+    assert counted + summary["lost"] == summary["due"] == 50 + 3000 + 50
+    assert set(summary["overload"]) == {"before", "during", "after", "recovered_s"}
+
+
+def test_the_command_prints_json_and_draws(url, tmp_path):
+    picture = tmp_path / "load.png"
+    arguments = [url, "toy", "--sessions", "0", "--queries-per-second", "50", "--duration", "0.5"]
+    result = CliRunner().invoke(loadtest, [*arguments, "--json", "--out", str(picture)])
+    assert result.exit_code == 0, result.output
+    summary = json.loads(result.output)
+    assert {"lost", "clean", "all", "solve_us", "machine"} <= set(summary)
+    assert {"p50_us", "p99_us", "p999_us"} <= set(summary["all"])
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_command_prints_a_table(url):
+    arguments = [url, "toy", "--rate", "50", "--queries-per-second", "50", "--duration", "0.5"]
+    outputs = ["--output", "displacement", "--output", "half"]
+    result = CliRunner().invoke(loadtest, [*arguments, *outputs])
+    assert "| frames, all windows | 25 | 0 | 0 |" in result.output
+    assert "| queries, all windows | 25 | 0 | 0 |" in result.output

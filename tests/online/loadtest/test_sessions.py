@@ -1,0 +1,103 @@
+"""What a session makes of bytes, however they are cut."""
+
+import socket
+
+import numpy as np
+import pytest
+
+from online.frames import REPLY, REQUEST, Flag, decode_request
+from online.loadtest import sessions
+from online.loadtest.generator import ANSWERED, LOST, SUPERSEDED
+from online.loadtest.sessions import Session, _frame
+
+POSITIONS = np.arange(15.0).reshape(5, 3)
+
+
+@pytest.fixture
+def session(monkeypatch):
+    """Return a session whose service is the socket `far`."""
+    near, far = socket.socketpair()
+    monkeypatch.setattr(sessions, "_open", lambda target: (near, b""))
+    session = Session(None, np.arange(5) / 10, POSITIONS, outputs=2)
+    session.far = far
+    yield session
+    session.close()
+    far.close()
+
+
+def reply(number, superseded=0, payload=b""):
+    record = np.zeros(1, REPLY)
+    record["version"], record["seq"], record["superseded"] = 1, number, superseded
+    record["flags"], record["solve_time"] = Flag.CONTACT | Flag.CONVERGED, 5e-5
+    body = record.tobytes() + payload
+    if len(body) < 2**16:
+        return b"\x82\x7e" + len(body).to_bytes(2, "big") + body
+    return b"\x82\x7f" + len(body).to_bytes(8, "big") + body
+
+
+def test_frames_are_those_of_the_layout(session):
+    for number in (0, 3):
+        session.send(number, now=7)
+        message = session.far.recv(1000)
+        opcode, begin, end = _frame(message[:1] + bytes([message[1] & 0x7F]) + message[2:], 0, 99)
+        assert (opcode, end - begin) == (2, REQUEST.itemsize)
+        assert message[2:6] == bytes(4)  # a mask that changes nothing
+        request = decode_request(message[6:])
+        assert request.seq == number
+        assert request.client_time == number / 10
+        assert request.position == tuple(POSITIONS[number])
+        assert request.outputs == 2
+        assert session.log.sent[number] == 7
+
+
+@pytest.mark.parametrize("payload", [b"", bytes(70_000)])
+@pytest.mark.parametrize("cut", [1, 2, 3, 100, 10**6])
+def test_replies_may_come_in_pieces(session, payload, cut):
+    for number in range(3):
+        session.send(number, now=number)
+    received = reply(0, payload=payload) + reply(2, superseded=1, payload=payload)
+    for start in range(0, len(received), max(cut, len(received) // 1000)):
+        session.far.sendall(received[start : start + max(cut, len(received) // 1000)])
+        assert session.receive(session.sockets[0], now=50)
+    while session.waiting:
+        session.receive(session.sockets[0], now=50)
+    assert session.log.outcome == [ANSWERED, SUPERSEDED, ANSWERED, LOST, LOST]
+    assert session.log.received == [50, 0, 50, 0, 0]
+    assert session.log.solve_us[2] == pytest.approx(50.0)
+    assert session.log.flags[0] == Flag.CONTACT | Flag.CONVERGED
+
+
+def test_what_was_not_told_to_be_superseded_is_lost(session):
+    for number in range(5):
+        session.send(number, now=number)
+    session.far.sendall(reply(4, superseded=2))
+    session.receive(session.sockets[0], now=50)
+    assert session.log.outcome == [LOST, LOST, SUPERSEDED, SUPERSEDED, ANSWERED]
+
+
+def test_pings_are_answered(session):
+    session.far.sendall(b"\x89\x02hi")
+    session.receive(session.sockets[0], now=0)
+    assert session.far.recv(100) == b"\x8a\x82\0\0\0\0hi"
+
+
+def test_a_farewell_ends_it_with_its_reason(session):
+    session.far.sendall(b"\x88\x06\x03\xe9stop")
+    assert not session.receive(session.sockets[0], now=0)
+    assert session.complaint == "stop"
+    session.send(0, now=5)
+    assert session.log.sent[0] == 0
+    assert not session.waiting
+
+
+def test_a_service_that_does_not_read_holds_nobody_up(session):
+    session.sockets[0].setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)
+    for _ in range(2000):
+        for number in range(5):
+            session.send(number, now=1)
+    taken = 0
+    session.far.settimeout(1.0)
+    while taken < 5 * 2000 * (6 + REQUEST.itemsize):
+        taken += len(session.far.recv(1 << 20))
+        session.far.sendall(b"\x89\x00")  # any news lets it send on
+        session.receive(session.sockets[0], now=2)
