@@ -20,7 +20,7 @@ from offline.validate import unseen_loads
 from offline.workshop import Load, Workshop
 from shared.artifact import read_artifact
 from shared.atlas import Atlas, Region
-from shared.endoscope import pressure_limit
+from shared.endoscope import TIP_DEPTH, pressure_limit
 
 Array = NDArray[np.float64]
 
@@ -42,9 +42,10 @@ def bench(artifact: Path) -> dict[str, Any]:
     -------
     dict
         Medians in µs: ``cold_us``, each query independent of the last; ``warm_us``, along paths of
-        0.05 mm steps over the surface; ``surface_us`` and ``fields_us``, a cold query with
-        displacement and von Mises stress at the surface's or all nodes; ``full_us``, the full model
-        in a single jump from rest. ``p95``: their 95th percentiles. ``ratio``: full over cold.
+        0.05 mm steps over the surface; ``tip_us``, of the rigid tip along those; ``surface_us`` and
+        ``fields_us``, a cold query with displacement and von Mises stress at the surface's or all
+        nodes; ``full_us``, the full model in a single jump from rest. ``p95``: their 95th
+        percentiles. ``ratio``: full over cold.
     """
     atlas = Atlas.load(artifact)
     workshop = Workshop.of_artifact(read_artifact(artifact))
@@ -68,7 +69,10 @@ def bench(artifact: Path) -> dict[str, Any]:
 
     times: dict[str, list[float]] = {}
 
-    def take(kind: str, query: Callable[[Load], object], loads: list[Load]) -> None:
+    def touch(position: Array) -> None:
+        atlas.touch(position, walker)
+
+    def take(kind: str, query: Callable[[Any], object], loads: list[Any]) -> None:
         times.setdefault(kind, []).extend(_time(query, load) for load in loads)
 
     for round_ in range(ROUNDS + 1):
@@ -77,6 +81,10 @@ def bench(artifact: Path) -> dict[str, Any]:
         take("cold_us", cold, loads)
         warm(first)
         take("warm_us", warm, steps)
+        if atlas.tips is not None:
+            first_touch, *touches = [tip_at(atlas, load) for load in (first, *steps)]
+            touch(first_touch)
+            take("tip_us", touch, touches)
         take("surface_us", lambda load: with_fields(load, "surface"), loads)
         take("fields_us", lambda load: with_fields(load, "all"), loads)
         take("full_us", workshop.sample, loads[:1])
@@ -114,13 +122,19 @@ def walk(atlas: Atlas, start: Load, count: int, rng: np.random.Generator) -> lis
     return loads
 
 
+def tip_at(atlas: Atlas, load: Load) -> Array:
+    """Centre of a tip at a load's contact, half as deep as may be."""
+    x, normal, _, fields = atlas.surface.locate(load.position, atlas.limits)
+    return x + (atlas.scene.endoscope.radius - fields[TIP_DEPTH] / 2) * normal
+
+
 def _random_tangent(normal: Array, rng: np.random.Generator) -> Array:
     turn = 2 * math.pi * rng.random()
     t, b = tangents(normal)
     return math.cos(turn) * t + math.sin(turn) * b
 
 
-def _time(query: Callable[[Load], object], load: Load) -> float:
+def _time(query: Callable[[Any], object], load: Any) -> float:
     """Time of one query, µs."""
     started = time.perf_counter()
     query(load)

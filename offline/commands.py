@@ -161,8 +161,8 @@ def validate(
 def bench(artifact: Path, as_json: bool) -> None:
     """Time queries on the artifact F.
 
-    Median µs of a cold query, on a warm path of small steps, with the fields on the surface, with
-    all fields, and of the full model.
+    Median µs of a cold query, on a warm path of small steps, of the rigid tip on that path, with
+    the fields on the surface, with all fields, and of the full model.
     """
     from offline.bench import bench
 
