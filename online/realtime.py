@@ -12,7 +12,7 @@ import os
 PRIORITY = 10
 """Above all ordinary work, below the kernel's own threads (50)."""
 
-_MCL_CURRENT = 1
+_MCL_CURRENT, _MCL_ONFAULT = 1, 4  # Linux: what is in memory, not all that could be
 
 
 def enter() -> str:
@@ -47,7 +47,7 @@ def _lock_memory() -> str:
     mlockall = getattr(ctypes.CDLL(None, use_errno=True), "mlockall", None)
     if mlockall is None:
         return "memory lock: not known to this system"
-    if mlockall(_MCL_CURRENT) != 0:
+    if mlockall(_MCL_CURRENT | _MCL_ONFAULT) != 0:
         return (
             f"memory lock: refused ({os.strerror(ctypes.get_errno())}); it takes root, "
             "CAP_IPC_LOCK or a higher memlock limit"
