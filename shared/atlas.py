@@ -61,6 +61,9 @@ Region = Literal["surface", "all"]
 REACH = 0.8
 """Radius of a contact at most, in radii of the tip: nearer faces count."""
 
+MIDDLE = 0.6
+"""Height over a patch of a tip half as deep as may be, in radii of the tip."""
+
 BESIDE = 0.1
 """Millimetres beyond the rim of the surface at which the answer is not to the question any more."""
 
@@ -260,7 +263,7 @@ def assemble_tips(
             modes[k] = _rows(basis, surface_nodes[own[k][0]], C)
     normals = models.frames[:, 0]
     return TipModels(
-        centres=np.ascontiguousarray((models.centres + body.tip.radius * normals).T),
+        centres=np.ascontiguousarray((models.centres + MIDDLE * body.tip.radius * normals).T),
         frames=models.frames,
         blend=models.blend,
         points=points,

@@ -13,8 +13,8 @@ the query.  Force and tangent of an equilibrium are
 
 K the tangent there.  K^-1 B dx is also where the search for the next equilibrium starts.
 
-Local models are blended by the distance of the tip's centre from their *sites*, where a tip's
-centre lies that just touches the surface at the model's middle.
+Local models are blended by the distance of the tip's centre from where it lies when a tip presses
+the middle of the model, half as deep as may be.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ class Points(NamedTuple):
 class TipModels(NamedTuple):
     """Local models of the tip; ``*_from[k] : *_from[k + 1]`` are the rows of model k."""
 
-    centres: Array  # (3, p) mm, of a tip that just touches the middle of the model
+    centres: Array  # (3, p) mm, of a tip at the middle of the model, half as deep as may be
     frames: Array  # (p, 3, 3) rows: outward normal and two tangents
     blend: float  # mm
     points: Points
