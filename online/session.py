@@ -38,6 +38,9 @@ BUDGET = 1e-3
 MOST_FRAMES = 10_000
 """Frames a second that are read of a session."""
 
+MOST_AT_ONCE = 100
+"""Frames that are passed over for a newer one before one is answered."""
+
 BURST = 0.01
 """Seconds' worth of frames that may come at once."""
 
@@ -152,10 +155,12 @@ class Session:
         """Answer the newest message, again and again."""
         while self._farewell is None:
             message = newest = await self._receive()
-            while message["type"] == "websocket.receive":
-                await self._note()
+            for more in reversed(range(MOST_AT_ONCE)):
+                if message["type"] != "websocket.receive":
+                    break
+                self._note()
                 newest = message
-                if not self._pending():
+                if not (more and self._pending()):
                     break
                 message = await self._receive()
                 self._superseded += message["type"] == "websocket.receive"
@@ -165,14 +170,14 @@ class Session:
                 if message["code"] == STOPPING:
                     self._farewell = GOING_AWAY, "the service is stopping"
                 return
+            # only now: a message that waits must not grow older for those behind it
+            if (excess := self._full_at - perf_counter() - BURST) > 0.0:
+                await asyncio.sleep(excess)
 
-    async def _note(self) -> None:
-        """Note that a message has come; wait if there are too many."""
-        now = perf_counter()
+    def _note(self) -> None:
+        """Note that a message has come."""
         self._received = self._read_at()
-        self._full_at = max(self._full_at, now) + 1.0 / MOST_FRAMES
-        if self._full_at - now > BURST:
-            await asyncio.sleep(self._full_at - now - BURST)
+        self._full_at = max(self._full_at, perf_counter()) + 1.0 / MOST_FRAMES
 
     async def _deliver(self, message: Message) -> None:
         """Send a message; wait until the client has taken most of those before it."""
