@@ -68,7 +68,7 @@ Array = NDArray[np.float64]
 Field = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
-TOLERANCE = 1e-3
+TOLERANCE = 5e-4
 """Residual at equilibrium relative to the response, both in the energy norm of the rest state."""
 
 LEAST = 1e-6

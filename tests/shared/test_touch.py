@@ -57,7 +57,7 @@ def path(atlas, depth, points):
 
 
 def test_the_tangent_is_the_derivative_of_the_force(atlas):
-    h = 2e-3
+    h = 0.02  # the solver's tolerance is noise in the force
     for at in ((0.5, 0.5), (0.31, 0.62), (0.7, 0.44)):
         x = above(atlas, 0.6, at)
         tangent = atlas.touch(x).tangent
@@ -125,5 +125,5 @@ def test_what_is_outside_the_range_is_flagged(atlas):
 
 
 def test_a_tip_inside_the_body_is_refused(atlas):
-    with pytest.raises(QueryError, match="below the surface"):
+    with pytest.raises(QueryError, match="below the accessible surface"):
         atlas.touch(above(atlas, 2.1))
