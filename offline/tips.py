@@ -21,6 +21,7 @@ from shared.atlas import Body, LocalModels, assemble_tips
 from shared.reduced import LANES
 from shared.surface import Surface
 from shared.touch import (
+    MAX_ITERATIONS,
     STATUS,
     TIP_ERROR_FEATURES,
     TIP_FEATURES,
@@ -83,7 +84,7 @@ class TipTrainer:
 
     def solve(self, position: Array) -> bool:
         """Solve a position, from the last one if that was solved."""
-        query(self.state.bound, position)
+        query(self.state.bound, position, MAX_ITERATIONS)
         return bool(self.state.outcome.scalars[STATUS] == equilibrium.CONVERGED)
 
     @property

@@ -29,6 +29,9 @@ In Hertz's theory the force goes with the depth d as d^1.5; linearised at d, it 
 measured on the turbinate: up to 5 % for 95 % of steps of this length in any direction.
 """
 
+MOST_ITERATIONS = 10
+"""Of one solve: a step that takes more is walked in shorter strides, within the time there is."""
+
 SHORTEST = 1.0 / 64.0
 """Stride, as a part of the way, that is not halved any more."""
 
@@ -135,7 +138,7 @@ class Follower:
 
     def _solve(self, position: Array) -> bool:
         """Solve a position; tell whether that led to an equilibrium, which is then the last."""
-        touch = self._atlas.touch(position, self._state)
+        touch = self._atlas.touch(position, self._state, MOST_ITERATIONS)
         if not (touch.converged and _is_finite(touch)):
             return False
         self._good = touch

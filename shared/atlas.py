@@ -735,7 +735,9 @@ class Atlas:
         tips = self.models.tips
         return None if tips is None else assemble_tips(self.body, self.models, tips)
 
-    def touch(self, position: ArrayLike, state: State | None = None) -> Touch:
+    def touch(
+        self, position: ArrayLike, state: State | None = None, most: int = touch.MAX_ITERATIONS
+    ) -> Touch:
         """Answer a position of the rigid tip.
 
         Parameters
@@ -744,6 +746,9 @@ class Atlas:
             Centre of the tip, outside the body.
         state : State, optional
             Where the last answer is remembered to start from; without it every answer is cold.
+        most : int
+            Iterations in one local model. With fewer than the default, a position that is hard to
+            get to is given up early: for callers that come nearer step by step.
 
         Raises
         ------
@@ -759,7 +764,7 @@ class Atlas:
             state.forget()
         if state.tip is None:
             state.tip = TipState(self.tips, self._tip_ground, self.tip_estimator.coefficients)
-        return touch.answer(state.tip, at, started)
+        return touch.answer(state.tip, at, started, most)
 
     @cached_property
     def _tip_ground(self) -> Ground:

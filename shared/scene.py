@@ -149,7 +149,7 @@ class Endoscope(_Part):
     radius: Positive = Field(description="of the pressed footprint, and of the tip, mm")
     max_tilt: float = Field(ge=0, lt=90, description="of the load from the inward normal, degrees")
     reach: Positive = Field(description="largest distance of a queried position from the body, mm")
-    tip: bool = Field(True, description="whether to train it as a rigid spherical tip, too")
+    tip: bool = Field(False, description="whether to train it as a rigid spherical tip, too")
 
 
 class Load(_Part):

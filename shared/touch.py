@@ -76,6 +76,13 @@ LEAST = 1e-6
 
 MAX_ITERATIONS = 40
 
+SKIN = 0.02
+"""Distance from the surface, in radii of the tip, at which contact is looked for: the triangles
+that say where the surface is cut its curves."""
+
+UPRIGHT = 0.7
+"""Cosine between normal and way to the tip's centre below which it is beside the surface."""
+
 RAMP = 8
 """Steps of the way in when an equilibrium cannot be found in one jump."""
 
@@ -379,17 +386,17 @@ descend = njit(equilibrium.descend, error_model="numpy", nogil=True, cache=True)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _settle(system, q, work, least):
+def _settle(system, q, work, least, most):
     """Equilibrium near q, in place: (status, iterations, energy, smallest det F).
 
     The response sets the tolerance and is not known before; ``least`` is what it may be.
     """
     energy, smallest = equilibrium.potential(system, q, work[0])
     status, iterations = equilibrium.CONVERGED, 0
-    size = max(math.sqrt(np.dot(q, q)), least)
+    size = max(math.sqrt(np.dot(q, q)), least, LEAST)
     while True:
         status, more, energy, smallest = descend(
-            system, q, work, energy, smallest, TOLERANCE * size, REUSE, MAX_ITERATIONS,
+            system, q, work, energy, smallest, TOLERANCE * size, REUSE, most,
             system.factor[0, 0] > 0.0, ROUND_OFF,
         )  # fmt: skip
         iterations += more
@@ -472,13 +479,13 @@ def _settle_on_the_way(system, q, work, least, depth, normal):
         if status == equilibrium.CONVERGED:
             at -= away / RAMP
             system.factor[0, 0] = 0.0
-            status, more, energy, smallest = _settle(system, q, work, least)
+            status, more, energy, smallest = _settle(system, q, work, least, MAX_ITERATIONS)
             iterations += more
     return status, iterations, energy, smallest
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _solve(models, k, slot, warm, x, normal, depth, memory, scratch, outcome):
+def _solve(models, k, slot, warm, x, normal, depth, most, memory, scratch, outcome):
     """Equilibrium of model k, its force and tangent into memory's slot and the outcome."""
     q, at, factor = memory.q[slot], memory.position[slot], memory.factor[slot]
     if warm:
@@ -490,8 +497,8 @@ def _solve(models, k, slot, warm, x, normal, depth, memory, scratch, outcome):
     tip = models.tip
     least = 0.1 * depth * tip.radius * math.sqrt(tip.stiffness / HARDNESS)
     system = _system(models, k, slot, at, memory, scratch)
-    status, iterations, energy, smallest = _settle(system, q, scratch.newton, least)
-    if status != equilibrium.CONVERGED and depth > 0.0:
+    status, iterations, energy, smallest = _settle(system, q, scratch.newton, least, most)
+    if status != equilibrium.CONVERGED and depth > 0.0 and most == MAX_ITERATIONS:
         status, more, energy, smallest = _settle_on_the_way(
             system, q, scratch.newton, least, depth, normal
         )
@@ -567,11 +574,12 @@ def _weight_gradients(models, memory, x, weight, scratch):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def query(solver, x):
+def query(solver, x, most):
     """Answer the tip's centre ``x`` (3,) mm into the solver's outcome.
 
-    A centre that is beyond the tip's radius from the surface, or below it, is not solved: the depth
-    in the outcome tells.
+    At ``most`` so many iterations are made in a patch; only with ``MAX_ITERATIONS`` is the way in
+    tried too where a jump fails.  A centre that is beyond the tip's radius from the surface, or
+    below it, is not solved: the depth in the outcome tells.
     """
     models, memory, scratch, outcome = (
         solver.models, solver.memory, solver.scratch, solver.outcome,
@@ -587,7 +595,8 @@ def query(solver, x):
     for i in range(3):
         above += (x[i] - foot[i]) * normal[i]
     radius = models.tip.radius
-    depth = radius - math.copysign(distance, above)
+    beside = abs(above) < UPRIGHT * distance
+    depth = radius - (distance if beside else math.copysign(distance, above))
     scalars[DEPTH], scalars[DISTANCE] = depth, distance
     if depth > radius or depth < -SKIN * radius:
         return
@@ -598,7 +607,7 @@ def query(solver, x):
             k = memory.patch[slot]
             warm = k >= 0
             k = k if warm else -2 - k
-            _solve(models, k, slot, warm, x, normal, depth, memory, scratch, outcome)
+            _solve(models, k, slot, warm, x, normal, depth, most, memory, scratch, outcome)
             share = outcome.weight[slot]
             for i in range(3):
                 outcome.force[i] += share * outcome.forces[slot, i]
@@ -627,15 +636,6 @@ def _features(outcome):
     features[4:7] = outcome.normal
     features[7] = math.log(max(pushed / depth, 1e-6))
     features[8] = math.log(max(2.0 * scalars[ENERGY] / max(pushed * depth, 1e-9), 1e-3))
-
-
-SKIN = 0.02
-"""Distance from the surface, in radii of the tip, at which contact is looked for: the triangles
-that say where the surface is cut its curves."""
-
-
-UPRIGHT = 0.7
-"""Cosine between normal and way to the tip's centre below which it is beside the surface."""
 
 
 class TipState:
@@ -766,15 +766,17 @@ class Touch(NamedTuple):
     solve_seconds: float
 
 
-def answer(state: TipState, position: Array, started: float) -> Touch:
+def answer(state: TipState, position: Array, started: float, most: int = MAX_ITERATIONS) -> Touch:
     """Answer a finite position of the tip; ``started`` is when the clock began to run, s.
+
+    For ``most`` see ``query``.
 
     Raises
     ------
     QueryError
         If the tip's centre lies below the surface.
     """
-    query(state.bound, position)
+    query(state.bound, position, most)
     outcome, memory, radius = state.outcome, state.memory, state.tip.radius
     scalars = outcome.scalars.tolist()
     depth, limit = scalars[DEPTH], float(outcome.limit[0])

@@ -115,7 +115,7 @@ class FakeAtlas:
     def new_state(self) -> "Memory":
         return Memory()
 
-    def touch(self, position: Any, state: Any = None) -> Touch:
+    def touch(self, position: Any, state: Any = None, most: int = 40) -> Touch:
         start = time.perf_counter()
         state = self.new_state() if state is None else state
         position = np.array(position, float)

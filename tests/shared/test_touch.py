@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from shared.atlas import Atlas
+from shared.endoscope import TIP_DEPTH
 from shared.errors import QueryError
+from shared.touch import TipState
+from shared.touch import answer as answer_touch
 
 
 @pytest.fixture(scope="module")
@@ -122,6 +125,37 @@ def test_what_is_outside_the_range_is_flagged(atlas):
     assert deep.out_of_range == ("depth",)
     beside = np.add(above(atlas, 1.9, (1.0, 0.5)), [0.5, 0, 0])
     assert "position" in atlas.touch(beside).out_of_range
+
+
+def test_contact_begins_where_the_surface_is_cut_short(atlas):
+    # triangles cut the curves of a surface: contact can begin a little above them
+    ground = atlas.surface.ground(atlas.limits[:, [TIP_DEPTH]])
+    lower = ground._replace(vertices=ground.vertices - [0.0, 0.0, 0.01])
+    radius, low = atlas.scene.endoscope.radius, atlas.nodes[:, 2].max() - 0.01
+    for depth in (0.0085, 0.005, 0.002):
+        state = TipState(atlas.tips, lower, atlas.tip_estimator.coefficients)
+        x = above(atlas, 0.0, (0.4, 0.6))
+        x[2] = low + radius - (depth - 0.01)
+        answer = answer_touch(state, x, 0.0)
+        assert answer.depth <= 0.0
+        assert answer.contact
+        assert answer.converged
+        assert answer.force[2] > 0.0
+
+
+def test_free_space_beside_the_body_is_free(atlas):
+    answer = atlas.touch([-5.0, 5.0, 5.0])
+    assert not answer.contact
+    assert not answer.force.any()
+    assert answer.depth < 0.0
+
+
+def test_an_impatient_caller_gets_an_answer_or_none(atlas):
+    state, deep = atlas.new_state(), above(atlas, 1.0, (0.45, 0.55))
+    answer = atlas.touch(deep, state, 1)
+    assert answer.iterations <= 3
+    assert answer.converged or not answer.force.any()
+    assert atlas.touch(deep, state).converged
 
 
 def test_a_tip_inside_the_body_is_refused(atlas):
