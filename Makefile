@@ -25,6 +25,7 @@ help:
 	@echo "make clean   remove .venv and the caches; artifacts stay"
 
 serve: .venv/run | $(artifact)
+	@$(bin)/palpate info $(artifact) > /dev/null || $(bin)/palpate train turbinate --out $(artifact)
 	$(bin)/palpate serve --artifacts artifacts --host $(HOST) --port $(PORT)
 
 test: lint
@@ -44,7 +45,7 @@ bench: .venv/dev | $(artifact)
 	$(bin)/palpate bench $(artifact)
 	$(bin)/pytest -q -rN --benchmark-enable --benchmark-only --benchmark-columns=median,iqr,rounds
 
-# Trained once; delete the file to train anew.
+# Trained once, and anew where another release wrote it; delete the file to train anew.
 $(artifact): | .venv/run
 	$(bin)/palpate train turbinate --out $@
 

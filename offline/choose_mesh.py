@@ -65,7 +65,7 @@ def with_mesh(scene: Scene) -> tuple[Scene, dict[str, Any] | None]:
     if chosen.error <= allowed:
         why = "the coarsest mesh tried with"
     else:
-        why = f"no mesh of at most {MOST_DOFS} DOFs has"
+        why = f"no mesh tried, of up to {chosen.dofs} DOFs, has"
     why += f" at most {allowed:.1%} error under the footprint: {chosen.error:.2%}"
     tqdm.write(f"mesh: {chosen.divisions}, {chosen.dofs} DOFs; {why}", file=sys.stderr)
     document = {"why": why, "tried": [vars(trial) for trial in tried]}

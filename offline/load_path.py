@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 NEAR = 0.1
 """Relative distance from the wanted displacement at which the pressure is interpolated."""
 
+LEAST = 1e-3
+
 TOLERANCE = 1e-3
 MAX_ITERATIONS = 20
 
@@ -46,22 +48,20 @@ class LoadPath:
         self._q = np.zeros_like(self._unit)
 
     def solve(self, pressure: float, start: Array | None) -> Array:
-        """Displacement (n, 3) mm at a pressure, from the last one unless ``start`` is None.
+        """Displacement (n, 3) mm at a pressure, from the last found unless ``start`` is None.
 
         Raises
         ------
         NoEquilibrium
         """
         self._load[:] = pressure * self._unit
-        if start is None:
-            self._q[:] = 0.0
+        q = np.zeros_like(self._q) if start is None else self._q.copy()
         target = TOLERANCE * float(np.linalg.norm(self._load))
-        status, *_ = equilibrium.newton(
-            self, self._q, self._work, target, 0.0, MAX_ITERATIONS, False
-        )
+        status, *_ = equilibrium.newton(self, q, self._work, target, 0.0, MAX_ITERATIONS, False)
         if status != equilibrium.CONVERGED:
             raise NoEquilibrium("load: no equilibrium found along its path")
-        return self._full(self._q).reshape(-1, 3)
+        self._q = q
+        return self._full(q).reshape(-1, 3)
 
     def _full(self, q: Array) -> Array:
         displacement = np.zeros(3 * len(self._model.mesh.nodes))
@@ -115,13 +115,21 @@ def pressure_that_moves(
     pressure, exponent : float
     displacement : ndarray, shape (n, 3), or None
         Near there.
+
+    Raises
+    ------
+    NoEquilibrium
+        If there is none at ``LEAST`` of the first guess either.
     """
+    least = LEAST * pressure
     low, high, last = 0.0, np.inf, None
     state = below = None  # the last state, and that at the pressure ``low``
     while high > 1.03 * low:
         try:
             state = solve(pressure, start)
         except NoEquilibrium:
+            if pressure < least:
+                raise
             high = pressure
             pressure, start = (low + high) / 2, below
             continue

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offline.cubature import compress, damped_fit, nonnegative, point_forces
+from offline.full_model import NoEquilibrium
 from offline.sampling import farthest
 from shared import equilibrium
 from shared.atlas import Body, LocalModels, assemble_tips
@@ -167,6 +168,8 @@ def train_tip(
         _untrained(space, models.points, models.weights),
     )
     pressed = _press(trainer, contacts, normals, depths, body.tip.radius, rng)
+    if not pressed:
+        raise NoEquilibrium("endoscope.tip: no equilibrium found under it; is the load too large?")
     V = _modes(pressed)
     states = [state.within(V) for state in pressed]
     modes = (space @ V).astype(np.float16)

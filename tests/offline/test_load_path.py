@@ -48,6 +48,13 @@ def test_beyond_the_last_equilibrium_it_stops_within_three_percent():
     assert 0.7 / 1.03 <= pressure_that_moves(solve, 3.0, 2.0)[0] <= 0.7
 
 
+def test_without_any_equilibrium_it_says_so():
+    solve, asked = spring(lambda p: p, limit=0.0)
+    with pytest.raises(NoEquilibrium):
+        pressure_that_moves(solve, 3.0, 2.0)
+    assert len(asked) < 15
+
+
 def test_the_path_is_near_the_full_model(workshop):
     x = workshop.surface.vertices[len(workshop.surface.vertices) // 2]
     nodal, normal = workshop.unit_load(x)
