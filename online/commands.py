@@ -148,7 +148,7 @@ def latency(url: str, scene: str, rounds: int, session: bool, as_json: bool) -> 
 
 @click.command()
 @click.argument("url")
-@click.argument("scene", default="turbinate")
+@click.argument("scene", default="turbinate-tip")
 @click.option(
     "--sessions", type=click.IntRange(0), default=1, show_default=True, help="Tools at once."
 )
