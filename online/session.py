@@ -26,7 +26,7 @@ from online.metrics import Metrics
 from online.schemas import parse_session_request
 from online.settings import Settings
 from online.store import Model, Store
-from online.websocket import LINGER, PENDING, READ_AT, STOPPING
+from online.websocket import LINGER, MOST_FRAMES, PENDING, READ_AT, STOPPING
 from shared.atlas import Atlas
 from shared.touch import Touch
 
@@ -34,9 +34,6 @@ logger = logging.getLogger(__name__)
 
 BUDGET = 1e-3
 """Seconds after which no further solve is begun for a step too large to follow at once."""
-
-MOST_FRAMES = 10_000
-"""Frames a second that are read of a session."""
 
 MOST_AT_ONCE = 100
 """Frames that are passed over for a newer one before one is answered."""
