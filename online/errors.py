@@ -26,6 +26,7 @@ STATUS = {
     "not_acceptable": 406,
     "body_too_large": 413,
     "unsupported_media_type": 415,
+    "foreign_host": 421,
     "upgrade_required": 426,
     "invalid_json": 422,
     "invalid_value": 422,

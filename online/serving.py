@@ -10,6 +10,7 @@ import logging
 import signal
 import sys
 import tempfile
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -64,11 +65,8 @@ def serve(settings: Settings, host: str, port: int, public: bool) -> None:
             f"no artifacts (*.h5) in {settings.artifacts}; make one with: "
             f"palpate train turbinate --out {settings.artifacts / 'turbinate.h5'}"
         )
-    if not settings.token and not public and not is_loopback(host):
-        raise PalpateError(
-            f"--host {host or '(any)'} lets other machines in: set PALPATE_TOKEN, or say "
-            "--public to serve anybody"
-        )
+    if not settings.token and not public:
+        settings = replace(settings, hosts=_local_names(host))
     logs.set_up(settings)
     with tempfile.TemporaryDirectory(prefix="palpate-") as directory:
         config = _config(settings, host, port)
@@ -88,6 +86,16 @@ def serve(settings: Settings, host: str, port: int, public: bool) -> None:
             Multiprocess(config, [bound]).run()
         else:
             uvicorn.Server(config).run([bound])
+
+
+def _local_names(host: str) -> tuple[str, ...]:
+    """Names by which to serve all who ask: this machine's, if it alone can ask."""
+    if not is_loopback(host):
+        raise PalpateError(
+            f"--host {host or '(any)'} lets other machines in: set PALPATE_TOKEN, or say "
+            "--public to serve anybody"
+        )
+    return ("localhost", host)
 
 
 def _config(settings: Settings, host: str, port: int) -> uvicorn.Config:
