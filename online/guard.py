@@ -30,7 +30,7 @@ METRICS = "/metrics"
 """Answered also while the service sheds load: it shows that it does."""
 
 BURST = 1.0
-"""Seconds of the rate limit that may come at once."""
+"""Seconds of the rate limit that may come at once, but always one request."""
 
 MOST_CLIENTS = 10_000
 """Clients whose rates are remembered; beyond it all are forgiven, so that memory stays bounded."""
@@ -80,7 +80,7 @@ class Guard:
         self._check_token(headers)
         if scope["path"] != METRICS:
             now = perf_counter()
-            self._check_wait(now - scope.get(RECEIVED, now))
+            self._check_wait(now - scope.get(RECEIVED, now), scope["type"])
             self._check_rate(scope, now)
 
     def _check_host(self, headers: Mapping[bytes, bytes]) -> None:
@@ -122,8 +122,9 @@ class Guard:
                 headers={"WWW-Authenticate": "Bearer"},
             )
 
-    def _check_wait(self, waited: float) -> None:
-        self._metrics.count_wait(waited)
+    def _check_wait(self, waited: float, kind: str) -> None:
+        if kind == "http":  # the opening of a session is no query
+            self._metrics.count_wait(waited)
         if waited > self._max_wait:
             raise Refusal(
                 "overloaded",
@@ -166,20 +167,21 @@ def _is_loopback_address(host: str) -> bool:
 
 
 class RateLimit:
-    """A bucket of tokens per client that fills at `rate` (1/s) up to `BURST` seconds' worth.
+    """A bucket of tokens per client that fills at `rate` (1/s).
 
-    Kept as the one moment at which the bucket will be full again (the generic cell rate algorithm
+    It holds `BURST` seconds' worth, but at least one. Kept as the one moment at which the bucket will be full again (the generic cell rate algorithm
     of ATM networks), so that an idle client costs nothing.
     """
 
     def __init__(self, rate: float) -> None:
         self.rate = rate
+        self._burst = max(BURST, 1.0 / rate)
         self._full_at: dict[str, float] = {}
 
     def take(self, client: str, now: float) -> float:
         """Take a token of `client` at `now` (s); if there is none, return the seconds to wait."""
         full_at = max(self._full_at.get(client, now), now)
-        wait = full_at + 1.0 / self.rate - now - BURST
+        wait = full_at + 1.0 / self.rate - now - self._burst
         if wait > 1e-9:
             return wait
         self._full_at[client] = full_at + 1.0 / self.rate

@@ -153,6 +153,14 @@ def test_a_bucket_empties_and_fills_at_its_rate():
     assert answered == pytest.approx(10 + 10 * 100, abs=1)
 
 
+def test_a_rate_below_one_a_second_is_kept_too():
+    bucket = RateLimit(0.1)
+    assert bucket.take("a", 0.0) == 0.0
+    assert bucket.take("a", 4.0) == pytest.approx(6.0)
+    answered = [t for t in range(5, 101) if bucket.take("a", t) == 0.0]
+    assert answered == list(range(10, 101, 10))
+
+
 def test_a_flood_of_addresses_does_not_fill_the_memory(monkeypatch):
     monkeypatch.setattr(guard, "MOST_CLIENTS", 100)
     bucket = RateLimit(10.0)
