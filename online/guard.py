@@ -169,8 +169,9 @@ def _is_loopback_address(host: str) -> bool:
 class RateLimit:
     """A bucket of tokens per client that fills at `rate` (1/s).
 
-    It holds `BURST` seconds' worth, but at least one. Kept as the one moment at which the bucket will be full again (the generic cell rate algorithm
-    of ATM networks), so that an idle client costs nothing.
+    It holds `BURST` seconds' worth, but at least one. Kept as the one moment at which the bucket
+    will be full again (the generic cell rate algorithm of ATM networks), so that an idle client
+    costs nothing.
     """
 
     def __init__(self, rate: float) -> None:
