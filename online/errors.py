@@ -21,6 +21,7 @@ STATUS = {
     "unauthorized": 401,
     "foreign_origin": 403,
     "unknown_scene": 404,
+    "no_tip": 404,
     "not_found": 404,
     "method_not_allowed": 405,
     "not_acceptable": 406,

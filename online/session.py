@@ -72,6 +72,10 @@ class Sessions:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Refuse a session or run it until it ends."""
         model = self._store.model(scope["path_params"]["name"])
+        if model.atlas.tips is None:
+            raise Refusal(
+                "no_tip", "name", "This scene was trained without a tip; it only answers loads"
+            )
         most = self._settings.max_sessions
         if self._open >= most:
             raise Refusal(
@@ -282,6 +286,8 @@ class Session:
 
 def warm(model: Model, metrics: Metrics) -> None:
     """Call all that a session calls once, and keep what the first sessions need at hand."""
+    if model.atlas.tips is None:
+        return
     x, y, z = model.tip
     request = Request(0, 0.0, (x, y, z), sum(Output))
     for _ in range(SPARE):

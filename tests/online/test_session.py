@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from online import frames
+from online.client import Client
 from online.frames import Flag, Output, Request
 from online.session_client import ServiceError, Session, SessionClosed
 from online.settings import Settings
@@ -251,6 +252,19 @@ def test_an_unknown_scene_has_no_session(url, caplog):
     with pytest.raises(PalpateError, match="HTTP 403"):
         Session(url, "a/b c")
     assert not caplog.records
+
+
+def test_a_scene_without_a_tip_has_no_session(serving):
+    atlas = FakeAtlas()
+    atlas.tips = None
+    with serving(toy=atlas, other=FakeAtlas("other")) as url:
+        with pytest.raises(ServiceError, match="trained without a tip") as refused:
+            Session(url, "toy")
+        assert (refused.value.status, refused.value.code) == (404, "no_tip")
+        with Client(url) as client:
+            assert client.solve("toy", (5.0, 5.0, 5.0), 4.0).trust["converged"]
+        with Session(url, "other") as session:
+            assert session.step(PRESSED).good
 
 
 def test_without_a_handshake_there_is_no_session(client):
