@@ -143,14 +143,14 @@ class Session:
                 async with asyncio.timeout(None) as self._interruption:
                     await self._deliver({"type": "websocket.send", "text": self._hello()})
                     await self._converse()
-            if self._farewell is not None:
-                code, reason = self._farewell
+        finally:
+            watching.cancel()  # there is nothing to interrupt any more
+        if self._farewell is not None:
+            code, reason = self._farewell
+            # a client that does not listen is cut off when this returns
+            with suppress(TimeoutError):
                 async with asyncio.timeout(LINGER):
                     await self._send({"type": "websocket.close", "code": code, "reason": reason})
-        except TimeoutError:
-            pass  # it does not listen; its connection is cut when this returns
-        finally:
-            watching.cancel()
 
     async def _converse(self) -> None:
         """Answer the newest message, again and again."""
