@@ -124,8 +124,10 @@ def test_a_new_worker_counts_on_where_a_killed_one_was(tmp_path):
     make_table(table, 2)
     (first, a), (second, b) = worker(table), worker(table)
     assert {a, b} == {0, 1}
+    descriptors = len(os.listdir("/dev/fd"))
     with pytest.raises(PalpateError, match="more workers than rows"):
         Metrics(table)
+    assert len(os.listdir("/dev/fd")) == descriptors
     first.kill()
     first.wait()
     third = Metrics(table)
