@@ -34,6 +34,9 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+LAST_WAIT = 4.0
+"""Seconds that workers get to end."""
+
 
 class Protocol(HttpToolsProtocol):
     """Uvicorn's HTTP, which also notes when it read a request."""
@@ -42,6 +45,19 @@ class Protocol(HttpToolsProtocol):
         """Begin a request."""
         super().on_message_begin()
         self.scope[RECEIVED] = perf_counter()  # type: ignore[literal-required]
+
+
+class Supervisor(Multiprocess):
+    """Uvicorn's, but it does not wait for ever for a worker to end."""
+
+    def join_all(self) -> None:
+        """Wait for the workers; kill those that are still loading their models."""
+        end = perf_counter() + LAST_WAIT
+        for worker in self.processes:
+            worker.process.join(max(0.0, end - perf_counter()))
+            if worker.process.is_alive():
+                worker.process.kill()
+        super().join_all()
 
 
 def serve(settings: Settings, host: str, port: int, public: bool) -> None:
@@ -83,7 +99,7 @@ def serve(settings: Settings, host: str, port: int, public: bool) -> None:
         for stop in (signal.SIGTERM, signal.SIGINT):
             signal.signal(stop, lambda *_: sys.exit(0))
         if settings.workers > 1:
-            Multiprocess(config, [bound]).run()
+            Supervisor(config, [bound]).run()
         else:
             uvicorn.Server(config).run([bound])
 
