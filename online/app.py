@@ -3,8 +3,9 @@
 import asyncio
 import gc
 import logging
+import threading
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from importlib.metadata import version
 from typing import Any
 
@@ -54,7 +55,9 @@ def create_app(
         if settings.workers > 1:
             await preparing
         yield
-        await preparing
+        preparing.cancel()
+        with suppress(asyncio.CancelledError):
+            await preparing
 
     app = FastAPI(
         title="Palpate",
@@ -77,10 +80,26 @@ def create_app(
 
 async def _prepare(store: Store, on_ready: Callable[[Store], None] | None) -> None:
     """Load and warm the models in a thread, then keep the collector away from them."""
-    try:
-        await asyncio.to_thread(store.open, _warm)
-    except Exception:
-        logger.exception("the models could not be loaded")
+    loop = asyncio.get_running_loop()
+    opened: asyncio.Future[bool] = loop.create_future()
+
+    def tell(whether: bool) -> None:
+        if not opened.done():
+            opened.set_result(whether)
+
+    def load() -> None:
+        done = False
+        try:
+            store.open(_warm)
+            done = True
+        except Exception:
+            logger.exception("the models could not be loaded")
+        with suppress(RuntimeError):  # the service has ended meanwhile
+            loop.call_soon_threadsafe(tell, done)
+
+    # a daemon: a service that is told to stop does not wait for it
+    threading.Thread(target=load, name="loading", daemon=True).start()
+    if not await opened:
         return
     gc.collect()
     gc.freeze()

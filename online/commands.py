@@ -124,8 +124,11 @@ def serve(host: str, port: int, public: bool, **settings: Any) -> None:
 @click.argument("scene")
 @click.option("--rounds", type=click.IntRange(min=1), default=3000, show_default=True)
 @click.option("--session", is_flag=True, help="Measure the steps of a session; needs an --echo.")
+@click.option("--token", envvar="PALPATE_TOKEN", show_envvar=True)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def latency(url: str, scene: str, rounds: int, session: bool, as_json: bool) -> None:
+def latency(
+    url: str, scene: str, rounds: int, session: bool, token: str | None, as_json: bool
+) -> None:
     """Measure what a running service at URL adds to a solve of SCENE.
 
     Medians in µs over ROUNDS turns of an empty request, a solve without fields and one with all
@@ -138,7 +141,7 @@ def latency(url: str, scene: str, rounds: int, session: bool, as_json: bool) -> 
     """
     from online.latency import measure, measure_session
 
-    report = (measure_session if session else measure)(url, scene, rounds)
+    report = (measure_session if session else measure)(url, scene, rounds, token)
     if as_json:
         click.echo(json.dumps(report))
         return

@@ -7,8 +7,8 @@ between, force and tangent of the last reply give the force at the device's own 
 
 with the step x - x_0 held to the reply's valid radius. What would pull the tip into the tissue is
 left out: a tool that is drawn back feels nothing. When a reply comes in, the difference to what the
-device felt before dwindles during `BLEND` seconds, so that there is no jump; when replies stop, the
-force fades away.
+device felt before dwindles during `BLEND` seconds, so that there is no jump; when replies stop, or
+do no more than repeat the last good answer, the force fades away.
 
 Plain functions of time and position; nothing here knows of sockets. Times are of the client's
 clock, seconds; lengths mm; forces mN.
@@ -20,7 +20,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from online.frames import Reply
+from online.frames import Flag, Reply
 
 Array = NDArray[np.float64]
 
@@ -92,7 +92,12 @@ class Extrapolator:
         self._offset = np.zeros(3)
 
     def update(self, reply: Reply, now: float) -> None:
-        """Take over a reply that came at `now`."""
+        """Take over a reply that came at `now`.
+
+        One with `Flag.FALLBACK` repeats what is known already, and makes it no younger.
+        """
+        if reply.flags & Flag.FALLBACK:
+            return
         position = reply.position if self._position is None else self._position
         self._offset = self._force(position, now) - linear_force(reply, position)
         self._reply = reply

@@ -149,6 +149,7 @@ REPLY = _dtype(REPLY_FIELDS)
 _REQUEST = _struct(REQUEST_FIELDS)
 _REPLY = _struct(REPLY_FIELDS)
 _OUTPUTS = sum(Output)
+_LARGEST = float(np.finfo(np.float32).max)
 # enumerations are slow to calculate with
 _COORDINATES, _DISPLACEMENT, _VON_MISES = map(
     int, (Output.COORDINATES, Output.DISPLACEMENT, Output.VON_MISES)
@@ -275,9 +276,9 @@ def encode_reply(
         *touch.normal.tolist(),
         touch.depth,
         touch.penetration,
-        touch.error_displacement,
-        touch.error_von_mises,
-        touch.error_force,
+        _estimate(touch.error_displacement),
+        _estimate(touch.error_von_mises),
+        _estimate(touch.error_force),
         touch.min_jacobian,
         extras.max_von_mises,
         extras.p99_von_mises,
@@ -294,6 +295,11 @@ def encode_reply(
         return head
     parts = (extras.coordinates, extras.displacement, extras.von_mises)
     return b"".join((head, *(part.data for part in parts if part is not None)))
+
+
+def _estimate(error: float) -> float:
+    """Call an error unknown that is too large for a float32."""
+    return error if error <= _LARGEST else math.inf
 
 
 def _nodes(extras: Extras) -> int:

@@ -5,9 +5,12 @@ would cost a query more than its solve.
 """
 
 import hmac
+import ipaddress
 import math
 from collections.abc import Mapping
+from functools import lru_cache
 from time import perf_counter
+from urllib.parse import urlsplit
 
 from fastapi import FastAPI
 from starlette.middleware.cors import CORSMiddleware
@@ -27,7 +30,7 @@ METRICS = "/metrics"
 """Answered also while the service sheds load: it shows that it does."""
 
 BURST = 1.0
-"""Seconds of the rate limit that may come at once."""
+"""Seconds of the rate limit that may come at once, but always one request."""
 
 MOST_CLIENTS = 10_000
 """Clients whose rates are remembered; beyond it all are forgiven, so that memory stays bounded."""
@@ -54,6 +57,7 @@ class Guard:
         self._app = app
         self._metrics = metrics
         self._origins = frozenset(origin.encode() for origin in settings.origins)
+        self._hosts = frozenset(host.lower() for host in settings.hosts)
         self._secret = f"Bearer {settings.token}".encode() if settings.token else None
         self._rates = RateLimit(settings.rate_limit) if settings.rate_limit else None
         self._max_wait = settings.max_wait
@@ -71,12 +75,30 @@ class Guard:
 
     def _admit(self, scope: Scope) -> None:
         headers = dict(scope["headers"])
+        self._check_host(headers)
         self._check_origin(headers)
         self._check_token(headers)
         if scope["path"] != METRICS:
             now = perf_counter()
-            self._check_wait(now - scope.get(RECEIVED, now))
+            self._check_wait(now - scope.get(RECEIVED, now), scope["type"])
             self._check_rate(scope, now)
+
+    def _check_host(self, headers: Mapping[bytes, bytes]) -> None:
+        """Refuse calls by other names than this machine's.
+
+        A page of another site may have its own name lead here (DNS rebinding); its origin is then
+        that of the service.
+        """
+        if not self._hosts:
+            return
+        host = _host(headers.get(b"host", b""))
+        if host not in self._hosts and not _is_loopback_address(host):
+            raise Refusal(
+                "foreign_host",
+                "host",
+                "The service does not go by this name",
+                sorted({*self._hosts, "127.0.0.1"}),
+            )
 
     def _check_origin(self, headers: Mapping[bytes, bytes]) -> None:
         """Refuse other sites' pages: a browser would lend them the user's place in the network."""
@@ -100,8 +122,9 @@ class Guard:
                 headers={"WWW-Authenticate": "Bearer"},
             )
 
-    def _check_wait(self, waited: float) -> None:
-        self._metrics.count_wait(waited)
+    def _check_wait(self, waited: float, kind: str) -> None:
+        if kind == "http":  # the opening of a session is no query
+            self._metrics.count_wait(waited)
         if waited > self._max_wait:
             raise Refusal(
                 "overloaded",
@@ -126,21 +149,40 @@ class Guard:
             )
 
 
-class RateLimit:
-    """A bucket of tokens per client that fills at `rate` (1/s) up to `BURST` seconds' worth.
+@lru_cache(64)
+def _host(header: bytes) -> str:
+    """Read the name or address in a Host header; empty if there is none."""
+    try:
+        return urlsplit(f"//{header.decode('latin-1')}").hostname or ""
+    except ValueError:
+        return ""
 
-    Kept as the one moment at which the bucket will be full again (the generic cell rate algorithm
-    of ATM networks), so that an idle client costs nothing.
+
+@lru_cache(64)
+def _is_loopback_address(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+class RateLimit:
+    """A bucket of tokens per client that fills at `rate` (1/s).
+
+    It holds `BURST` seconds' worth, but at least one. Kept as the one moment at which the bucket
+    will be full again (the generic cell rate algorithm of ATM networks), so that an idle client
+    costs nothing.
     """
 
     def __init__(self, rate: float) -> None:
         self.rate = rate
+        self._burst = max(BURST, 1.0 / rate)
         self._full_at: dict[str, float] = {}
 
     def take(self, client: str, now: float) -> float:
         """Take a token of `client` at `now` (s); if there is none, return the seconds to wait."""
         full_at = max(self._full_at.get(client, now), now)
-        wait = full_at + 1.0 / self.rate - now - BURST
+        wait = full_at + 1.0 / self.rate - now - self._burst
         if wait > 1e-9:
             return wait
         self._full_at[client] = full_at + 1.0 / self.rate

@@ -29,7 +29,7 @@ PATH = 0.3
 """Amplitude of the path of a session, mm."""
 
 
-def measure(url: str, scene: str, rounds: int) -> dict[str, float]:
+def measure(url: str, scene: str, rounds: int, token: str | None = None) -> dict[str, float]:
     """Time the service as one client sees it.
 
     Returns
@@ -41,10 +41,10 @@ def measure(url: str, scene: str, rounds: int) -> dict[str, float]:
         solve and the recovery; then these two as multiples of `empty_us`, ``solve_ratio`` and
         ``fields_ratio``.
     """
-    with Client(url) as client:
+    with Client(url, token) as client:
         example = client.scene(scene)["example"]
     path = f"/scenes/{quote(scene, safe='')}"
-    with _Connection(url) as connection:
+    with _Connection(url, token) as connection:
         empty = connection.request(f"{path}/check", JSON, {**example, "region": "none"})
         solve = connection.request(f"{path}/solve", JSON, {**example, "region": "none"})
         fields = connection.request(f"{path}/solve", BINARY, {**example, "region": "all"})
@@ -70,7 +70,9 @@ def measure(url: str, scene: str, rounds: int) -> dict[str, float]:
     return report
 
 
-def measure_session(url: str, scene: str, rounds: int) -> dict[str, float]:
+def measure_session(
+    url: str, scene: str, rounds: int, token: str | None = None
+) -> dict[str, float]:
     """Time the steps of a session on a path of small steps as one client sees them.
 
     Returns
@@ -82,8 +84,8 @@ def measure_session(url: str, scene: str, rounds: int) -> dict[str, float]:
     """
     solve_time = struct.Struct(f"<{REPLY.fields['solve_time'][1]}xf")  # type: ignore[index]
     with (
-        _WebSocket(url, f"/scenes/{quote(scene, safe='')}/session") as session,
-        _WebSocket(url, ECHO) as echo,
+        _WebSocket(url, token, f"/scenes/{quote(scene, safe='')}/session") as session,
+        _WebSocket(url, token, ECHO) as echo,
     ):
         x, y, z = json.loads(session.receive())["example"]["position"]
         path = [
@@ -110,9 +112,11 @@ def measure_session(url: str, scene: str, rounds: int) -> dict[str, float]:
 class _Connection:
     """A bare keep-alive connection: of an HTTP library we would measure the library."""
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, token: str | None) -> None:
         parts = urlsplit(url)
-        self._host = parts.netloc
+        self._headers = f"host: {parts.netloc}\r\n"
+        if token is not None:
+            self._headers += f"authorization: Bearer {token}\r\n"
         self._socket = socket.create_connection((parts.hostname, parts.port or 80), timeout=10)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
@@ -126,7 +130,7 @@ class _Connection:
         """Make the bytes of a POST."""
         body = json.dumps(document).encode()
         head = (
-            f"POST {path} HTTP/1.1\r\nhost: {self._host}\r\naccept: {accept}\r\n"
+            f"POST {path} HTTP/1.1\r\n{self._headers}accept: {accept}\r\n"
             f"content-type: application/json\r\ncontent-length: {len(body)}\r\n\r\n"
         )
         return head.encode() + body
@@ -161,10 +165,10 @@ class _Connection:
 class _WebSocket(_Connection):
     """A bare WebSocket, for frames of up to 64 KB."""
 
-    def __init__(self, url: str, path: str) -> None:
-        super().__init__(url)
+    def __init__(self, url: str, token: str | None, path: str) -> None:
+        super().__init__(url, token)
         self._socket.sendall(
-            f"GET {path} HTTP/1.1\r\nhost: {self._host}\r\nupgrade: websocket\r\n"
+            f"GET {path} HTTP/1.1\r\n{self._headers}upgrade: websocket\r\n"
             "connection: upgrade\r\nsec-websocket-version: 13\r\n"
             "sec-websocket-key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n".encode()
         )

@@ -11,6 +11,7 @@ milliseconds to write the text, in which nobody is answered. This takes 1 µs an
 import mmap
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from itertools import accumulate
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
@@ -255,14 +256,17 @@ def _claim(path: Path) -> tuple[int, mmap.mmap]:
     """Map the shared table and take a free row of it, until this process ends."""
     import fcntl  # only workers need it, and only POSIX has both
 
-    descriptor = os.open(path, os.O_RDWR)
-    table = mmap.mmap(descriptor, 0)
-    for worker in range(len(table) // (8 * WIDTH)):
-        try:
-            fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, worker)
-        except OSError:
-            continue
-        return worker, table
+    with ExitStack() as stack:
+        descriptor = os.open(path, os.O_RDWR)
+        stack.callback(os.close, descriptor)
+        table = stack.enter_context(mmap.mmap(descriptor, 0))
+        for worker in range(len(table) // (8 * WIDTH)):
+            try:
+                fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, worker)
+            except OSError:
+                continue
+            stack.pop_all()  # they stay open: closing either would free the row
+            return worker, table
     raise PalpateError(f"{path}: more workers than rows")
 
 

@@ -25,6 +25,9 @@ FORMAT_VERSION = 1
 CHUNK = 2000
 """Replies that are kept in memory until they are written."""
 
+MOST_UNANSWERED = 100_000
+"""Requests that are remembered for their replies: more than the buffers on the way can hold."""
+
 ASKED = (
     Field("asked_position", "float64", "mm", "centre of the tip that was asked for", (3,)),
     Field("asked_outputs", "uint16", "", "what was wanted, bits"),
@@ -81,17 +84,22 @@ class Recorder:
     def sent(self, request: Request) -> None:
         """Note a request."""
         self._requests[request.seq] = request
+        if len(self._requests) > MOST_UNANSWERED:
+            del self._requests[next(iter(self._requests))]
 
     def received(self, reply: bytes, now: float) -> None:
-        """Note the reply (a frame) to one of the requests noted, which came at `now` (s)."""
-        head = np.frombuffer(reply, REPLY, 1)[0]
-        request = self._requests.pop(int(head["seq"]))
+        """Note the reply (a frame) to one of the requests noted, which came at `now` (s).
+
+        A reply to anything else is left out: what was asked is not known.
+        """
+        request = self._requests.pop(int(np.frombuffer(reply, REPLY, 1)[0]["seq"]), None)
+        if request is None:
+            return
         self._asked.append((request.position, request.outputs, now))
         self._replies.append(reply[: REPLY.itemsize])
-        if head["superseded"]:
-            # replies come in order: what was sent earlier will not be answered any more
-            for seq in [seq for seq in self._requests if _before(seq, request.seq)]:
-                del self._requests[seq]
+        # replies come in order: what was sent earlier was dropped or refused
+        for seq in [seq for seq in self._requests if _before(seq, request.seq)]:
+            del self._requests[seq]
         if len(self._replies) >= CHUNK:
             self._write()
 

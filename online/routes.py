@@ -52,7 +52,7 @@ _BY_HAND: dict[str, Any] = {"parameters": [_NAME], "requestBody": _BODY}
 
 def _problems(*codes: int) -> dict[int | str, dict[str, Any]]:
     """Describe the refusals of an endpoint: its own `codes` and those of the guard."""
-    return {code: {"model": Problem} for code in sorted({401, 403, 429, 503, *codes})}
+    return {code: {"model": Problem} for code in sorted({401, 403, 421, 429, 503, *codes})}
 
 
 def _document(model: type, what: str) -> dict[int | str, dict[str, Any]]:

@@ -5,11 +5,13 @@ dies, and passes on the signal to end. All workers accept from the one socket, s
 to the worker that accepted it and is none of the others' business.
 """
 
+import asyncio
 import json
 import logging
 import signal
 import sys
 import tempfile
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -17,11 +19,12 @@ from typing import TYPE_CHECKING
 
 import click
 import uvicorn
-from fastapi import FastAPI
-from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from fastapi import FastAPI, Response
+from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 from uvicorn.supervisors.multiprocess import Multiprocess
 
 from online import logs, realtime
+from online.errors import Refusal
 from online.guard import RECEIVED
 from online.metrics import Metrics, make_table
 from online.settings import Settings, is_loopback
@@ -33,14 +36,92 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+MOST_CONNECTIONS = 900
+"""Of one worker; systems commonly allow a process 1024 files."""
+
+PATIENCE = 10.0
+"""Seconds that a client gets to send a request, or to begin its first one."""
+
+LAST_WAIT = 4.0
+"""Seconds that workers get to end."""
+
+
+def _http(response: Response) -> bytes:
+    """Write a response as it goes over the wire."""
+    head = b"".join(name + b": " + value + b"\r\n" for name, value in response.raw_headers)
+    return STATUS_LINE[response.status_code] + head + b"\r\n" + bytes(response.body)
+
+
+FULL = _http(
+    Refusal(
+        "overloaded",
+        "",
+        "The service has no place for another connection",
+        {"max_connections": MOST_CONNECTIONS},
+        {"Retry-After": "1", "Connection": "close"},
+    ).response()
+)
+"""What a client is told for whom there is no place."""
+
 
 class Protocol(HttpToolsProtocol):
-    """Uvicorn's HTTP, which also notes when it read a request."""
+    """Uvicorn's HTTP, which also notes when it read a request, and whom it waits for.
+
+    A connection beyond `MOST_CONNECTIONS` is told so and closed, and one whose request is not
+    whole after `PATIENCE` is closed: it holds a place and memory.
+    """
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Take over a connection."""
+        super().connection_made(transport)
+        self.waiting_since: float | None = self.loop.time()
+        self.patience = self.loop.call_later(PATIENCE, self.check_patience)
+        if len(self.connections) > MOST_CONNECTIONS:
+            transport.write(FULL)
+            transport.close()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forget a connection."""
+        self.patience.cancel()
+        super().connection_lost(exc)
 
     def on_message_begin(self) -> None:
         """Begin a request."""
         super().on_message_begin()
+        self.waiting_since = self.loop.time()
         self.scope[RECEIVED] = perf_counter()  # type: ignore[literal-required]
+
+    def on_message_complete(self) -> None:
+        """End a request."""
+        super().on_message_complete()
+        self.waiting_since = None
+
+    def handle_websocket_upgrade(self) -> None:
+        """Leave a connection to its session."""
+        self.patience.cancel()
+        super().handle_websocket_upgrade()
+
+    def check_patience(self) -> None:
+        """Close the connection if its request has been coming for too long; else look again."""
+        now = self.loop.time()
+        since = now if self.waiting_since is None else self.waiting_since
+        if now - since >= PATIENCE:
+            self.transport.abort()
+        else:
+            self.patience = self.loop.call_at(since + PATIENCE, self.check_patience)
+
+
+class Supervisor(Multiprocess):
+    """Uvicorn's, but it does not wait for ever for a worker to end."""
+
+    def join_all(self) -> None:
+        """Wait for the workers; kill those that are still loading their models."""
+        end = perf_counter() + LAST_WAIT
+        for worker in self.processes:
+            worker.process.join(max(0.0, end - perf_counter()))
+            if worker.process.is_alive():
+                worker.process.kill()
+        super().join_all()
 
 
 def serve(settings: Settings, host: str, port: int, public: bool) -> None:
@@ -64,11 +145,8 @@ def serve(settings: Settings, host: str, port: int, public: bool) -> None:
             f"no artifacts (*.h5) in {settings.artifacts}; make one with: "
             f"palpate train turbinate --out {settings.artifacts / 'turbinate.h5'}"
         )
-    if not settings.token and not public and not is_loopback(host):
-        raise PalpateError(
-            f"--host {host or '(any)'} lets other machines in: set PALPATE_TOKEN, or say "
-            "--public to serve anybody"
-        )
+    if not settings.token and not public:
+        settings = replace(settings, hosts=_local_names(host))
     logs.set_up(settings)
     with tempfile.TemporaryDirectory(prefix="palpate-") as directory:
         config = _config(settings, host, port)
@@ -85,9 +163,19 @@ def serve(settings: Settings, host: str, port: int, public: bool) -> None:
         for stop in (signal.SIGTERM, signal.SIGINT):
             signal.signal(stop, lambda *_: sys.exit(0))
         if settings.workers > 1:
-            Multiprocess(config, [bound]).run()
+            Supervisor(config, [bound]).run()
         else:
             uvicorn.Server(config).run([bound])
+
+
+def _local_names(host: str) -> tuple[str, ...]:
+    """Names by which to serve all who ask: this machine's, if it alone can ask."""
+    if not is_loopback(host):
+        raise PalpateError(
+            f"--host {host or '(any)'} lets other machines in: set PALPATE_TOKEN, or say "
+            "--public to serve anybody"
+        )
+    return ("localhost", host)
 
 
 def _config(settings: Settings, host: str, port: int) -> uvicorn.Config:

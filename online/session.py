@@ -26,7 +26,7 @@ from online.metrics import Metrics
 from online.schemas import parse_session_request
 from online.settings import Settings
 from online.store import Model, Store
-from online.websocket import LINGER, PENDING, READ_AT, STOPPING
+from online.websocket import LINGER, MOST_FRAMES, PENDING, READ_AT, STOPPING
 from shared.atlas import Atlas
 from shared.touch import Touch
 
@@ -34,9 +34,6 @@ logger = logging.getLogger(__name__)
 
 BUDGET = 1e-3
 """Seconds after which no further solve is begun for a step too large to follow at once."""
-
-MOST_FRAMES = 10_000
-"""Frames a second that are read of a session."""
 
 MOST_AT_ONCE = 100
 """Frames that are passed over for a newer one before one is answered."""
@@ -75,6 +72,10 @@ class Sessions:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Refuse a session or run it until it ends."""
         model = self._store.model(scope["path_params"]["name"])
+        if model.atlas.tips is None:
+            raise Refusal(
+                "no_tip", "name", "This scene was trained without a tip; it only answers loads"
+            )
         most = self._settings.max_sessions
         if self._open >= most:
             raise Refusal(
@@ -142,14 +143,14 @@ class Session:
                 async with asyncio.timeout(None) as self._interruption:
                     await self._deliver({"type": "websocket.send", "text": self._hello()})
                     await self._converse()
-            if self._farewell is not None:
-                code, reason = self._farewell
+        finally:
+            watching.cancel()  # there is nothing to interrupt any more
+        if self._farewell is not None:
+            code, reason = self._farewell
+            # a client that does not listen is cut off when this returns
+            with suppress(TimeoutError):
                 async with asyncio.timeout(LINGER):
                     await self._send({"type": "websocket.close", "code": code, "reason": reason})
-        except TimeoutError:
-            pass  # it does not listen; its connection is cut when this returns
-        finally:
-            watching.cancel()
 
     async def _converse(self) -> None:
         """Answer the newest message, again and again."""
@@ -285,6 +286,8 @@ class Session:
 
 def warm(model: Model, metrics: Metrics) -> None:
     """Call all that a session calls once, and keep what the first sessions need at hand."""
+    if model.atlas.tips is None:
+        return
     x, y, z = model.tip
     request = Request(0, 0.0, (x, y, z), sum(Output))
     for _ in range(SPARE):

@@ -312,7 +312,11 @@ class AsyncSession(_Dialogue):
             self._connection: ClientConnection = await self._connecting
         except InvalidStatus as error:
             raise _refusal(error) from None
-        self._begin(await self._message())
+        try:
+            self._begin(await self._message())
+        except BaseException:
+            await self._connection.close()
+            raise
         return self
 
     async def __aexit__(
@@ -321,8 +325,10 @@ class AsyncSession(_Dialogue):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        await self._connection.close()
-        self._end()
+        try:
+            await self._connection.close()
+        finally:
+            self._end()
 
     async def send(
         self, position: Sequence[float], outputs: int = 0, client_time: float | None = None

@@ -20,6 +20,8 @@ class Settings:
         What clients must present as ``Authorization: Bearer``. Default: nobody is asked.
     origins : tuple of str
         Origins whose web pages may use the service, besides its own; ``*`` for any.
+    hosts : tuple of str
+        Names that clients may call the service by, besides loopback addresses. Default: any.
     max_body : int, bytes
         Largest request body. A query needs some hundred bytes.
     max_json_numbers : int
@@ -50,6 +52,7 @@ class Settings:
     artifacts: Path
     token: str | None = None
     origins: tuple[str, ...] = ()
+    hosts: tuple[str, ...] = ()
     max_body: int = 64 * 1024
     max_json_numbers: int = 100_000
     rate_limit: float = 2000.0

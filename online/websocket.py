@@ -1,12 +1,16 @@
 """Uvicorn's WebSockets, bounded: what a client may pile up here, and how it is told to go."""
 
 import asyncio
+import logging
 import socket
 from time import perf_counter
 from typing import Any
 
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from websockets.frames import Frame
 from websockets.http11 import Request
+
+logger = logging.getLogger(__name__)
 
 STOPPING = 1012
 """Code of the ``websocket.disconnect`` that asks an application to say goodbye itself."""
@@ -28,24 +32,34 @@ All of them are parsed in one go, some microseconds for every small frame, while
 SEND_BUFFER = 128 * 1024
 """Bytes the system keeps for a client that does not read: a few replies with fields."""
 
+MOST_FRAMES = 10_000
+"""Frames a second: no more messages are read of a client, and more of others cut it off."""
+
+MOST_PARTS = 64
+"""Frames that a message may come in; even empty ones take memory until it is whole."""
+
 LINGER = 1.0
 """Seconds a client gets to take what was sent before its connection is cut."""
 
 
 class Protocol(WebSocketsSansIOProtocol):
-    """Like uvicorn's, but for seven things.
+    """Like uvicorn's, but for eight things.
 
     An application can tell whether there is more to read, and when it was read. The system's
     buffers are small, so that what waits in them is recent. A service that stops lets its
     applications answer what they have and close with a reason. Closing does not wait long for a
     client that says nothing. A connection whose application has ended is cut even if its client
-    never reads what is left. A refusal is no error of the application, and not logged as one.
+    never reads what is left. So is that of a client that floods it with what no application ever
+    sees, pings and parts of messages. A refusal is no error of the application, and not logged as
+    one.
     """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self.close_timeout = LINGER
         self.read_at = 0.0
+        self.asides = 0
+        self.asides_since = 0.0
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Take over a connection."""
@@ -66,6 +80,40 @@ class Protocol(WebSocketsSansIOProtocol):
             extensions: dict[str, Any] = self.scope["extensions"]
             extensions[PENDING] = lambda: not self.queue.empty()
             extensions[READ_AT] = lambda: self.read_at
+
+    def handle_ping(self) -> None:
+        """Answer a ping, unless the answers to those before pile up here."""
+        if not self.writable.is_set():
+            self.cut_off("it leaves the answers to its pings unread")
+        elif self.is_bearable():
+            super().handle_ping()
+
+    def handle_pong(self, event: Frame) -> None:
+        """Take a pong."""
+        if self.is_bearable():
+            super().handle_pong(event)
+
+    def handle_cont(self, event: Frame) -> None:
+        """Take a further part of a message."""
+        if len(self.frames) >= MOST_PARTS:
+            self.cut_off(f"it sends a message in more than {MOST_PARTS} parts")
+        elif self.is_bearable():
+            super().handle_cont(event)
+
+    def is_bearable(self) -> bool:
+        """Count a frame that is no message; cut the client off if there are too many a second."""
+        if self.read_at - self.asides_since >= 1.0:
+            self.asides, self.asides_since = 0, self.read_at
+        self.asides += 1
+        if self.asides > MOST_FRAMES:
+            self.cut_off("it floods the service with frames that are no messages")
+        return not self.transport.is_closing()
+
+    def cut_off(self, why: str) -> None:
+        """End the connection at once, whatever else has been read of it."""
+        if not self.transport.is_closing():
+            logger.warning("a client is cut off: %s", why)
+            self.transport.abort()
 
     def shutdown(self) -> None:
         """Ask the application to end the connection."""

@@ -5,7 +5,8 @@ import os
 import sys
 from pathlib import Path
 
-KERNELS = ("shared", "offline", "offline/methods")
+KERNELS = ("shared", "offline", "offline/methods", "online")
+"""Folders of sources with kernels, or with constants that are compiled into them."""
 
 
 def _kernel_cache() -> None:

@@ -22,6 +22,7 @@ from online.loadtest.report import (
 )
 from online.loadtest.sessions import Session
 from online.loadtest.target import Target
+from shared.errors import PalpateError
 
 Array = NDArray[np.float64]
 
@@ -103,8 +104,11 @@ def run(plan: Plan) -> Outcome:
     Raises
     ------
     PalpateError
-        If the service cannot be reached, lacks the scene or refuses a session.
+        If there is nothing to send, or the service cannot be reached, lacks the scene or refuses a
+        session.
     """
+    if not (plan.sessions or plan.queries):
+        raise PalpateError("nothing to send: ask for --sessions or --queries-per-second")
     rng = np.random.default_rng(plan.seed)
     with Client(plan.url, token=plan.token) as client:
         scene = client.scene(plan.scene)

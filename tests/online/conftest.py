@@ -8,6 +8,7 @@ import uvicorn
 from starlette.testclient import TestClient
 
 from online.app import create_app
+from online.serving import Protocol
 from online.settings import Settings
 from online.store import Store
 from online.websocket import OPTIONS
@@ -68,7 +69,9 @@ def serving(fake_store, tmp_path):
     def serving(settings=None, **atlases):
         store = fake_store(**atlases)
         app = create_app(settings or Settings(tmp_path), store)
-        config = uvicorn.Config(app, access_log=False, log_level="warning", **OPTIONS)
+        config = uvicorn.Config(
+            app, http=Protocol, access_log=False, log_level="warning", **OPTIONS
+        )
         server = uvicorn.Server(config)
         with socket.create_server(("127.0.0.1", 0)) as bound:
             thread = threading.Thread(target=server.run, args=([bound],))

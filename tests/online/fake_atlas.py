@@ -31,13 +31,15 @@ class FakeAtlas:
     Above `collapse` (kPa) it has no equilibrium; `poison` makes its answers NaN.
 
     A tip meets a bed of springs of `stiffness` (mN/mm). Deeper than `deepest` (mm) there is no
-    equilibrium, and none is found more than `stride` (mm) from the last contact.
+    equilibrium, and none is found more than `stride` (mm) from the last contact. Without `tips`
+    there is no answer to a tip at all.
     """
 
     pressure_max = 8.0
     stiffness = 20.0
     deepest = 1.5
     stride = np.inf
+    tips: object | None = "a bed of springs"
 
     def __init__(
         self, name: str = "toy", divisions: int = 10, collapse: float = 40.0, poison: bool = False
@@ -117,6 +119,8 @@ class FakeAtlas:
 
     def touch(self, position: Any, state: Any = None, most: int = 40) -> Touch:
         start = time.perf_counter()
+        if self.tips is None:
+            raise QueryError("position", "no tip")
         state = self.new_state() if state is None else state
         position = np.array(position, float)
         radius = self.scene.endoscope.radius

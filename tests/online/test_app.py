@@ -39,6 +39,15 @@ def test_it_lives_at_once_and_is_ready_when_warm(slow_store, tmp_path):
         assert client.get("/ready").json() == {"status": "ready"}
 
 
+def test_a_service_that_is_told_to_stop_does_not_wait_for_its_models(slow_store, tmp_path):
+    store, loaded = slow_store
+    with TestClient(create_app(Settings(tmp_path), store)) as client:
+        assert client.get("/ready").status_code == 503
+    assert not store.ready
+    assert not loaded.is_set()
+    loaded.set()
+
+
 def test_a_service_without_any_model_is_not_ready(serve):
     with serve(broken=PalpateError("broken.h5: truncated")) as client:
         response = client.get("/ready")

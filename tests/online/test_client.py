@@ -3,9 +3,11 @@ import select
 
 import numpy as np
 import pytest
+from websockets.protocol import State
 
 from online.client import AsyncClient, Client, ServiceError
-from online.session_client import SessionClosed
+from online.recording import read_recording
+from online.session_client import AsyncSession, SessionClosed
 from shared.errors import PalpateError
 
 from .fake_atlas import FakeAtlas
@@ -99,3 +101,35 @@ def test_poll_does_not_wait(url):
             pass
         assert reply.seq == seq
         assert session.poll() is None
+
+
+def test_a_session_that_cannot_be_recorded_is_closed(url, tmp_path):
+    """There is no such folder: the error is told, and the session's place is free again."""
+    session = AsyncSession(url, "toy", record=tmp_path / "missing" / "session.h5")
+
+    async def run():
+        with pytest.raises(FileNotFoundError):
+            async with session:
+                pass
+        return session._connection.state
+
+    assert asyncio.run(run()) is State.CLOSED
+
+
+def test_a_recording_is_whole_even_if_closing_fails(url, tmp_path, monkeypatch):
+    path = tmp_path / "session.h5"
+
+    async def run():
+        async with AsyncSession(url, "toy", record=path) as session:
+            await session.step((5.0, 5.0, 6.5))
+            connection, closing = session._connection, session._connection.close()
+
+            async def close():
+                await closing
+                raise OSError("gone")
+
+            monkeypatch.setattr(connection, "close", close)
+
+    with pytest.raises(OSError, match="gone"):
+        asyncio.run(run())
+    assert len(read_recording(path).requests) == 1

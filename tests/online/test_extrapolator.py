@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from online.extrapolator import BLEND, HOLD, RAMP, Extrapolator, clamp, fade, linear_force
 from online.follower import Follower
-from online.frames import Request, decode_reply, encode_reply
+from online.frames import Flag, Request, decode_reply, encode_reply
 
 from .fake_atlas import FakeAtlas
 
@@ -99,6 +99,31 @@ def test_when_replies_stop_the_force_fades():
     device.update(late, 10.0)
     assert not device.force(at, 10.0).any()
     np.testing.assert_allclose(device.force(at, 10.0 + BLEND), [0, 0, 10.0])
+
+
+def test_answers_that_are_only_repeated_fade_too():
+    """The tip is where there is no equilibrium: replies go on, but none is of where it is."""
+    device, follower = Extrapolator(MOST), Follower(TOY)
+    at, too_deep = (5.0, 5.0, SURFACE - 0.5), (5.0, 5.0, SURFACE - 1.8)
+
+    def tick(position, now):
+        step = follower.follow(position, budget=0.0)
+        reply = decode_reply(encode_reply(Request(0, 0.0, position), step))
+        device.update(reply, now)
+        return reply, device.force(at, now)
+
+    tick(at, 0.0)
+    forces = []
+    for now in 1e-3 * np.arange(1, 1000):
+        reply, force = tick(too_deep, now)
+        assert reply.flags & Flag.FALLBACK
+        np.testing.assert_allclose(reply.force, [0, 0, 10.0])
+        if now >= BLEND:
+            np.testing.assert_allclose(force, [0, 0, 10.0 * fade(now)], atol=1e-9)
+        forces.append(force[2])
+    assert forces[-1] == 0.0
+    tick(at, 1.0)
+    np.testing.assert_allclose(device.force(at, 1.0 + BLEND), [0, 0, 10.0])
 
 
 def test_the_force_on_a_moving_device_is_continuous(rng):

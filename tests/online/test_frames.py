@@ -73,6 +73,16 @@ def test_a_reply_comes_back():
     assert reply.coordinates is reply.displacement is reply.von_mises is None
 
 
+@pytest.mark.parametrize("error", [3.5e38, 1e300, float("inf")])
+def test_estimates_too_large_for_their_field_are_unknown(error):
+    huge = step()
+    huge.touch.error_displacement = huge.touch.error_von_mises = huge.touch.error_force = error
+    reply = frames.decode_reply(frames.encode_reply(REQUEST, huge))
+    assert reply.error_displacement == reply.error_von_mises == reply.error_force == np.inf
+    huge.touch.error_force = 3e38
+    assert frames.decode_reply(frames.encode_reply(REQUEST, huge)).error_force < np.inf
+
+
 @pytest.mark.parametrize("half", [False, True])
 def test_extras_come_back(rng, half):
     kind = np.float16 if half else np.float32

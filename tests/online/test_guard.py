@@ -70,6 +70,39 @@ def test_pages_of_other_sites_are_refused(guarded):
         assert client.get("/scenes").status_code == 200
 
 
+LOCAL = {"hosts": ("localhost", "Trainer")}
+FOREIGN = (
+    "evil.example",
+    "evil.example:8000",
+    "10.0.0.1",
+    "localhost.evil.example",
+    "",
+    "[",
+    "[::",
+)
+
+
+@pytest.mark.parametrize("host", FOREIGN)
+def test_names_that_are_not_this_machines_are_refused(guarded, host):
+    """A page whose own name leads here is of the same origin, as far as its browser knows."""
+    with guarded(**LOCAL) as client:
+        headers = {"host": host, "origin": f"http://{host}"}
+        error = refused(client.get("/scenes", headers=headers), 421)
+        assert (error["code"], error["field"]) == ("foreign_host", "host")
+        assert "localhost" in error["allowed"]
+        assert refused(client.post("/scenes/toy/solve", json=LOAD, headers=headers), 421)
+
+
+@pytest.mark.parametrize(
+    "host",
+    ["localhost", "LOCALHOST:80", "127.0.0.1:8000", "127.9.8.7", "[::1]:8000", "trainer:1"],
+)
+def test_names_of_this_machine_are_served(guarded, host):
+    with guarded(**LOCAL) as client:
+        headers = {"host": host, "origin": f"http://{host}"}
+        assert client.get("/scenes", headers=headers).status_code == 200
+
+
 def test_listed_origins_may_read_answers(guarded):
     page = "https://trainer.example"
     with guarded(origins=(page,), token="secret") as client:
@@ -118,6 +151,14 @@ def test_a_bucket_empties_and_fills_at_its_rate():
     # over a long time the rate is kept exactly, however often one asks
     answered = sum(bucket.take("c", 0.01 * i) == 0.0 for i in range(10_000))
     assert answered == pytest.approx(10 + 10 * 100, abs=1)
+
+
+def test_a_rate_below_one_a_second_is_kept_too():
+    bucket = RateLimit(0.1)
+    assert bucket.take("a", 0.0) == 0.0
+    assert bucket.take("a", 4.0) == pytest.approx(6.0)
+    answered = [t for t in range(5, 101) if bucket.take("a", t) == 0.0]
+    assert answered == list(range(10, 101, 10))
 
 
 def test_a_flood_of_addresses_does_not_fill_the_memory(monkeypatch):
@@ -178,7 +219,7 @@ def test_sessions_ask_for_the_token_too(serving, tmp_path):
             assert session.step((5.0, 5.0, 6.5)).good
 
 
-def handshake(url, origin):
+def handshake(url, origin, **more):
     """Try to open a session from a page of `origin`; return the status."""
     address = urlsplit(url).netloc
     connection = http.client.HTTPConnection(address, timeout=10)
@@ -188,6 +229,7 @@ def handshake(url, origin):
         "Upgrade": "websocket",
         "Sec-WebSocket-Version": "13",
         "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
+        **more,
     }
     connection.request("GET", "/scenes/toy/session", headers=headers)
     status = connection.getresponse().status
@@ -201,6 +243,12 @@ def test_pages_of_other_sites_get_no_session(serving, tmp_path):
         assert handshake(url, "https://evil.example") == 403
         assert handshake(url, page) == 101
         assert handshake(url, url) == 101
+
+
+def test_other_names_get_no_session(serving, tmp_path):
+    with serving(Settings(tmp_path, **LOCAL), toy=FakeAtlas()) as url:
+        assert handshake(url, url) == 101
+        assert handshake(url, "http://evil.example", Host="evil.example") == 421
 
 
 def test_opening_sessions_has_a_rate(serving, tmp_path):

@@ -34,3 +34,13 @@ def test_what_a_session_adds_is_told_apart_from_the_solve(serving, tmp_path):
 def test_without_an_echo_a_session_cannot_be_measured(url):
     with pytest.raises(PalpateError, match="palpate serve --echo"):
         measure_session(url, "toy", rounds=1)
+
+
+def test_it_presents_a_token(serving, tmp_path):
+    with serving(Settings(tmp_path, echo=True, token="secret"), toy=FakeAtlas()) as url:
+        arguments = [url, "toy", "--rounds", "2", "--json"]
+        for more in ([], ["--session"]):
+            refused = CliRunner().invoke(latency, [*arguments, *more])
+            assert isinstance(refused.exception, PalpateError)
+            result = CliRunner().invoke(latency, [*arguments, *more, "--token", "secret"])
+            assert result.exit_code == 0, result.output

@@ -1,12 +1,14 @@
 import os
 import subprocess
 import sys
+import urllib.request
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from online.frames import Flag
 from online.metrics import BOUNDS, WIDTH, Metrics, make_table
+from online.session_client import Session
 from shared.errors import PalpateError
 
 LOAD = {"contacts": [{"position": [5, 5, 5], "pressure": 4}]}
@@ -30,6 +32,15 @@ def test_every_answer_is_timed_by_phase(client):
         assert found["palpate_phase_seconds_count", *labels] == 3
         assert 0 < found["palpate_phase_seconds_sum", *labels] < 3
     assert found["palpate_queue_seconds_count", ("kind", "query")] == 3
+
+
+def test_the_opening_of_a_session_is_no_query(url):
+    with Session(url, "toy") as session:
+        session.step((5.0, 5.0, 6.5))
+        with urllib.request.urlopen(f"{url}/metrics") as response:
+            found = samples(response.read().decode())
+    assert found["palpate_queue_seconds_count", ("kind", "query")] == 0
+    assert found["palpate_queue_seconds_count", ("kind", "session")] == 1
 
 
 def test_flags_and_refusals_are_counted(client):
@@ -113,8 +124,10 @@ def test_a_new_worker_counts_on_where_a_killed_one_was(tmp_path):
     make_table(table, 2)
     (first, a), (second, b) = worker(table), worker(table)
     assert {a, b} == {0, 1}
+    descriptors = len(os.listdir("/dev/fd"))
     with pytest.raises(PalpateError, match="more workers than rows"):
         Metrics(table)
+    assert len(os.listdir("/dev/fd")) == descriptors
     first.kill()
     first.wait()
     third = Metrics(table)

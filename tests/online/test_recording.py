@@ -9,9 +9,10 @@ from click.testing import CliRunner
 from online import commands
 from online.client import AsyncClient, Client
 from online.follower import Follower
-from online.frames import REPLY_FIELDS, Flag, Output, Request, encode_reply
+from online.frames import REPLY_FIELDS, Flag, Output, Request, encode_reply, encode_request
 from online.recording import ASKED, Recorder, RecordingError, read_recording
 from online.replay import replay
+from online.session_client import Session
 from shared.atlas import Atlas
 
 from .fake_atlas import FakeAtlas
@@ -117,6 +118,39 @@ def test_numbers_may_start_again(tmp_path):
         recorder.received(encode_reply(last, step, superseded=3), 1.0)
         assert not recorder._requests
     assert read_recording(tmp_path / "session.h5").requests == [last]
+
+
+@pytest.fixture
+def recorder(tmp_path):
+    with Recorder(tmp_path / "session.h5", {"scene": "toy"}) as recorder:
+        yield recorder
+
+
+def test_requests_that_were_refused_are_not_kept(recorder):
+    """The service complains of them without a number."""
+    follower = Follower(FakeAtlas())
+    for seq in range(1, 31):
+        request = Request(seq, 0.0, (5.0, 5.0, 6.5))
+        recorder.sent(request)
+        if seq % 10 == 0:
+            recorder.received(encode_reply(request, follower.follow(request.position, 0.0)), 1.0)
+            assert not recorder._requests
+
+
+def test_requests_without_any_reply_do_not_fill_the_memory(recorder, monkeypatch):
+    monkeypatch.setattr("online.recording.MOST_UNANSWERED", 10)
+    for seq in range(100):
+        recorder.sent(Request(seq, 0.0, (5.0, 5.0, 6.5)))
+    assert list(recorder._requests) == list(range(90, 100))
+
+
+def test_a_reply_to_a_frame_of_the_clients_own_is_left_out(url, tmp_path):
+    path = tmp_path / "session.h5"
+    with Session(url, "toy", record=path) as session:
+        session.send_bytes(encode_request(Request(77, 0.0, (5.0, 5.0, 6.5))))
+        assert session.receive().seq == 77
+        reply = session.step((5.0, 5.0, 6.4))
+    assert [request.seq for request in read_recording(path).requests] == [reply.seq]
 
 
 def test_other_files_are_refused(tmp_path):

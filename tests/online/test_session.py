@@ -1,5 +1,6 @@
 """Sessions on a real socket: what is answered, what is refused, and how they end."""
 
+import asyncio
 import json
 import time
 
@@ -7,9 +8,15 @@ import numpy as np
 import pytest
 
 from online import frames
+from online import session as server_session
+from online.client import Client
+from online.follower import Follower
 from online.frames import Flag, Output, Request
+from online.metrics import Metrics
 from online.session_client import ServiceError, Session, SessionClosed
 from online.settings import Settings
+from online.store import Model
+from online.websocket import PENDING, READ_AT
 from shared.errors import PalpateError
 
 from .fake_atlas import FakeAtlas
@@ -244,6 +251,39 @@ def test_a_silent_session_is_closed(serving, tmp_path):
         assert closed.value.code == 4000
 
 
+def test_a_session_that_says_goodbye_is_watched_no_more(tmp_path):
+    """What interrupts a session must not interrupt its last word."""
+    messages = iter(
+        [{"type": "websocket.connect"}, {"type": "websocket.receive", "bytes": b"\2\0"}]
+    )
+    tasks = []
+
+    async def receive():
+        return next(messages)
+
+    async def send(message):
+        await asyncio.sleep(0)
+        if message["type"] == "websocket.close":
+            tasks.extend(asyncio.all_tasks())
+
+    async def run():
+        extensions = {PENDING: lambda: False, READ_AT: time.perf_counter}
+        atlas = FakeAtlas()
+        session = server_session.Session(
+            Model(atlas, {}, list(PRESSED)),
+            Follower(atlas),
+            Settings(tmp_path),
+            Metrics(),
+            {"extensions": extensions},
+            receive,
+            send,
+        )
+        await session.run()
+
+    asyncio.run(run())
+    assert len(tasks) == 1
+
+
 def test_an_unknown_scene_has_no_session(url, caplog):
     with pytest.raises(ServiceError, match="No such scene") as refused:
         Session(url, "other")
@@ -251,6 +291,19 @@ def test_an_unknown_scene_has_no_session(url, caplog):
     with pytest.raises(PalpateError, match="HTTP 403"):
         Session(url, "a/b c")
     assert not caplog.records
+
+
+def test_a_scene_without_a_tip_has_no_session(serving):
+    atlas = FakeAtlas()
+    atlas.tips = None
+    with serving(toy=atlas, other=FakeAtlas("other")) as url:
+        with pytest.raises(ServiceError, match="trained without a tip") as refused:
+            Session(url, "toy")
+        assert (refused.value.status, refused.value.code) == (404, "no_tip")
+        with Client(url) as client:
+            assert client.solve("toy", (5.0, 5.0, 5.0), 4.0).trust["converged"]
+        with Session(url, "other") as session:
+            assert session.step(PRESSED).good
 
 
 def test_without_a_handshake_there_is_no_session(client):

@@ -1,6 +1,7 @@
 """Clients that do everything wrong, while another one goes on being answered."""
 
 import json
+import math
 import socket
 import struct
 import threading
@@ -12,7 +13,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from online import frames
+from online import frames, websocket
 from online import session as server_session
 from online.frames import Flag, Output, Request
 from online.session_client import ServiceError, Session, SessionClosed
@@ -179,6 +180,47 @@ def test_a_client_that_does_not_read_is_cut(serving, tmp_path, monkeypatch, capl
                 pour(slow, repeat(frame))
         places_come_free(url).close()
     assert "leaves replies unread" in caplog.text
+
+
+PING, EMPTY_PART = 0x89, 0x00
+
+
+def control(first, payload=b""):
+    """Make a client's frame of less than 126 bytes with a mask of zeros."""
+    return bytes((first, 0x80 | len(payload), 0, 0, 0, 0)) + payload
+
+
+@pytest.mark.parametrize(
+    ("frame", "most", "reason"),
+    [
+        (control(PING), websocket.MOST_FRAMES, "floods the service"),
+        (control(PING, bytes(125)), math.inf, "answers to its pings unread"),
+        (control(EMPTY_PART), websocket.MOST_FRAMES, "more than 64 parts"),
+    ],
+)
+def test_floods_that_no_session_sees_are_cut(url, monkeypatch, caplog, frame, most, reason):
+    monkeypatch.setattr(websocket, "MOST_FRAMES", most)
+    with witness(url):
+        with Session(url, "toy") as session:
+            if frame == control(EMPTY_PART):
+                session._socket.sendall(control(0x02))  # begins a message
+            with pytest.raises(ConnectionError):
+                flood(session._socket, 1000 * frame)
+        places_come_free(url).close()
+    assert reason in caplog.text
+
+
+def flood(connection, data):
+    while True:
+        connection.sendall(data)
+
+
+def test_pings_and_messages_in_parts_are_answered(url):
+    frame = frames.encode_request(Request(7, 0.0, PRESSED))
+    with Session(url, "toy") as session:
+        session._socket.sendall(control(0x02, frame[:10]) + control(PING, b"!"))
+        session._socket.sendall(control(0x00, frame[10:30]) + control(0x80, frame[30:]))
+        assert session.receive().seq == 7
 
 
 def test_a_flood_is_answered_or_counted(url):

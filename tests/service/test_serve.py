@@ -42,13 +42,22 @@ def test_it_ends_cleanly_on_a_signal(serve, artifact, number):
 def test_a_client_that_hangs_up_leaves_no_trace(serve, artifact):
     with serve(artifact.parent) as server:
         parts = urlsplit(server.url)
-        head = b"POST /scenes/quick/solve HTTP/1.1\r\nhost: x\r\ncontent-type: application/json\r\n"
+        head = (
+            b"POST /scenes/quick/solve HTTP/1.1\r\nhost: localhost\r\n"
+            b"content-type: application/json\r\n"
+        )
         with socket.create_connection((parts.hostname, parts.port)) as connection:
             connection.sendall(head + b"content-length: 100\r\n\r\n{")
         with Client(server.url) as client:
             client.scenes()
         assert server.stop() == 0
         assert "Traceback" not in server.log
+
+
+def test_on_loopback_only_names_of_this_machine_are_served(server):
+    request = urllib.request.Request(f"{server.url}/scenes", headers={"host": "evil.example"})
+    with pytest.raises(urllib.error.HTTPError, match="421"):
+        urllib.request.urlopen(request)
 
 
 def test_a_connection_survives_refusals(server):

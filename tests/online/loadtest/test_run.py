@@ -45,6 +45,11 @@ def test_a_session_that_is_refused_says_why(url):
         run(Plan(url, "toy", sessions=Settings.max_sessions + 1))
 
 
+def test_a_load_of_nothing_is_refused(url):
+    with pytest.raises(PalpateError, match="--sessions or --queries-per-second"):
+        run(Plan(url, "toy", sessions=0))
+
+
 def test_too_much_is_refused_and_told_apart(url):
     plan = Plan(url, "toy", sessions=0, queries=100.0, duration=0.5, overload=60.0, region="none")
     summary = run(plan).summary
