@@ -81,13 +81,13 @@ def bench(artifact: Path) -> dict[str, Any]:
         take("cold_us", cold, loads)
         warm(first)
         take("warm_us", warm, steps)
+        take("surface_us", lambda load: with_fields(load, "surface"), loads)
+        take("fields_us", lambda load: with_fields(load, "all"), loads)
+        take("full_us", workshop.sample, loads[:1])
         if atlas.tips is not None:
             first_touch, *touches = [tip_at(atlas, load) for load in (first, *steps)]
             touch(first_touch)
             take("tip_us", touch, touches)
-        take("surface_us", lambda load: with_fields(load, "surface"), loads)
-        take("fields_us", lambda load: with_fields(load, "all"), loads)
-        take("full_us", workshop.sample, loads[:1])
         if round_ == 0:
             # compiled code came in from disk
             times.clear()

@@ -62,7 +62,3 @@ def main() -> None:
 
     Set PALPATE_DEBUG=1 to see where an error came from.
     """
-    # Before NumPy comes in: the products of a query are too small to share, and a BLAS thread that
-    # waits for a busy core turns 0.3 ms into 100. Long work runs in processes.
-    for library in ("OPENBLAS", "MKL", "OMP"):
-        os.environ.setdefault(f"{library}_NUM_THREADS", "1")

@@ -8,7 +8,7 @@ from offline.bench import STEP, bench, walk
 from offline.validate import unseen_loads
 from shared.atlas import Atlas
 
-KINDS = ["cold_us", "warm_us", "tip_us", "surface_us", "fields_us", "full_us"]
+KINDS = ["cold_us", "warm_us", "surface_us", "fields_us", "full_us", "tip_us"]
 
 
 @pytest.fixture
