@@ -1,3 +1,4 @@
+import os
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -68,11 +69,17 @@ def test_our_errors_show_their_origin_when_asked(run, monkeypatch):
     assert isinstance(run("fail").exception, PalpateError)
 
 
-def test_every_command_runs_on_one_blas_thread(run, monkeypatch):
-    monkeypatch.setattr(shared.cli.os, "environ", {"MKL_NUM_THREADS": "2"})
-    run("train", "nowhere")
-    assert shared.cli.os.environ["OPENBLAS_NUM_THREADS"] == "1"
-    assert shared.cli.os.environ["MKL_NUM_THREADS"] == "2"
+def test_whatever_imports_the_software_runs_on_one_blas_thread():
+    script = (
+        "import os, shared\n"
+        "print(*(os.environ[f'{name}_NUM_THREADS'] for name in ('OPENBLAS', 'MKL')))"
+    )
+    environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
+    output = subprocess.run(
+        [sys.executable, "-c", script],
+        env=environment | {"MKL_NUM_THREADS": "2"}, capture_output=True, check=True,
+    )  # fmt: skip
+    assert output.stdout.decode().split() == ["1", "2"]
 
 
 def test_help_is_quick():
