@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from offline.norms import relative, statistics
 from offline.sampling import random_points
-from offline.validate import UNSEEN, write_rows
+from offline.validate import UNSEEN, coverage, write_rows
 from offline.workers import completed, worker_pool
 from offline.workshop import TouchSample, Workshop, open_artifact
 from shared.artifact import read_artifact
@@ -133,24 +133,14 @@ def summarise_touches(rows: Sequence[TouchComparison]) -> dict[str, Any]:
     """Errors of the converged answers; ``covered``: the share within all three estimates."""
     unconverged = sum(not r.converged for r in rows)
     rows = [r for r in rows if r.converged]
-    covered = [
-        all(getattr(r, name) <= getattr(r, f"estimated_{name}") for name in QUANTITIES)
-        for r in rows
-    ]
+    covered, ratios = coverage(rows, QUANTITIES)
     return {
         "queries": len(rows) + unconverged,
         "unconverged": unconverged,
-        "covered": float(np.mean(covered)),
+        "covered": covered,
         **{name: statistics([getattr(r, name) for r in rows]) for name in (*QUANTITIES, "tangent")},
         "penetration_over_depth": statistics([r.penetration / r.depth for r in rows]),
-        "estimate_over_error_median": {
-            name: float(
-                np.median(
-                    [getattr(r, f"estimated_{name}") / max(getattr(r, name), 1e-12) for r in rows]
-                )
-            )
-            for name in QUANTITIES
-        },
+        "estimate_over_error_median": ratios,
     }
 
 

@@ -189,8 +189,22 @@ def summarise(rows: Sequence[Comparison]) -> dict[str, Any]:
     """Errors of the converged answers; ``covered``: the share within both estimates."""
     unconverged = sum(not r.converged for r in rows)
     rows = [r for r in rows if r.converged]
+    covered, ratios = coverage(rows, ("displacement", "von_mises"))
+    return {
+        "queries": len(rows) + unconverged,
+        "unconverged": unconverged,
+        "covered": covered,
+        "displacement": statistics([r.displacement for r in rows]),
+        "von_mises": statistics([r.von_mises for r in rows]),
+        "von_mises_p99": statistics([r.von_mises_p99 for r in rows]),
+        "estimate_over_error_median": ratios,
+    }
+
+
+def coverage(rows: Sequence[Any], quantities: Sequence[str]) -> tuple[float, dict[str, float]]:
+    """Share of rows whose errors are all within their estimates; median of estimate over error."""
     covered = [
-        r.displacement <= r.estimated_displacement and r.von_mises <= r.estimated_von_mises
+        all(getattr(r, name) <= getattr(r, f"estimated_{name}") for name in quantities)
         for r in rows
     ]
     ratios = {
@@ -199,14 +213,6 @@ def summarise(rows: Sequence[Comparison]) -> dict[str, Any]:
                 [getattr(r, f"estimated_{name}") / max(getattr(r, name), 1e-12) for r in rows]
             )
         )
-        for name in ("displacement", "von_mises")
+        for name in quantities
     }
-    return {
-        "queries": len(rows) + unconverged,
-        "unconverged": unconverged,
-        "covered": float(np.mean(covered)),
-        "displacement": statistics([r.displacement for r in rows]),
-        "von_mises": statistics([r.von_mises for r in rows]),
-        "von_mises_p99": statistics([r.von_mises_p99 for r in rows]),
-        "estimate_over_error_median": ratios,
-    }
+    return float(np.mean(covered)), ratios
