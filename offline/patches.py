@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offline.cubature import compress, damped_fit, nonnegative, point_forces
+from offline.cubature import compress, damped_fit, nonlinear_forces, nonnegative, point_forces
 from offline.sampling import cone, tangents
 from offline.spaces import Footprint, local_modes
 from offline.tips import TipResult, compile_tip_query, train_tip
@@ -49,7 +49,12 @@ OFF_EQUILIBRIUM = 0.03
 
 TEST_LOADS = 6
 
+DEFECT_LOADS = 240
+
 GUESS_LOADS = 500
+
+NO_LIMIT = 1e100
+"""Largest pressure, kPa, that a local model in training answers for."""
 
 PATH_LOADS, FITTED_TILT = 24, 45.0
 """Directions of load to which a footprint's path derivatives are fitted, and their cone."""
@@ -129,6 +134,7 @@ class PatchResult:
     points: NDArray[np.int32]
     weights: Array
     path: NDArray[np.float16]
+    defect: NDArray[np.float16]
     guess: NDArray[np.float16]
     error: float
     tip: TipResult | None = None
@@ -155,10 +161,11 @@ class LocalTrainer:
         self.models = models
         self.patches: Patches = assemble_patches(body, models, self.radius)
         self.state = State(self.patches, surface.clusters)
-        no_range = np.zeros((len(surface.vertices), LIMIT_FIELDS))
+        no_limit = np.tile(np.eye(LIMIT_FIELDS)[1:4].sum(0), (len(surface.vertices), 1))
+        no_limit[:, 0] = NO_LIMIT
         self.terms = bind(
             Terms(
-                ground=surface.ground(no_range),
+                ground=surface.ground(no_limit),
                 reach=scene.endoscope.reach,
                 max_tilt=scene.endoscope.max_tilt,
                 errors=models.errors,
@@ -172,6 +179,13 @@ class LocalTrainer:
         state.forget()
         query(self.terms, state.bound, x, direction, pressure, self.radius)
         return bool(state.outcome.scalars[STATUS] == equilibrium.CONVERGED)
+
+    def internal_forces(self, states: Array) -> Array:
+        """What the law adds to linear elasticity's force: (k, r) in states (k, r)."""
+        patches = self.patches
+        rows = patches.gradients[0] * patches.steps[0][:, None]
+        law = patches.weights[0], patches.mu[0], patches.lam[0]
+        return nonlinear_forces(rows, *law, states)
 
     @property
     def wide(self) -> Array:
@@ -219,6 +233,7 @@ def compile_query(scene: Scene, body: Body, surface: Surface) -> None:
         points=np.zeros(1, np.int32),
         weights=np.ones(1),
         path=np.zeros((1, PATH_FEATURES, NARROW), np.float32),
+        defect=np.zeros((1, PATH_FEATURES, NARROW), np.float32),
         guess=np.zeros((1, FEATURES, LEADING + PATH), np.float32),
         errors=np.zeros(1),
         extent=1.0,
@@ -263,6 +278,7 @@ def train_patch(
         points=np.arange(len(weights), dtype=np.int32),
         weights=weights,
         path=_fit_path(leading.T @ ritz, task, frame).astype(np.float16),
+        defect=np.zeros((PATH_FEATURES, leading.shape[1]), np.float16),
         guess=np.zeros((FEATURES, LEADING + PATH), np.float16),
         error=0.0,
     )
@@ -270,6 +286,9 @@ def train_patch(
     contributions = _training_forces(galerkin, scene, task, rng)[: len(weights)]
     points, chosen = _cubature(contributions, weights, task.size.cubature_points, rng)
     result = replace(everywhere, points=points.astype(np.int32), weights=chosen)
+    reduced = local_trainer(scene, body, surface, region, task, result)
+    defect = _fit_defect(galerkin, reduced, scene, task, frame, rng)
+    result = replace(result, defect=defect.astype(np.float16))
     reduced = local_trainer(scene, body, surface, region, task, result)
     guess = _fit_guess(reduced, scene, task, frame, rng)
     error = _cubature_error(galerkin, reduced, scene, task, rng)
@@ -307,6 +326,7 @@ def local_trainer(
             points=result.points,
             weights=result.weights,
             path=result.path[None].astype(np.float32),
+            defect=result.defect[None].astype(np.float32),
             guess=result.guess[None].astype(np.float32),
             errors=np.zeros(1),
             extent=task.extent,
@@ -425,6 +445,30 @@ def _cubature(
     A, b = compress(contributions, EQUATIONS, rng)
     chosen, x = nonnegative(A, b, most)
     return chosen, x * weights[chosen]
+
+
+def _fit_defect(
+    galerkin: LocalTrainer,
+    reduced: LocalTrainer,
+    scene: Scene,
+    task: PatchTask,
+    frame: Array,
+    rng: np.random.Generator,
+) -> Array:
+    """Force (PATH_FEATURES, r) that the cubature misses in equilibrium, relative to the answer."""
+    rows, states = [], []
+    features = np.zeros(FEATURES)
+    for _ in range(DEFECT_LOADS):
+        draw = extreme_load if rng.random() < EXTREME else random_load
+        x, direction, pressure = draw(scene, task, rng)
+        if reduced.solve(x, direction, pressure):
+            load_features(frame, task.centre, x, direction * pressure / task.pressure, features)
+            rows.append(features[:PATH_FEATURES].copy())
+            states.append(reduced.wide)
+    missed = galerkin.internal_forces(np.array(states)) - reduced.internal_forces(np.array(states))
+    scale = 1.0 / np.linalg.norm(states, axis=1, keepdims=True)
+    kept = np.isfinite(missed).all(axis=1)
+    return damped_fit((scale * rows)[kept], (scale * missed)[kept])
 
 
 def _fit_guess(

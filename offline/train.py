@@ -343,6 +343,7 @@ class Pipeline:
             points=np.concatenate([r.points for r in results]),
             weights=np.concatenate([r.weights for r in results]),
             path=np.stack([r.path for r in results]).astype(np.float32),
+            defect=np.stack([r.defect for r in results]).astype(np.float32),
             guess=np.stack([r.guess for r in results]).astype(np.float32),
             errors=np.array([float(r.error) for r in results]),
             extent=layout.extent,
@@ -519,6 +520,9 @@ class Pipeline:
             ),
             "patch_path": Dataset(
                 models.path.astype(np.float16), one, "derivatives along a load path, polynomials"
+            ),
+            "patch_defect": Dataset(
+                models.defect.astype(np.float16), "mN", "force that cubature misses, polynomials"
             ),
             "patch_guess": Dataset(
                 models.guess.astype(np.float16), one, "first guess beyond the linear response"

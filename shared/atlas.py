@@ -150,6 +150,8 @@ class LocalModels:
     weights : ndarray, shape (c,), mm^3
     path : ndarray, shape (p, PATH_FEATURES, r), float32
         Second and third derivative of the equilibrium along a load path, as polynomials.
+    defect : ndarray, shape (p, PATH_FEATURES, r), float32, mN
+        Force that the cubature misses in equilibrium, as polynomials of the load.
     guess : ndarray, shape (p, FEATURES, LEADING + PATH), float32
     errors : ndarray, shape (p,)
         Relative error of the cubature in the energy norm, on loads it was not fitted to.
@@ -171,6 +173,7 @@ class LocalModels:
     points: NDArray[np.int32]
     weights: Array
     path: Field
+    defect: Field
     guess: Field
     errors: Array
     extent: float
@@ -228,6 +231,7 @@ def assemble_patches(body: Body, models: LocalModels, radius: float) -> Patches:
         face_nodes=np.vstack([r[1] for r in rows]).astype(np.int32),
         face_shape=surface.shape[near],
         path=models.path,
+        defect=models.defect,
         guess=np.pad(models.guess, ((0, 0), (0, 0), (0, NARROW - models.guess.shape[2]))),
         blend=models.blend,
     )
@@ -594,6 +598,7 @@ class Atlas:
                 points=arrays["cubature_points"],
                 weights=arrays["cubature_weights"],
                 path=arrays["patch_path"].astype(np.float32),
+                defect=arrays["patch_defect"].astype(np.float32),
                 guess=arrays["patch_guess"].astype(np.float32),
                 errors=arrays["patch_errors"],
                 extent=float(arrays["patch_extent"]),

@@ -26,6 +26,10 @@ that is small where the load is small, and lives near the contact, where the poi
 points and their own weights, and all modes, this is the Galerkin model; tissue law, load footprint
 and Newton's method are those of the full model.
 
+What the points still miss of the internal force in equilibrium, the *defect* of the cubature, is a
+smooth function of the load.  It is fitted by polynomials on each patch and taken off ``f``: the
+state at which the points are in equilibrium with the rest is that of the Galerkin model.
+
 A *warm* query, whose patch answered the last one too, is *followed* in the wide space itself: the
 rest stiffness there is the identity, and each residual shows a direction of the tangent, so a few
 secants (BFGS) make up for a tangent that is never formed.
@@ -513,6 +517,7 @@ class Patches(NamedTuple):
     face_nodes: NDArray[np.int32]  # (g, k), counted from the patch's first node
     face_shape: Array  # (g, k)
     path: Field  # (p, PATH_FEATURES, r) second and third derivative along the load path
+    defect: Field  # (p, PATH_FEATURES, r) force that the points miss, by load_features
     guess: Field  # (p, FEATURES, NARROW), the last column zero
     blend: float  # mm, excess distance over the nearest centre at which a patch fades out
 
@@ -743,12 +748,23 @@ def _append(number, steps, scratch):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _path_modes(patches, k, x, direction, pressure, scratch):
+def _balance(defect, inside, features, load):
+    """Take the cubature's defect off a load (r,) mN.
+
+    ``inside`` is the largest trained pressure over that of the load, at most 1: beyond the range
+    the defect stays what it is at its end.
+    """
+    second, third = inside**2, inside**3
+    for f in range(PATH_FEATURES):
+        feature = np.float32(features[f] * (second if f < SECOND_FEATURES else third))
+        row = defect[f]
+        for i in range(len(load)):
+            load[i] -= feature * row[i]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _path_modes(patches, k, scratch):
     """Modes of the narrow space of patch k for ``scratch.wide_load``, but the residual."""
-    load = scratch.scaled_load
-    for i in range(3):
-        load[i] = direction[i] * pressure / patches.pressures[k]
-    load_features(patches.frames[k], patches.centres[:, k], x, load, scratch.features)
     scratch.load[:] = 0.0
     scratch.load[:LEADING] = scratch.wide_load[:LEADING]
     first, second, third = scratch.vectors[0], scratch.vectors[1], scratch.vectors[2]
@@ -834,9 +850,15 @@ def _merge(scratch):
 
 
 @njit(inline="always")
-def _solve_patch(patches, k, slot, warm, x, direction, pressure, memory, scratch, scalars):
+def _solve_patch(patches, k, slot, warm, x, direction, pressure, limit, memory, scratch, scalars):
     """Equilibrium of patch k under ``scratch.wide_load``; its answer goes to memory's slot."""
-    _path_modes(patches, k, x, direction, pressure, scratch)
+    for i in range(3):
+        scratch.scaled_load[i] = direction[i] * pressure / patches.pressures[k]
+    frame, centre = patches.frames[k], patches.centres[:, k]
+    load_features(frame, centre, x, scratch.scaled_load, scratch.features)
+    inside = limit / pressure if pressure > limit else 1.0
+    _balance(patches.defect[k], inside, scratch.features, scratch.wide_load)
+    _path_modes(patches, k, scratch)
     _first_guess(patches.guess[k], scratch)
     wide, guess, start, load = (
         memory.wide[slot],
@@ -962,7 +984,7 @@ def _solve_narrow(patches, k, size, wide, scratch):
 
 
 @njit(inline="always")
-def _answer(solver, x, normal, direction, pressure, radius):
+def _answer(solver, x, normal, direction, pressure, limit, radius):
     patches, memory, scratch, outcome = (
         solver.patches, solver.memory, solver.scratch, solver.outcome,
     )  # fmt: skip
@@ -981,7 +1003,9 @@ def _answer(solver, x, normal, direction, pressure, radius):
             k = -2 - k
         area = _wide_load(patches, k, x, normal, direction, pressure, radius, scratch)
         scalars[AREA] = area
-        _solve_patch(patches, k, slot, warm, x, direction, pressure, memory, scratch, scalars)
+        _solve_patch(
+            patches, k, slot, warm, x, direction, pressure, limit, memory, scratch, scalars
+        )
         if area > 0.0:
             wide, unit = memory.wide[slot], scratch.unit_loads
             for i in range(3):
@@ -1022,7 +1046,7 @@ def query(terms, solver, position, direction, pressure, radius):
     tilt = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
     limit = pressure_limit(outcome.range, normal, towards)
     if distance <= terms.reach and tilt < 90.0:
-        _answer(solver, x, normal, towards, pressure, radius)
+        _answer(solver, x, normal, towards, pressure, limit, radius)
         _estimate(terms, solver, pressure / limit, tilt / max(terms.max_tilt, 1.0), pressure)
     scalars[DISTANCE], scalars[TILT], scalars[LIMIT] = distance, tilt, limit
 
