@@ -172,11 +172,11 @@ def nonlinear_forces(
     return forces
 
 
-def damped_fit(A: Array, B: Array) -> Array:
-    """Least squares ``A X ~ B``, each column of A scaled to one and slightly damped."""
+def damped_fit(A: Array, B: Array, damping: float = 1e-4) -> Array:
+    """Least squares ``A X ~ B``, each column of A scaled to one and damped."""
     scale = np.sqrt(np.mean(A**2, axis=0)) + 1e-300
     A = A / scale
-    ridge = 1e-4 * np.sqrt(len(A)) * np.eye(A.shape[1])
+    ridge = damping * np.sqrt(len(A)) * np.eye(A.shape[1])
     X = np.linalg.lstsq(np.vstack([A, ridge]), np.vstack([B, np.zeros((len(ridge), B.shape[1]))]))[
         0
     ]

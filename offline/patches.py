@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offline.cubature import compress, damped_fit, nonlinear_forces, nonnegative, point_forces
+from offline.full_model import FullModel
 from offline.sampling import cone, tangents
 from offline.spaces import Footprint, local_modes
 from offline.tips import TipResult, compile_tip_query, train_tip
 from shared import equilibrium
 from shared.atlas import Body, LocalModels, State, assemble_patches
 from shared.bound import bind
-from shared.endoscope import LIMIT_FIELDS, TIP_DEPTH, pressure_limit
+from shared.endoscope import LIMIT_FIELDS, TIP_DEPTH, footprint, pressure_limit
 from shared.reduced import (
     ERROR_FEATURES,
     FEATURES,
@@ -25,12 +26,14 @@ from shared.reduced import (
     NARROW,
     PATH,
     PATH_FEATURES,
+    RESIDUAL_FEATURES,
     SECOND_FEATURES,
     STATUS,
     Patches,
     Terms,
     load_features,
     query,
+    residual_features,
 )
 from shared.scene import Scene, Size
 from shared.surface import Surface
@@ -47,7 +50,10 @@ most, random loads are rare."""
 OFF_EQUILIBRIUM = 0.03
 """Size of the random departure from equilibrium, relative to each mode's part in the states."""
 
-TEST_LOADS = 6
+RESIDUAL_LOADS = 64
+
+RESIDUAL_DAMPING = 0.15
+"""Of the fit of their logs: they scatter about any smooth function."""
 
 DEFECT_LOADS = 240
 
@@ -136,7 +142,7 @@ class PatchResult:
     path: NDArray[np.float16]
     defect: NDArray[np.float16]
     guess: NDArray[np.float16]
-    error: float
+    residual: Array
     tip: TipResult | None = None
 
     def arrays(self) -> dict[str, Any]:
@@ -168,7 +174,7 @@ class LocalTrainer:
                 ground=surface.ground(no_limit),
                 reach=scene.endoscope.reach,
                 max_tilt=scene.endoscope.max_tilt,
-                errors=models.errors,
+                residuals=models.residuals,
                 coefficients=np.zeros((2, ERROR_FEATURES)),
             )
         )
@@ -235,7 +241,7 @@ def compile_query(scene: Scene, body: Body, surface: Surface) -> None:
         path=np.zeros((1, PATH_FEATURES, NARROW), np.float32),
         defect=np.zeros((1, PATH_FEATURES, NARROW), np.float32),
         guess=np.zeros((1, FEATURES, LEADING + PATH), np.float32),
-        errors=np.zeros(1),
+        residuals=np.zeros((1, RESIDUAL_FEATURES)),
         extent=1.0,
         blend=1.0,
         tips=None,
@@ -248,9 +254,9 @@ def compile_query(scene: Scene, body: Body, surface: Surface) -> None:
 
 def train_patch(
     scene: Scene,
+    model: FullModel,
     body: Body,
     surface: Surface,
-    weights: Array,
     region: RegionResult,
     task: PatchTask,
 ) -> PatchResult:
@@ -259,15 +265,16 @@ def train_patch(
     Parameters
     ----------
     scene : Scene
+    model : FullModel
     body : Body
     surface : Surface
         Accessible.
-    weights : ndarray, shape (quadrature points,), mm^3
     region : RegionResult
         With the Ritz vectors of the task's footprints.
     task : PatchTask
     """
     rng = np.random.default_rng(task.seed)
+    weights = model.weights.ravel()
     frame = np.array([task.normal, *tangents(task.normal)])
     ritz = region.ritz.astype(np.float64)
     leading = local_modes(np.hstack(list(ritz)), task.size.modes)
@@ -280,7 +287,7 @@ def train_patch(
         path=_fit_path(leading.T @ ritz, task, frame).astype(np.float16),
         defect=np.zeros((PATH_FEATURES, leading.shape[1]), np.float16),
         guess=np.zeros((FEATURES, LEADING + PATH), np.float16),
-        error=0.0,
+        residual=np.zeros(RESIDUAL_FEATURES),
     )
     galerkin = local_trainer(scene, body, surface, region, task, everywhere)
     contributions = _training_forces(galerkin, scene, task, rng)[: len(weights)]
@@ -291,14 +298,14 @@ def train_patch(
     result = replace(result, defect=defect.astype(np.float16))
     reduced = local_trainer(scene, body, surface, region, task, result)
     guess = _fit_guess(reduced, scene, task, frame, rng)
-    error = _cubature_error(galerkin, reduced, scene, task, rng)
+    residual = _fit_residual(model, reduced, body, scene, task, frame, rng)
     tip = None
     if scene.endoscope.tip:
         tip = train_tip(
             body, surface, weights, reduced.models, region.orthonormal,
             task.contacts, task.normals, task.ranges[:, TIP_DEPTH], rng,
         )  # fmt: skip
-    return replace(result, guess=guess.astype(np.float16), error=error, tip=tip)
+    return replace(result, guess=guess.astype(np.float16), residual=residual, tip=tip)
 
 
 def local_trainer(
@@ -328,7 +335,7 @@ def local_trainer(
             path=result.path[None].astype(np.float32),
             defect=result.defect[None].astype(np.float32),
             guess=result.guess[None].astype(np.float32),
-            errors=np.zeros(1),
+            residuals=np.zeros((1, RESIDUAL_FEATURES)),
             extent=task.extent,
             blend=task.blend,
             tips=None,
@@ -341,12 +348,12 @@ def _fit_path(ritz: Array, task: PatchTask, frame: Array) -> Array:
     rng = np.random.default_rng(task.seed)
     rows, second, third = [], [], []
     features = np.zeros(FEATURES)
-    for footprint, vectors in zip(task.footprints, ritz, strict=True):
-        loads = footprint.pressure * cone(footprint.normal, FITTED_TILT, PATH_LOADS, rng)
+    for place, vectors in zip(task.footprints, ritz, strict=True):
+        loads = place.pressure * cone(place.normal, FITTED_TILT, PATH_LOADS, rng)
         for load in loads:
-            load_features(frame, task.centre, footprint.point, load / task.pressure, features)
+            load_features(frame, task.centre, place.point, load / task.pressure, features)
             rows.append(features[:PATH_FEATURES].copy())
-        two, three = footprint.path_derivatives(vectors, loads)
+        two, three = place.path_derivatives(vectors, loads)
         second.append(two)
         third.append(three)
     A = np.array(rows)
@@ -358,21 +365,36 @@ def _fit_path(ritz: Array, task: PatchTask, frame: Array) -> Array:
     )
 
 
-def _cubature_error(
-    galerkin: LocalTrainer,
+def _fit_residual(
+    model: FullModel,
     reduced: LocalTrainer,
+    body: Body,
     scene: Scene,
     task: PatchTask,
+    frame: Array,
     rng: np.random.Generator,
-) -> float:
-    """Root mean square of the relative error of the cubature on other loads, energy norm."""
-    errors = []
-    for _ in range(TEST_LOADS):
-        load = random_load(scene, task, rng)
-        if galerkin.solve(*load) and reduced.solve(*load):
-            exact = galerkin.wide
-            errors.append(np.linalg.norm(reduced.wide - exact) / np.linalg.norm(exact))
-    return float(np.sqrt(np.mean(np.square(errors))))
+) -> Array:
+    """Log of the full model's relative residual (RESIDUAL_FEATURES,), by ``residual_features``."""
+    rows, logs = [], []
+    nodal, features = np.zeros(len(body.nodes)), np.zeros(RESIDUAL_FEATURES)
+    for _ in range(RESIDUAL_LOADS):
+        x, direction, limit = _limit(scene, task, rng, border=False)
+        share = np.sqrt(rng.random())
+        pressure = share * limit
+        if not reduced.solve(x, direction, pressure):
+            continue
+        outcome = reduced.state.outcome
+        footprint(body.boundary, outcome.point, outcome.normal, reduced.radius, nodal)
+        load = (pressure * nodal[:, None] * direction).ravel()[model.free]
+        residual = model.relative_residual(reduced.displacement.ravel()[model.free], load)
+        if 0 < residual < np.inf:
+            residual_features(frame, task.centre, x, direction, share, features)
+            rows.append(features.copy())
+            logs.append(np.log(residual))
+    mean = np.mean(logs)
+    fitted = damped_fit(np.array(rows), np.array(logs)[:, None] - mean, RESIDUAL_DAMPING)[:, 0]
+    fitted[0] += mean
+    return fitted
 
 
 def random_load(

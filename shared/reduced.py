@@ -557,6 +557,33 @@ def load_features(frame, centre, x, load, out):
                 k += POSITION_FEATURES
 
 
+RESIDUAL_FEATURES = 16
+
+LEAST_LOAD = 1e-2
+"""Share of the largest trained pressure below which residuals are taken for those there."""
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def residual_features(frame, centre, x, direction, share, out):
+    """What the residual of an answer depends on, (RESIDUAL_FEATURES,).
+
+    Monomials up to degree 2 in the position on the patch (mm from the centre) and in the two
+    tangential components of the unit direction, and the load's share of the largest trained
+    pressure, as it is and its log.
+    """
+    s = t = b = c = 0.0
+    for i in range(3):
+        s += frame[1, i] * (x[i] - centre[i])
+        t += frame[2, i] * (x[i] - centre[i])
+        b += frame[1, i] * direction[i]
+        c += frame[2, i] * direction[i]
+    share = min(max(share, LEAST_LOAD), 1.0)
+    log = math.log(share)
+    out[0], out[1], out[2], out[3], out[4], out[5] = 1.0, s, t, s * s, s * t, t * t
+    out[6], out[7], out[8], out[9], out[10] = b, c, b * b, b * c, c * c
+    out[11], out[12], out[13], out[14], out[15] = share, share**2, log, log * b, log * c
+
+
 class Memory(NamedTuple):
     """Last answers of the patches in use, to start the next from; patch < 0 is an empty slot."""
 
@@ -595,6 +622,7 @@ class Scratch(NamedTuple):
     stepped_state: Field  # (r,)
     latest: Array  # (r,)
     features: Array  # (FEATURES,)
+    residual_features: Array  # (RESIDUAL_FEATURES,)
     nodal: Array  # (most nodes of a patch,)
     distance: Array  # (p,)
     surface: Array  # (clusters of triangles + 6,)
@@ -622,7 +650,7 @@ ERROR_FEATURES = 11
     SMALLEST_J,
     AREA,
     DEPARTURE,
-    CUBATURE,
+    RESIDUAL,
     ENERGY,
     DISTANCE,
     TILT,
@@ -648,7 +676,7 @@ class Terms(NamedTuple):
     ground: Ground  # values at its vertices: the load range
     reach: float  # mm, farthest position from the surface
     max_tilt: float  # degrees
-    errors: Array  # (p,) of the patches' cubature
+    residuals: Array  # (p, RESIDUAL_FEATURES) log of the residual, by residual_features
     coefficients: Array  # (2, ERROR_FEATURES): displacement, von Mises
 
 
@@ -1056,26 +1084,31 @@ def _estimate(terms, solver, load, tilt, pressure):
     """Force and estimated errors of an answer: ``log error = c . features``.
 
     The features: 1, tilt over the largest, smallest det F, the normal (where on the body), and the
-    logs of the pressure over its limit, of the departure from the linear response, of the patch's
-    cubature error, of the contact's displacement over pressure (mm/kPa) and of the displacement in
-    the energy norm.
+    logs of the pressure over its limit, of the departure from the linear response, of the residual
+    that such answers leave in the full model, of the contact's displacement over pressure (mm/kPa)
+    and of the displacement in the energy norm.
     """
     outcome, patch = solver.outcome, solver.memory.patch
     scalars, features = outcome.scalars, outcome.features
-    moved = cubature = 0.0
+    patches, looked_at = solver.patches, solver.scratch.residual_features
+    moved = residual = 0.0
     for i in range(3):
         outcome.force[i] = pressure * scalars[AREA] * outcome.direction[i]
         moved += outcome.displacement[i] ** 2
     for slot in range(MAX_ACTIVE):
         if outcome.weight[slot] > 0.0:
-            k = patch[slot]
-            cubature += outcome.weight[slot] * terms.errors[k if k >= 0 else -2 - k]
+            k = patch[slot] if patch[slot] >= 0 else -2 - patch[slot]
+            residual_features(
+                patches.frames[k], patches.centres[:, k], outcome.point, outcome.direction, load,
+                looked_at,
+            )  # fmt: skip
+            residual += outcome.weight[slot] * np.dot(terms.residuals[k], looked_at)
     compliance = math.sqrt(moved) / max(pressure, 1e-6)
-    scalars[CUBATURE] = cubature
+    scalars[RESIDUAL] = math.exp(residual)
     features[0], features[1], features[2] = 1.0, tilt, scalars[SMALLEST_J]
     features[3:6] = outcome.normal
     features[6], features[7] = math.log(max(load, 1e-6)), math.log(max(scalars[DEPARTURE], 1e-6))
-    features[8], features[9] = math.log(max(cubature, 1e-6)), math.log(max(compliance, 1e-6))
+    features[8], features[9] = residual, math.log(max(compliance, 1e-6))
     features[10] = math.log(max(scalars[ENERGY], 1e-6))
     scalars[ERROR_DISPLACEMENT] = math.exp(np.dot(terms.coefficients[0], features))
     scalars[ERROR_VON_MISES] = math.exp(np.dot(terms.coefficients[1], features))
