@@ -36,10 +36,10 @@ from shared.reduced import (
     FAST,
     LANES,
     MAX_ACTIVE,
-    REUSE,
     ROUND_OFF,
     STATE,
     TILE,
+    _added_energy,
     _cholesky,
     _is,
     _lower_products,
@@ -53,7 +53,6 @@ from shared.reduced import (
 from shared.surface import Ground, locate
 from shared.tip import (
     CONVEX,
-    FORCE,
     HARDNESS,
     STIFFNESS,
     Tip,
@@ -68,8 +67,13 @@ Array = NDArray[np.float64]
 Field = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
-TOLERANCE = 5e-4
-"""Residual at equilibrium relative to the response, both in the energy norm of the rest state."""
+TOLERANCE = 0.01
+"""Residual before the last correction relative to the response, both in the energy norm of the rest
+state.  Newton's method squares it (to 1e-4, say), which need not be evaluated."""
+
+LAG = 0.015
+"""Change of the response, relative to it, up to which the tissue's part of the tangent serves again.
+The contact's never does: it is far stiffer and changes as fast as the tip moves."""
 
 LEAST = 1e-6
 """Response in that norm (square root of mN mm) that counts as none."""
@@ -165,6 +169,8 @@ class TipMemory(NamedTuple):
 
     patch: Ints  # (MAX_ACTIVE,)
     q: Array  # (MAX_ACTIVE, m)
+    bulk: Array  # (MAX_ACTIVE, m, m) part of the tangent
+    formed: Array  # (MAX_ACTIVE, m) state at which that was formed
     factor: Array  # (MAX_ACTIVE, m, m) of the tangent at the answer
     coupling: Array  # (MAX_ACTIVE, 3, m) B there
     position: Array  # (MAX_ACTIVE, 3) mm
@@ -180,10 +186,12 @@ class TipScratch(NamedTuple):
     linear: Array
     state: Field
     increments: Field  # (m, 9 c)
+    latest: Array  # (m,)
     tangent: Array  # (m, m)
     newton: Array  # (4, m)
     moved: Array  # (n, 3) mm, of the surface's nodes; only those near are written
-    folded: Array  # (3 k, m)
+    own: Array  # (3 k, m) modes at the nodes of a face
+    folded: Array  # (3 k, m) a face's stiffness times these
     touching: Touching
     distance: Array  # (p,)
     fade: Array  # (MAX_ACTIVE, 3) 1/mm, gradients of the weights
@@ -241,6 +249,9 @@ class TipSystem(NamedTuple):
     linear: Array
     state: Field
     increments: Field
+    bulk: Array  # (m, m) part of the tangent
+    formed: Array  # (m,) state at which that was formed
+    latest: Array  # (m,) state that ``touching`` is of
     tangent: Array
     factor: Array
     tip: Tip
@@ -252,6 +263,7 @@ class TipSystem(NamedTuple):
     x: Array
     step: Array  # (m,) scratch
     moved: Array
+    own: Array
     folded: Array
     touching: Touching
 
@@ -289,9 +301,9 @@ def _potential(system, u, residual):
         if not smallest > 0.0:
             return tissue.INVERTED, smallest
         project(system.gradients, system.P, residual)
-        count, energy, _ = _contact(system, u, FORCE)
-        for c in range(len(weights)):
-            energy += weights[c] * (tissue.energy(J[c], trace[c], mu[c], lam[c]) - linear[c])
+        count, energy, _ = _contact(system, u, STIFFNESS)
+        system.latest[:] = u
+        energy += _added_energy(weights, mu, lam, J, trace, linear)
         for j in range(len(u)):
             residual[j] += u[j]
             energy += 0.5 * u[j] * u[j]
@@ -313,45 +325,82 @@ def _factorise(system, u, shift):
         return None
 
     def factorise(system, u, shift):
-        gradients = system.tangent_gradients
-        H = system.H[: gradients.shape[1]]
-        superpose(gradients, u, H)
-        linearise(H, system.tangent_weights, system.tangent_mu, system.tangent_lam, system.state)
-        increments(system.state, gradients, system.increments)
-        _lower_products(gradients, system.increments, system.tangent)
-        for j in range(len(u)):
-            system.tangent[j, j] += 1.0
-        count, _, _ = _contact(system, u, CONVEX if shift > 0.0 else STIFFNESS)
-        for c in range(count):
-            _add_face(system, c)
-        return _cholesky(system.tangent, shift, system.factor)
+        known = _far(u, system.formed) <= LAG * LAG
+        if shift > 0.0:
+            _contact(system, u, CONVEX)
+            system.latest[:] = np.inf
+        elif _far(u, system.latest) > 0.0:
+            _contact(system, u, STIFFNESS)
+            system.latest[:] = u
+        while True:
+            if not known:
+                _form_bulk(system, u)
+            system.tangent[:] = system.bulk
+            for c in range(system.touching.touched[0]):
+                _add_face(system, c)
+            if _cholesky(system.tangent, shift, system.factor):
+                return True
+            if not known:
+                return False
+            known = False
 
     return factorise
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def _far(u, other):
+    """Squared distance of a state from another, relative to its size."""
+    size = distance = 0.0
+    for j in range(len(u)):
+        size += u[j] * u[j]
+        distance += (u[j] - other[j]) ** 2
+    return distance / max(size, LEAST * LEAST)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _form_bulk(system, u):
+    """The part of the tissue in the tangent at u, lower triangle."""
+    gradients, bulk = system.tangent_gradients, system.bulk
+    H = system.H[: gradients.shape[1]]
+    superpose(gradients, u, H)
+    linearise(H, system.tangent_weights, system.tangent_mu, system.tangent_lam, system.state)
+    increments(system.state, gradients, system.increments)
+    _lower_products(gradients, system.increments, bulk)
+    for j in range(len(u)):
+        bulk[j, j] += 1.0
+    system.formed[:] = u
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
 def _add_face(system, c):
     """Add a touching face's stiffness to the lower triangle of the tangent."""
-    K, folded, tangent = system.touching.stiffness[c], system.folded, system.tangent
-    own, modes = system.corners[system.touching.face[c]], system.modes
-    nodes = len(own)
-    folded[:] = 0.0
-    for i in range(3):
+    K, own, folded = system.touching.stiffness[c], system.own, system.folded
+    tangent = system.tangent
+    corners = system.corners[system.touching.face[c]]
+    nodes, m = len(corners), len(tangent)
+    for b in range(nodes):
         for j in range(3):
-            block = K[min(i, j), max(i, j)]
-            for a in range(nodes):
-                target = folded[3 * a + i]
-                for b in range(nodes):
-                    value, row = block[a, b], modes[own[b], j]
-                    for n in range(len(target)):
-                        target[n] += value * row[n]
-    for a in range(nodes):
-        for i in range(3):
-            row, other = modes[own[a], i], folded[3 * a + i]
-            for j in range(len(tangent)):
-                value = float(row[j])
-                for n in range(j + 1):
-                    tangent[j, n] += value * other[n]
+            row, target = system.modes[corners[b], j], own[nodes * j + b]
+            for n in range(m):
+                target[n] = row[n]
+    for i in range(3):
+        for a in range(nodes):
+            target = folded[nodes * i + a]
+            target[:] = 0.0
+            for j in range(3):
+                row = K[min(i, j), max(i, j), a]
+                for b in range(0, nodes, 4):  # a face has 4 or 8 nodes
+                    k, at = row[b : b + 4], nodes * j + b
+                    p, q, r, s = own[at], own[at + 1], own[at + 2], own[at + 3]
+                    for n in range(m):
+                        target[n] += k[0] * p[n] + k[1] * q[n] + k[2] * r[n] + k[3] * s[n]
+    for a in range(0, 3 * nodes, 4):
+        p, q, r, s = folded[a], folded[a + 1], folded[a + 2], folded[a + 3]
+        for j in range(m):
+            w, x, y, z = own[a, j], own[a + 1, j], own[a + 2, j], own[a + 3, j]
+            row = tangent[j]
+            for n in range(j + 1):
+                row[n] += w * p[n] + x * q[n] + y * r[n] + z * s[n]
 
 
 @overload(equilibrium.correct, jit_options={"error_model": "numpy"})
@@ -396,9 +445,8 @@ def _settle(system, q, work, least, most):
     size = max(math.sqrt(np.dot(q, q)), least, LEAST)
     while True:
         status, more, energy, smallest = descend(
-            system, q, work, energy, smallest, TOLERANCE * size, REUSE, most,
-            system.factor[0, 0] > 0.0, ROUND_OFF,
-        )  # fmt: skip
+            system, q, work, energy, smallest, TOLERANCE * size, 0.0, most, False, ROUND_OFF
+        )
         iterations += more
         found = math.sqrt(np.dot(q, q))
         if status != equilibrium.CONVERGED or size <= 2.0 * found or size <= LEAST:
@@ -428,6 +476,9 @@ def _system(models, k, slot, x, memory, scratch):
             scratch.linear,
             scratch.state,
             scratch.increments,
+            memory.bulk[slot],
+            memory.formed[slot],
+            scratch.latest,
             scratch.tangent,
             memory.factor[slot],
             models.tip,
@@ -439,6 +490,7 @@ def _system(models, k, slot, x, memory, scratch):
             x,
             scratch.newton[1],
             scratch.moved,
+            scratch.own,
             scratch.folded,
             scratch.touching,
         )
@@ -458,8 +510,6 @@ def _guess(models, k, x, depth, features, q):
 @njit(cache=True, error_model="numpy", nogil=True)
 def _predict(memory, slot, x, q, step):
     """Follow the last answer's derivatives to the position x."""
-    if not memory.factor[slot, 0, 0] > 0.0:
-        return
     for i in range(3):
         step[:] = memory.coupling[slot, i]
         _back_substitute(memory.factor[slot], step)
@@ -478,7 +528,6 @@ def _settle_on_the_way(system, q, work, least, depth, normal):
     for _ in range(RAMP):
         if status == equilibrium.CONVERGED:
             at -= away / RAMP
-            system.factor[0, 0] = 0.0
             status, more, energy, smallest = _settle(system, q, work, least, MAX_ITERATIONS)
             iterations += more
     return status, iterations, energy, smallest
@@ -487,13 +536,14 @@ def _settle_on_the_way(system, q, work, least, depth, normal):
 @njit(cache=True, error_model="numpy", nogil=True)
 def _solve(models, k, slot, warm, x, normal, depth, most, memory, scratch, outcome):
     """Equilibrium of model k, its force and tangent into memory's slot and the outcome."""
-    q, at, factor = memory.q[slot], memory.position[slot], memory.factor[slot]
+    q, at = memory.q[slot], memory.position[slot]
     if warm:
         _predict(memory, slot, x, q, scratch.newton[1])
     else:
         _guess(models, k, x, depth, scratch.features, q)
-        factor[0, 0] = 0.0
+        memory.formed[slot] = np.inf
     at[:] = x
+    scratch.latest[:] = np.inf
     tip = models.tip
     least = 0.1 * depth * tip.radius * math.sqrt(tip.stiffness / HARDNESS)
     system = _system(models, k, slot, at, memory, scratch)
@@ -507,7 +557,14 @@ def _solve(models, k, slot, warm, x, normal, depth, most, memory, scratch, outco
     if status == equilibrium.CONVERGED and not equilibrium.factorise(system, q, 0.0):
         status = equilibrium.STALLED  # a saddle
     if status == equilibrium.CONVERGED:
-        _react(system, memory.coupling[slot], outcome.forces[slot], outcome.tangents[slot])
+        coupling, force = memory.coupling[slot], outcome.forces[slot]
+        _react(system, coupling, force, outcome.tangents[slot])
+        residual, step = scratch.newton[0], scratch.newton[1]
+        equilibrium.correct(system, residual, step)
+        energy += 0.5 * np.dot(residual, step)
+        q += step
+        for i in range(3):
+            force[i] += np.dot(coupling[i], step)
     else:
         outcome.forces[slot] = 0.0
         outcome.tangents[slot] = 0.0
@@ -659,6 +716,8 @@ class TipState:
         self.memory = TipMemory(
             patch=np.full(MAX_ACTIVE, -1, np.int64),
             q=np.zeros((MAX_ACTIVE, m)),
+            bulk=np.zeros((MAX_ACTIVE, m, m)),
+            formed=np.zeros((MAX_ACTIVE, m)),
             factor=np.zeros((MAX_ACTIVE, m, m)),
             coupling=np.zeros((MAX_ACTIVE, 3, m)),
             position=np.zeros((MAX_ACTIVE, 3)),
@@ -671,9 +730,11 @@ class TipState:
             linear=np.zeros(points),
             state=np.zeros(STATE * LANES * (tangent_entries // TILE), np.float32),
             increments=np.zeros((m, tangent_entries), np.float32),
+            latest=np.zeros(m),
             tangent=np.zeros((m, m)),
             newton=np.zeros((4, m)),
             moved=np.zeros(models.surface.nodes.shape),
+            own=np.zeros((3 * models.corners.shape[1], m)),
             folded=np.zeros((3 * models.corners.shape[1], m)),
             touching=room_for(models.surface, int(np.diff(models.face_from).max())),
             distance=np.zeros(count),
