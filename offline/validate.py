@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from offline.norms import relative, statistics
-from offline.sampling import cone, random_points
+from offline.sampling import cone, random_points_and_rim
 from offline.workers import completed, worker_pool
 from offline.workshop import Load, Workshop, open_artifact
 from shared.artifact import read_artifact
@@ -140,12 +140,8 @@ def random_loads(
     Contact points are uniform over the area, one in eight on the rim of the surface; directions are
     uniform in the cone, one in eight on its border; pressures are denser towards the limit.
     """
-    points = random_points(surface, count, rng)
-    rim = surface.rim()
     loads = []
-    for i, point in enumerate(points):
-        if i % 8 == 0:
-            point = surface.vertices[rng.choice(rim)]
+    for i, point in enumerate(random_points_and_rim(surface, count, rng)):
         x, normal, _, fields = surface.locate(point, limits)
         tilt = scene.endoscope.max_tilt
         direction = cone(normal, tilt, 1, rng, border=i % 8 == 1)[0]

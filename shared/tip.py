@@ -41,7 +41,7 @@ Ints = NDArray[np.int32]
 HARDNESS = 4000.0
 """Of the penalty, in units of Young's modulus over the tip's radius."""
 
-ONSET = 2.5e-4
+ONSET = 1e-3
 """Penetration over which the penalty sets in, in radii of the tip."""
 
 SPACING = 0.05
@@ -232,7 +232,7 @@ def penalty(tip, d):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _within_reach(tip, surface, face, x, moved, at):
-    """Whether the tip at x reaches the surroundings of a deformed face; its nodes from x, ``at``."""
+    """Whether the tip at x reaches the surroundings of a deformed face; writes its nodes from x."""
     nodes, faces = surface.nodes, surface.faces
     squared = largest = 0.0
     for i in range(3):

@@ -44,13 +44,14 @@ from shared.reduced import (
     _is,
     _lower_products,
     activate,
+    back_substitute,
     increments,
     linearise,
     nonlinear_stress,
     project,
     superpose,
 )
-from shared.surface import Ground, locate
+from shared.surface import UPRIGHT, Ground, locate
 from shared.tip import (
     CONVEX,
     HARDNESS,
@@ -67,13 +68,13 @@ Array = NDArray[np.float64]
 Field = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
-TOLERANCE = 0.01
+TOLERANCE = 0.003
 """Residual before the last correction relative to the response, both in the energy norm of the rest
-state.  Newton's method squares it (to 1e-4, say), which need not be evaluated."""
+state.  Newton's method squares it (to 1e-5, say), which need not be evaluated."""
 
 LAG = 0.015
-"""Change of the response, relative to it, up to which the tissue's part of the tangent serves again.
-The contact's never does: it is far stiffer and changes as fast as the tip moves."""
+"""Change of the response, relative to it, up to which the tissue's part of the tangent serves
+again.  The contact's never does: it is far stiffer and changes as fast as the tip moves."""
 
 LEAST = 1e-6
 """Response in that norm (square root of mN mm) that counts as none."""
@@ -83,9 +84,6 @@ MAX_ITERATIONS = 40
 SKIN = 0.02
 """Distance from the surface, in radii of the tip, at which contact is looked for: the triangles
 that say where the surface is cut its curves."""
-
-UPRIGHT = 0.7
-"""Cosine between normal and way to the tip's centre below which it is beside the surface."""
 
 RAMP = 8
 """Steps of the way in when an equilibrium cannot be found in one jump."""
@@ -207,18 +205,21 @@ class TipOutcome(NamedTuple):
 
     weight: Array  # (MAX_ACTIVE,)
     foot: Array  # (3,) mm, on the surface, nearest to the tip's centre
-    normal: Array  # (3,) outward there
+    upward: Array  # (3,) outward normal there
     force: Array  # (3,) mN
     tangent: Array  # (3, 3) mN/mm
+    point: Array  # (3,) mm, see ``Touch.contact_point``
+    normal: Array  # (3,) from there to the tip's centre
     forces: Array  # (MAX_ACTIVE, 3) of the models
     tangents: Array  # (MAX_ACTIVE, 3, 3)
     limit: Array  # (1,) mm, largest trained depth there
     features: Array  # (TIP_ERROR_FEATURES,) of the error estimate
+    errors: Array  # (3,) estimated: displacement, von Mises stress, force
     scalars: Array  # (SCALARS,)
 
 
-(STATUS, ITERATIONS, SMALLEST_J, ENERGY, PENETRATION, TOUCHED, DEPTH, DISTANCE) = range(8)
-SCALARS = 8
+(STATUS, ITERATIONS, SMALLEST_J, ENERGY, PENETRATION, TOUCHED, DEPTH, DISTANCE, BESIDE) = range(9)
+SCALARS = 9
 
 
 class TipSolver(NamedTuple):
@@ -226,6 +227,7 @@ class TipSolver(NamedTuple):
 
     models: TipModels
     ground: Ground
+    coefficients: Array  # (3, TIP_ERROR_FEATURES) of the error estimate
     memory: TipMemory
     scratch: TipScratch
     outcome: TipOutcome
@@ -411,24 +413,9 @@ def _correct(system, residual, step):
     def correct(system, residual, step):
         for j in range(len(step)):
             step[j] = -residual[j]
-        _back_substitute(system.factor, step)
+        back_substitute(system.factor, step)
 
     return correct
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _back_substitute(L, x):
-    """Solve ``L L^T x = x`` in place."""
-    m = len(x)
-    for i in range(m):
-        total = x[i]
-        for k in range(i):
-            total -= L[i, k] * x[k]
-        x[i] = total / L[i, i]
-    for i in range(m - 1, -1, -1):
-        x[i] /= L[i, i]
-        for k in range(i):
-            x[k] -= L[i, k] * x[i]
 
 
 descend = njit(equilibrium.descend, error_model="numpy", nogil=True, cache=True)
@@ -512,7 +499,7 @@ def _predict(memory, slot, x, q, step):
     """Follow the last answer's derivatives to the position x."""
     for i in range(3):
         step[:] = memory.coupling[slot, i]
-        _back_substitute(memory.factor[slot], step)
+        back_substitute(memory.factor[slot], step)
         for j in range(len(q)):
             q[j] += step[j] * (x[i] - memory.position[slot, i])
 
@@ -597,7 +584,7 @@ def _react(system, coupling, force, tangent):
     step = system.step
     for i in range(3):
         step[:] = coupling[i]
-        _back_substitute(system.factor, step)
+        back_substitute(system.factor, step)
         for j in range(3):
             tangent[j, i] = np.dot(coupling[j], step) - touching.own[j, i]
 
@@ -641,20 +628,24 @@ def query(solver, x, most):
     models, memory, scratch, outcome = (
         solver.models, solver.memory, solver.scratch, solver.outcome,
     )  # fmt: skip
-    scalars, foot, normal = outcome.scalars, outcome.foot, outcome.normal
+    scalars, foot, upward = outcome.scalars, outcome.foot, outcome.upward
     scalars[:] = 0.0
     scalars[SMALLEST_J] = 1.0
     outcome.force[:] = 0.0
     outcome.tangent[:] = 0.0
     outcome.weight[:] = 0.0
-    distance = locate(solver.ground, x, scratch.ground, foot, normal, outcome.limit)
+    outcome.errors[:] = 0.0
+    outcome.features[:] = 0.0
+    distance = locate(solver.ground, x, scratch.ground, foot, upward, outcome.limit)
+    outcome.point[:] = foot
+    outcome.normal[:] = upward
     above = 0.0
     for i in range(3):
-        above += (x[i] - foot[i]) * normal[i]
+        above += (x[i] - foot[i]) * upward[i]
     radius = models.tip.radius
     beside = abs(above) < UPRIGHT * distance
     depth = radius - (distance if beside else math.copysign(distance, above))
-    scalars[DEPTH], scalars[DISTANCE] = depth, distance
+    scalars[DEPTH], scalars[DISTANCE], scalars[BESIDE] = depth, distance, 1.0 if beside else 0.0
     if depth > radius or depth < -SKIN * radius:
         return
     activate(models, x, memory, scratch.distance, outcome.weight)
@@ -664,7 +655,7 @@ def query(solver, x, most):
             k = memory.patch[slot]
             warm = k >= 0
             k = k if warm else -2 - k
-            _solve(models, k, slot, warm, x, normal, depth, most, memory, scratch, outcome)
+            _solve(models, k, slot, warm, x, upward, depth, most, memory, scratch, outcome)
             share = outcome.weight[slot]
             for i in range(3):
                 outcome.force[i] += share * outcome.forces[slot, i]
@@ -673,26 +664,43 @@ def query(solver, x, most):
                         share * outcome.tangents[slot, i, j]
                         + outcome.forces[slot, i] * scratch.fade[slot, j]
                     )
-
-    _features(outcome)
+    if scalars[TOUCHED] > 0.0:
+        _conclude(solver, x)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _features(outcome):
-    """What the error estimate is made of.
+def _conclude(solver, x):
+    """Where the force acts, and the estimated errors: ``log error = c . features``.
 
-    1, the depth over its limit and its log, smallest det F, the normal (where on the body), and the
-    logs of force over depth (mN/mm) and of the energy over that of a linear spring.
+    The features: 1, the depth over its limit and its log, smallest det F, the normal (where on the
+    body), and the logs of force over depth (mN/mm) and of the energy over that of a linear spring.
     """
-    scalars, features = outcome.scalars, outcome.features
+    outcome = solver.outcome
+    scalars, features, force = outcome.scalars, outcome.features, outcome.force
+    pushed = math.sqrt(np.dot(force, force))
+    if pushed > 0.0:
+        for i in range(3):
+            outcome.normal[i] = force[i] / pushed
+            outcome.point[i] = x[i] - solver.models.tip.radius * outcome.normal[i]
     depth = max(scalars[DEPTH], 1e-6)
     share = depth / max(outcome.limit[0], 1e-6)
-    pushed = math.sqrt(np.dot(outcome.force, outcome.force))
     features[0], features[1], features[2] = 1.0, share, math.log(share)
     features[3] = scalars[SMALLEST_J]
-    features[4:7] = outcome.normal
+    features[4:7] = outcome.upward
     features[7] = math.log(max(pushed / depth, 1e-6))
     features[8] = math.log(max(2.0 * scalars[ENERGY] / max(pushed * depth, 1e-9), 1e-3))
+    for i in range(3):
+        outcome.errors[i] = math.exp(np.dot(solver.coefficients[i], features))
+
+
+_WEIGHT = slice(0, MAX_ACTIVE)
+_FORCE, _POINT, _NORMAL = (slice(_WEIGHT.stop + 3 * i, _WEIGHT.stop + 3 * i + 3) for i in range(3))
+_TANGENT = slice(_NORMAL.stop, _NORMAL.stop + 9)
+_FEATURES = slice(_TANGENT.stop, _TANGENT.stop + TIP_ERROR_FEATURES)
+_ERRORS = slice(_FEATURES.stop, _FEATURES.stop + 3)
+_LIMIT = slice(_ERRORS.stop, _ERRORS.stop + 1)
+_SCALARS = slice(_LIMIT.stop, _LIMIT.stop + SCALARS)
+"""Where the parts of an outcome lie in a state's record."""
 
 
 class TipState:
@@ -708,8 +716,7 @@ class TipState:
     """
 
     def __init__(self, models: TipModels, ground: Ground, coefficients: Array) -> None:
-        self.tip = models.tip
-        self.coefficients = coefficients
+        self.radius = models.tip.radius
         count, m, entries = models.points.gradients.shape
         tangent_entries = models.tangent_points.gradients.shape[2]
         points = LANES * (entries // TILE)
@@ -742,19 +749,27 @@ class TipState:
             features=np.zeros(TIP_FEATURES),
             ground=np.zeros(len(ground.radii) + 6),
         )
+        # one array, so that an answer is kept by one copy
+        self.record = record = np.zeros(_SCALARS.stop)
         self.outcome = TipOutcome(
-            weight=np.zeros(MAX_ACTIVE),
+            weight=record[_WEIGHT],
             foot=np.zeros(3),
-            normal=np.zeros(3),
-            force=np.zeros(3),
-            tangent=np.zeros((3, 3)),
+            upward=np.zeros(3),
+            force=record[_FORCE],
+            tangent=record[_TANGENT].reshape(3, 3),
+            point=record[_POINT],
+            normal=record[_NORMAL],
             forces=np.zeros((MAX_ACTIVE, 3)),
             tangents=np.zeros((MAX_ACTIVE, 3, 3)),
-            limit=np.zeros(1),
-            features=np.zeros(TIP_ERROR_FEATURES),
-            scalars=np.zeros(SCALARS),
+            limit=record[_LIMIT],
+            features=record[_FEATURES],
+            errors=record[_ERRORS],
+            scalars=record[_SCALARS],
         )
-        self.bound = bind(TipSolver(models, ground, self.memory, scratch, self.outcome))
+        solver = TipSolver(
+            models, ground, np.ascontiguousarray(coefficients), self.memory, scratch, self.outcome
+        )
+        self.bound = bind(solver)
 
     def forget(self) -> None:
         """Make the next answer independent of the last."""
@@ -838,39 +853,34 @@ def answer(state: TipState, position: Array, started: float, most: int = MAX_ITE
         If the tip's centre lies below the surface.
     """
     query(state.bound, position, most)
-    outcome, memory, radius = state.outcome, state.memory, state.tip.radius
-    scalars = outcome.scalars.tolist()
-    depth, limit = scalars[DEPTH], float(outcome.limit[0])
+    record, memory, radius = state.record.copy(), state.memory, state.radius
+    weights, scalars = record[_WEIGHT].tolist(), record[_SCALARS].tolist()
+    errors, limit = record[_ERRORS].tolist(), record[_LIMIT].item()
+    depth = scalars[DEPTH]
     if depth > radius:
         raise QueryError(
             "position",
             f"the tip's centre lies {depth - radius:.2f} mm below the accessible surface",
         )
     contact = scalars[TOUCHED] > 0
-    force, point, normal = outcome.force.copy(), outcome.foot.copy(), outcome.normal.copy()
     out_of_range: tuple[str, ...] = ()
-    if contact and abs(float((position - point) @ normal)) < UPRIGHT * scalars[DISTANCE]:
+    if contact and scalars[BESIDE]:
         out_of_range += ("position",)
     if depth > limit * (1 + 1e-9):
         out_of_range += ("depth",)
-    pushed = math.sqrt(float(force @ force))
-    if pushed > 0:
-        normal = force / pushed
-        point = position - radius * normal
-    errors = np.exp(state.coefficients @ outcome.features).tolist() if contact else [0.0] * 3
     patches = []
     if contact:
-        for slot, weight in enumerate(outcome.weight.tolist()):
+        for slot, weight in enumerate(weights):
             if weight > 0:
                 k = int(memory.patch[slot])
                 patches.append((k if k >= 0 else -2 - k, weight, memory.q[slot].copy()))
     return Touch(
         position=position,
         contact=contact,
-        force=force,
-        tangent=outcome.tangent.copy(),
-        contact_point=point,
-        normal=normal,
+        force=record[_FORCE],
+        tangent=record[_TANGENT].reshape(3, 3),
+        contact_point=record[_POINT],
+        normal=record[_NORMAL],
         depth=depth,
         depth_limit=limit,
         penetration=scalars[PENETRATION],
@@ -883,7 +893,7 @@ def answer(state: TipState, position: Array, started: float, most: int = MAX_ITE
         error_von_mises=errors[1],
         error_force=errors[2],
         min_jacobian=scalars[SMALLEST_J],
-        features=outcome.features.copy(),
+        features=record[_FEATURES],
         patches=tuple(patches),
         solve_seconds=time.perf_counter() - started,
     )
