@@ -28,11 +28,6 @@ Array = NDArray[np.float64]
 
 QUANTITIES = ("displacement", "von_mises", "force")
 
-COVERAGE = 0.97
-"""Share of known positions whose errors the estimate must cover: above 95 %, as unseen ones are."""
-
-DAMPING = 3.0
-
 OTHER_EQUILIBRIUM = 0.1
 """Displacement error beyond which the models rest in different equilibria: a free edge can slip off
 the tip or not, and where it just does not in one model, it does in the other."""
@@ -76,9 +71,9 @@ class TouchComparison:
     estimated_force: float = field(default=float("nan"))
 
     @property
-    def same_equilibrium(self) -> bool:
-        """Whether the answer is near the full solution, see ``OTHER_EQUILIBRIUM``."""
-        return self.displacement <= OTHER_EQUILIBRIUM
+    def typical(self) -> bool:
+        """Whether it counts for the error estimate: both models rest in the same equilibrium."""
+        return self.converged and self.displacement <= OTHER_EQUILIBRIUM
 
     def estimate(self, estimator: Estimator) -> None:
         """Fill in the estimated errors."""
@@ -144,7 +139,7 @@ def summarise_touches(rows: Sequence[TouchComparison]) -> dict[str, Any]:
     unconverged = queries - len(rows)
     covered, ratios = coverage(rows, QUANTITIES)
     converged = len(rows)
-    rows = [r for r in rows if r.same_equilibrium]
+    rows = [r for r in rows if r.typical]
     return {
         "queries": queries,
         "unconverged": unconverged,
@@ -154,35 +149,6 @@ def summarise_touches(rows: Sequence[TouchComparison]) -> dict[str, Any]:
         "penetration_over_depth": statistics([r.penetration / r.depth for r in rows]),
         "estimate_over_error_median": ratios,
     }
-
-
-def calibrate_touches(rows: Sequence[TouchComparison]) -> Estimator:
-    """Fit the error estimate to known errors: it covers ``COVERAGE`` of them in all quantities.
-
-    A least-squares fit of their logs, raised by one constant for each quantity: so far that each
-    alone is covered as often as all are to be, then all alike until they are.
-    """
-    rows = [r for r in rows if r.converged]
-    X = np.array([r.features for r in rows])
-    varies = X.std(axis=0) > 0
-    middle, scale = np.where(varies, X.mean(axis=0), 0.0), np.where(varies, X.std(axis=0), 1.0)
-    A = (X - middle) / scale
-    # few rows for many features: hold the coefficients back
-    damping = np.diag(np.where(varies, DAMPING, 0.0))
-    needed = int(np.ceil(COVERAGE * len(rows))) - 1
-    coefficients, rests = [], []
-    for name in QUANTITIES:
-        y = np.log([max(getattr(r, name), 1e-8) for r in rows])
-        c = np.linalg.lstsq(np.vstack([A, damping]), np.append(y, np.zeros(len(damping))))[0]
-        c = c / scale
-        c[0] -= middle @ c
-        c[0] += np.sort(y - X @ c)[needed]
-        coefficients.append(c)
-        rests.append(y - X @ c)
-    missing = max(float(np.sort(np.max(rests, axis=0))[needed]), 0.0)
-    for c in coefficients:
-        c[0] += missing
-    return Estimator(np.array(coefficients))
 
 
 def validate_touches(

@@ -38,10 +38,10 @@ from shared.elements import quadrilateral, shape
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
-HARDNESS = 4000.0
+HARDNESS = 7000.0
 """Of the penalty, in units of Young's modulus over the tip's radius."""
 
-ONSET = 1e-3
+ONSET = 5e-4
 """Penetration over which the penalty sets in, in radii of the tip."""
 
 SPACING = 0.05
@@ -164,7 +164,8 @@ def _grid(nodes: Array, spacing: float) -> tuple[Array, Array, Ints]:
         Which those of a block are; the first and third, and the others, are opposite.
     """
     edges = np.linalg.norm(nodes[:, [1, 2, 3, 0]] - nodes[:, :4], axis=2)
-    m, n = (max(1, int(np.ceil(edges[:, i::2].max() / (SIDE * spacing)))) for i in range(2))
+    # a block more or less must not hang on round-off
+    m, n = (max(1, int(np.ceil(edges[:, i::2].max() / (SIDE * spacing) - 1e-6))) for i in range(2))
     cells = [(np.arange(SIDE * count) + 0.5) * 2 / (SIDE * count) - 1 for count in (m, n)]
     centres = np.stack(np.meshgrid(*cells, indexing="ij"), axis=-1)
     centres = centres.reshape(m, SIDE, n, SIDE, 2).transpose(0, 2, 1, 3, 4).reshape(-1, 2)
