@@ -214,7 +214,8 @@ def calibrate(rows: Sequence[Any], quantities: Sequence[str]) -> Estimator:
     """Fit the error estimate to known errors: it covers ``COVERAGE`` of them in all quantities.
 
     A least-squares fit of their logs is raised by a constant for each quantity.  The rows that need
-    not be covered are those that would raise one most.
+    not be covered are those that would raise one most.  What counts is how far a row lies from a
+    fit to the others, or the estimate would cover fewer of new ones.
     """
     rows = [r for r in rows if r.typical]
     X = np.array([r.features for r in rows])
@@ -223,6 +224,7 @@ def calibrate(rows: Sequence[Any], quantities: Sequence[str]) -> Estimator:
     middle = X.mean(axis=0)
     A = np.column_stack([(X - middle) / scale, np.ones(len(rows))])
     damping = np.diag([DAMPING] * len(middle) + [0.0])
+    leverage = np.sum(A * np.linalg.pinv(np.vstack([A, damping])).T[: len(A)], axis=1)
     coefficients, rests = [], []
     for name in quantities:
         y = np.log([max(getattr(r, name), 1e-8) for r in rows])
@@ -232,8 +234,8 @@ def calibrate(rows: Sequence[Any], quantities: Sequence[str]) -> Estimator:
         rest = y - X @ c
         c[0] += np.median(rest)
         coefficients.append(c)
-        rests.append(rest - np.median(rest))
-    covered = np.argsort(np.max(rests, axis=0))[: int(np.ceil(COVERAGE * len(rows)))]
+        rests.append((rest - np.median(rest)) / (1 - leverage))
+    covered = np.argsort(np.max(rests, axis=0))[: int(np.ceil(COVERAGE * (len(rows) + 1)))]
     for c, rest in zip(coefficients, rests, strict=True):
         c[0] += rest[covered].max()
     return Estimator(np.array(coefficients))
