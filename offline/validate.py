@@ -30,10 +30,10 @@ UNSEEN = 100
 
 ESTIMATED = ("displacement", "von_mises")
 
-COVERAGE = 0.97
-"""Share of known errors that the estimate must cover: above 95 %, for unseen ones to be."""
+COVERAGE = 0.95
+"""Share of errors that the estimate must cover."""
 
-DAMPING = 3.0
+DAMPING = 0.3
 """Holds the coefficients of the estimate back, since known errors are few for many features."""
 
 
