@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from offline.norms import relative, statistics
 from offline.sampling import random_points_and_rim
-from offline.validate import UNSEEN, coverage, write_rows
+from offline.validate import UNSEEN, calibrate, coverage, write_rows
 from offline.workers import completed, worker_pool
 from offline.workshop import TouchSample, Workshop, open_artifact
 from shared.artifact import read_artifact
@@ -27,6 +27,9 @@ from shared.touch import Touch
 Array = NDArray[np.float64]
 
 QUANTITIES = ("displacement", "von_mises", "force")
+
+COVERAGE, DAMPING = 0.97, 3.0
+"""Of the error estimate: fewer errors are known than of loads, and they scatter more."""
 
 OTHER_EQUILIBRIUM = 0.1
 """Displacement error beyond which the models rest in different equilibria: a free edge can slip off
@@ -80,6 +83,11 @@ class TouchComparison:
         self.estimated_displacement, self.estimated_von_mises, self.estimated_force = estimator(
             self.features
         )
+
+
+def calibrate_touches(rows: Sequence[TouchComparison]) -> Estimator:
+    """Fit the error estimate of the tip to known errors."""
+    return calibrate(rows, QUANTITIES, COVERAGE, DAMPING)
 
 
 def random_positions(

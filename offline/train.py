@@ -47,14 +47,13 @@ from offline.scenes import default_artifact, find_scene
 from offline.spaces import Footprint
 from offline.tips import TipResult
 from offline.touches import (
-    QUANTITIES,
     TouchComparison,
+    calibrate_touches,
     compare_touch,
     random_positions,
     summarise_touches,
 )
 from offline.validate import (
-    ESTIMATED,
     Comparison,
     calibrate,
     compare,
@@ -376,10 +375,10 @@ class Pipeline:
             if found[name]["displacement"].size
         ]
         for half, other in ((rows[::2], rows[1::2]), (rows[1::2], rows[::2])):
-            estimator = calibrate(other, QUANTITIES)
+            estimator = calibrate_touches(other)
             for row in half:
                 row.estimate(estimator)
-        return calibrate(rows, QUANTITIES), rows
+        return calibrate_touches(rows), rows
 
     def _validate(
         self, models: LocalModels, limits: Array
@@ -405,10 +404,10 @@ class Pipeline:
             if len(rows) >= LEAST and _accurate(rows, self.scene.tolerance):
                 break
         for half, other in ((rows[::2], rows[1::2]), (rows[1::2], rows[::2])):
-            estimator = calibrate(other, ESTIMATED)
+            estimator = calibrate(other)
             for row in half:
                 row.estimate(estimator)
-        estimator = calibrate(rows, ESTIMATED)
+        estimator = calibrate(rows)
         documents = {
             "provenance": self.provenance,
             "training": {"seconds": self.seconds, "mesh": mesh_quality(self.workshop.mesh)},

@@ -210,8 +210,13 @@ def summarise(rows: Sequence[Comparison]) -> dict[str, Any]:
     }
 
 
-def calibrate(rows: Sequence[Any], quantities: Sequence[str]) -> Estimator:
-    """Fit the error estimate to known errors: it covers ``COVERAGE`` of them in all quantities.
+def calibrate(
+    rows: Sequence[Any],
+    quantities: Sequence[str] = ESTIMATED,
+    share: float = COVERAGE,
+    damping: float = DAMPING,
+) -> Estimator:
+    """Fit the error estimate to known errors: it covers a share of them in all quantities.
 
     A least-squares fit of their logs is raised by a constant for each quantity.  The rows that need
     not be covered are those that would raise one most.  What counts is how far a row lies from a
@@ -223,19 +228,19 @@ def calibrate(rows: Sequence[Any], quantities: Sequence[str]) -> Estimator:
     scale = np.where(spread > 1e-9, spread, np.inf)  # the constant one; others may be, too
     middle = X.mean(axis=0)
     A = np.column_stack([(X - middle) / scale, np.ones(len(rows))])
-    damping = np.diag([DAMPING] * len(middle) + [0.0])
-    leverage = np.sum(A * np.linalg.pinv(np.vstack([A, damping])).T[: len(A)], axis=1)
+    ridge = np.diag([damping] * len(middle) + [0.0])
+    leverage = np.sum(A * np.linalg.pinv(np.vstack([A, ridge])).T[: len(A)], axis=1)
     coefficients, rests = [], []
     for name in quantities:
         y = np.log([max(getattr(r, name), 1e-8) for r in rows])
-        c = np.linalg.lstsq(np.vstack([A, damping]), np.append(y, np.zeros(len(damping))))[0]
+        c = np.linalg.lstsq(np.vstack([A, ridge]), np.append(y, np.zeros(len(ridge))))[0]
         c, constant = c[:-1] / scale, c[-1]
         c[0] = constant - c @ middle
         rest = y - X @ c
         c[0] += np.median(rest)
         coefficients.append(c)
         rests.append((rest - np.median(rest)) / (1 - leverage))
-    covered = np.argsort(np.max(rests, axis=0))[: int(np.ceil(COVERAGE * (len(rows) + 1)))]
+    covered = np.argsort(np.max(rests, axis=0))[: int(np.ceil(share * (len(rows) + 1)))]
     for c, rest in zip(coefficients, rests, strict=True):
         c[0] += rest[covered].max()
     return Estimator(np.array(coefficients))

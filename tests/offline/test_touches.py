@@ -3,8 +3,12 @@ import json
 import numpy as np
 import pytest
 
-from offline.touches import QUANTITIES, TouchComparison, validate_touches
-from offline.validate import calibrate
+from offline.touches import (
+    QUANTITIES,
+    TouchComparison,
+    calibrate_touches,
+    validate_touches,
+)
 from shared.atlas import Atlas
 
 
@@ -37,7 +41,7 @@ def test_the_estimate_covers_what_it_is_fitted_to(rng):
     for _ in range(60):
         features = np.concatenate([[1.0], rng.standard_normal(8)])
         rows.append(row(features, np.exp(rng.standard_normal(3) + features[1] - 8)))
-    estimator = calibrate(rows, QUANTITIES)
+    estimator = calibrate_touches(rows)
     covered = 0
     for known in rows:
         known.estimate(estimator)
@@ -45,5 +49,5 @@ def test_the_estimate_covers_what_it_is_fitted_to(rng):
     assert covered >= 0.97 * len(rows)
     elsewhere = row(rows[0].features, [0.5, 0.5, 0.5])  # in another equilibrium
     np.testing.assert_array_equal(
-        calibrate([*rows, elsewhere], QUANTITIES).coefficients, estimator.coefficients
+        calibrate_touches([*rows, elsewhere]).coefficients, estimator.coefficients
     )
