@@ -122,6 +122,22 @@ class Tissue(_Part):
     law: Literal["neo-hookean"]
     young: Positive = Field(description="Young's modulus at rest, kPa")
     poisson: float = Field(ge=0, lt=0.5, description="Poisson's ratio at rest")
+    prony: tuple[tuple[Fraction, Positive], ...] = Field(
+        (),
+        max_length=6,
+        description="[[share, time constant in s], ...]: what the isochoric stress loses with time",
+    )
+
+    @model_validator(mode="after")
+    def _some_stiffness_stays(self) -> Tissue:
+        total = sum(share for share, _ in self.prony)
+        if not total < 1.0:
+            raise PydanticCustomError(
+                "prony",
+                "the shares of prony must sum to less than 1, not {total}",
+                {"total": total},
+            )
+        return self
 
 
 class Patch(_Part):
