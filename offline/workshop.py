@@ -164,20 +164,21 @@ class Workshop:
         The limit along the normal is where the tissue moves by the scene's indentation, or beyond
         which it has no equilibrium; the depth of the tip is how far the footprint has sunk then.
         """
+        model = self.model.relaxed  # for as long as it takes
         nodal, normal = self.unit_load(position)
-        unit = np.einsum("n,ij->nij", nodal, np.eye(3)).reshape(-1, 3)[self.model.free]
-        linear = self.model.solve_linear(unit)
+        unit = np.einsum("n,ij->nij", nodal, np.eye(3)).reshape(-1, 3)[model.free]
+        linear = model.solve_linear(unit)
         C = unit.T @ linear / nodal.sum()
         thickness = local_thickness(self.mesh, position[None], normal[None])[0]
         wanted = self.scene.load.max_indentation * thickness
         pressure = wanted / np.linalg.norm((linear @ normal).reshape(-1, 3), axis=1).max()
-        path = LoadPath(self.model, -unit @ normal)
+        path = LoadPath(model, -unit @ normal)
         # no load steps in the full model: where a jump fails, the pressure between is asked for
         near = pressure_that_moves(path.solve, wanted, pressure)
 
         def full(pressure: float, start: Array | None) -> Array:
             force = -pressure * nodal[:, None] * normal
-            return self.model.solve(force, start, smallest_step=1.0).displacement
+            return model.solve(force, start, smallest_step=1.0).displacement
 
         limit, _, moved = pressure_that_moves(full, wanted, *near)
         depth = 0.0 if moved is None else -float(nodal @ moved @ normal) / nodal.sum()

@@ -201,6 +201,7 @@ def overstress(f0, f1, f2, f3, f4, f5, f6, f7, f8, b0, b1, b2, b3, b4, b5, J, sc
 def add_stress(F, B, mu, J, P):
     """Add what the past does to the stress ``P`` (9,) kPa; return what it adds to the energy (kPa).
 
+    Without ``-3/2 mu B[6]``, a constant of the step beside which small energies would drown.
     F (9,) with det F = ``J > 0``; B (7,) from ``predict``; ``mu`` kPa.
     """
     scale = mu * J ** (-2.0 / 3.0)
@@ -217,7 +218,7 @@ def add_stress(F, B, mu, J, P):
     P[6] += p6
     P[7] += p7
     P[8] += p8
-    return 0.5 * (scale * contraction - 3.0 * mu * B[6])
+    return 0.5 * scale * contraction
 
 
 @njit(cache=True, error_model="numpy")

@@ -31,7 +31,7 @@ def answer(F, B):
     """Energy density and stress (3, 3) at a deformation gradient (3, 3)."""
     P = np.empty(9)
     W, J = tissue.stress(F.ravel(), MU, LAM, P)
-    W += viscosity.add_stress(F.ravel(), B, MU, J, P)
+    W += viscosity.add_stress(F.ravel(), B, MU, J, P) - 1.5 * MU * B[6]
     return W, P.reshape(3, 3)
 
 
