@@ -45,7 +45,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from shared.tissue import inverse_and_jacobian
+from shared.tissue import equivalent, first_piola, inverse_and_jacobian
 
 Array = NDArray[np.float64]
 
@@ -142,6 +142,25 @@ def advance(history, m, weights):
                 + weights.new[a] * m[i]
             )
         history[terms, i] = m[i]
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def driven(f0, f1, f2, f3, f4, f5, f6, f7, f8):
+    """``m - I`` of a deformation gradient in scalars, for loops over many points."""
+    c0, c1, c2 = f4 * f8 - f5 * f7, f5 * f6 - f3 * f8, f3 * f7 - f4 * f6
+    c3, c4, c5 = f2 * f7 - f1 * f8, f0 * f8 - f2 * f6, f1 * f6 - f0 * f7
+    c6, c7, c8 = f1 * f5 - f2 * f4, f2 * f3 - f0 * f5, f0 * f4 - f1 * f3
+    J = f0 * c0 + f1 * c1 + f2 * c2  # c = J F^-T
+    trace = f0 * f0 + f1 * f1 + f2 * f2 + f3 * f3 + f4 * f4 + f5 * f5 + f6 * f6 + f7 * f7 + f8 * f8
+    s = trace / (3.0 * J * J)
+    return (
+        s * (c0 * c0 + c3 * c3 + c6 * c6) - 1.0,
+        s * (c1 * c1 + c4 * c4 + c7 * c7) - 1.0,
+        s * (c2 * c2 + c5 * c5 + c8 * c8) - 1.0,
+        s * (c1 * c2 + c4 * c5 + c7 * c8),
+        s * (c0 * c2 + c3 * c5 + c6 * c8),
+        s * (c0 * c1 + c3 * c4 + c6 * c7),
+    )
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -277,3 +296,18 @@ def dissipation(F, history, weights, tau, mu):
         excess = J ** (-2.0 / 3.0) * contraction - 3.0 * (1.0 + h[6])
         power += 0.5 * mu * weights.share[a] * excess / tau[a]
     return power
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def von_mises(f0, f1, f2, f3, f4, f5, f6, f7, f8, b0, b1, b2, b3, b4, b5, mu, lam):
+    """Von Mises equivalent (kPa) of the Cauchy stress with its past; see ``overstress``."""
+    J, _, p0, p1, p2, p3, p4, p5, p6, p7, p8 = first_piola(
+        f0, f1, f2, f3, f4, f5, f6, f7, f8, mu, lam
+    )
+    _, q0, q1, q2, q3, q4, q5, q6, q7, q8 = overstress(
+        f0, f1, f2, f3, f4, f5, f6, f7, f8, b0, b1, b2, b3, b4, b5, J, mu * abs(J) ** (-2.0 / 3.0)
+    )
+    return equivalent(
+        f0, f1, f2, f3, f4, f5, f6, f7, f8,
+        p0 + q0, p1 + q1, p2 + q2, p3 + q3, p4 + q4, p5 + q5, p6 + q6, p7 + q7, p8 + q8, J,
+    )  # fmt: skip
