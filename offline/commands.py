@@ -371,6 +371,24 @@ def stability(scene: str, artifact: Path | None, cases: int, seed: int, as_json:
     _show(stability(path, cases, seed), as_json)
 
 
+@study.command()
+@artifact_argument
+@click.option("--at", "position", type=VECTOR, metavar="X Y Z", help="mm  [default: the middle]")
+@json_option
+def relaxation(artifact: Path, position: tuple[float, float, float] | None, as_json: bool) -> None:
+    """Press the visco-elastic tissue of the artifact F, hold, release, wait.
+
+    Force and depth over time, of the full and the reduced model, go to NAME/report/relaxation.csv
+    and .png beside the artifact.
+    """
+    import numpy as np
+
+    from offline.studies.relaxation import relaxation
+
+    at = None if position is None else np.array(position)
+    _show(relaxation(artifact, at), as_json)
+
+
 def _show(report: Mapping[str, object], as_json: bool) -> None:
     """Print a report as JSON, or as one ``name value`` line per leaf."""
     if as_json:

@@ -56,7 +56,7 @@ from shared.surface import Ground, Surface, boundary_triangles
 from shared.tip import Tip, TipSurface, tip_of, tip_surface
 from shared.tissue import lame
 from shared.touch import TIP_ERROR_FEATURES, LocalTips, Points, TipModels, TipState, Touch
-from shared.viscosity import step_weights
+from shared.viscosity import Weights, step_weights
 
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
@@ -548,6 +548,7 @@ class Atlas:
         )
         self._stress = np.zeros(len(body.nodes))
         self._state = self.new_state()
+        self._last_step: tuple[float, Weights] | None = None
 
     @classmethod
     def load(cls, path: str | Path) -> Atlas:
@@ -810,13 +811,13 @@ class Atlas:
         place(self._terms, state.bound, at, towards)
         outcome, patch = state.outcome, state.memory.patch
         self._check_place(outcome.scalars[DISTANCE], outcome.scalars[TILT])
-        weights = step_weights(self.scene.tissue.prony, dt)
+        weights = self._step_weights(dt)
         found: dict[int, Local] = {}
         moved, force_over_pressure = np.zeros(3), 0.0
         iterations, smallest, converged = 0, math.inf, True
         active = [
-            (-2 - int(patch[slot]), float(share))
-            for slot, share in enumerate(outcome.weight)
+            (-2 - number, share)
+            for number, share in zip(patch.tolist(), outcome.weight.tolist(), strict=True)
             if share > 0.0
         ]
         part = np.zeros(3)
@@ -859,6 +860,12 @@ class Atlas:
             solve_seconds=time.perf_counter() - started,
         )
         return moment, after if converged else history
+
+    def _step_weights(self, dt: float) -> Weights:
+        """Weights of a time step, which is often the last one's."""
+        if self._last_step is None or self._last_step[0] != dt:
+            self._last_step = dt, step_weights(self.scene.tissue.prony, dt)
+        return self._last_step[1]
 
     @cached_property
     def _follower(self) -> Follower:

@@ -441,10 +441,7 @@ def step_patch(patches, k, deviatoric, time, load, memory, scratch):
     if status != equilibrium.CONVERGED:
         _forget_secants(memory.secants, scratch.origin)
         return status, iterations, smallest
-    # the last evaluation was of the answer, unless there was a shorter step after it
-    for i in range(len(start)):
-        scratch.stepped[i] = start[i] * steps[i]
-    superpose(gradients, scratch.stepped, scratch.H)
+    # the last evaluation was of the answer
     drive_points(scratch.H, scratch.B)
     advance_points(scratch.B, time, memory.points)
     for a in range(terms):
