@@ -26,7 +26,11 @@ Field = NDArray[np.float32]
 FORGOTTEN = 1e-3
 """Size of what remains, over the largest, below which it is let go."""
 
-MOST_REMAINS = 16
+MOST_REMAINS = 12
+"""Moves from patch to patch that are remembered; the slowest recovery takes no longer."""
+
+MOST_PARTS = 4
+"""Patches among which a move is shared out."""
 
 Answers = list[tuple[int, float, Array]]
 
@@ -59,10 +63,10 @@ class Remains(NamedTuple):
 
 @dataclass(frozen=True)
 class Local:
-    """History of a patch in use, with what its space cannot hold in others'."""
+    """History of a patch in use, and what each move of the tool left in the spaces of others."""
 
     memory: Memory
-    remains: Mapping[int, Remains]
+    remains: tuple[Mapping[int, Remains], ...]
 
 
 @dataclass(frozen=True)
@@ -154,35 +158,66 @@ class Follower:
         self._scratch = new_scratch(self.modes, points)
         # the slowest that anything recovers
         self._slowest = self._tau.max() / (1.0 - self._share.sum())
-        self._spectra: dict[int, tuple[Array, Array, Array, Array]] = {}
+        # of D: Q, and of the terms that each of its eigenvalues couples
+        d, self._vectors = np.linalg.eigh(models.deviatoric.astype(float))
+        self._scale = np.sqrt(self._share * self._tau)
+        coupling = np.sqrt(self._share / self._tau)
+        coupled = d[:, :, None, None] * np.outer(coupling, coupling) - np.diag(1.0 / self._tau)
+        self._rates, self._coupled = np.linalg.eigh(coupled)
 
     def at_rest(self) -> Local:
         """A patch that nothing has happened to."""
-        return Local(new_memory(len(self._tau), self.modes, self._points), {})
+        return Local(new_memory(len(self._tau), self.modes, self._points), ())
 
     def follow(self, history: History, k: int) -> Local:
-        """Local history of patch k, which does not have one yet."""
+        """Local history of patch k, which does not have one yet.
+
+        What the patch that answered last remembers is projected on the space of patch k, and so is
+        what remains of earlier moves; what that space does not hold remains.
+        """
         if history.main < 0:
             return self.at_rest()
-        source = history.locals[history.main]
-        old, time = source.memory, history.time
+        source, time = history.locals[history.main], history.time
         new = new_memory(len(self._tau), self.modes, self._points)
-        remains = dict(source.remains)
-        back = remains.pop(k, None)
+        old, move = source.memory, {history.main: Remains(source.memory.mean, time)}
         T = self._overlap(k, history.main)
         if T is not None:
             new.knots[:] = old.knots @ T.T
             new.share[:] = old.share
             new.mean[:] = old.mean @ T.T
-            new.wide[:] = new.knots[-1]
             new.load[:] = T @ old.load
-            self._add(remains, k, -new.mean, time)
-        self._add(remains, history.main, old.mean, time)
-        if back is not None:
-            new.mean[:] += self._recover(k, back, time)
-        if T is not None or back is not None:
-            recall_points(self._solver, k, new, self._scratch)
+            self._add(move, k, -new.mean, time)
+        remains = [move]
+        for earlier in source.remains:
+            left = dict(earlier)
+            projected = self._projected(k, left, time)
+            if projected is not None:
+                mean, moved = projected
+                new.mean[:] += mean
+                new.knots[:] += moved  # about as far as it was while the knots were made
+                self._add(left, k, -mean, time)
+            remains.append(left)
+        new.wide[:] = new.knots[-1]
+        recall_points(self._solver, k, new, self._scratch)
         return Local(new, self._largest(remains, time))
+
+    def _projected(
+        self, k: int, left: Mapping[int, Remains], time: float
+    ) -> tuple[Array, Array] | None:
+        """Mean (terms, r) and displacement (r,) of what a move left, in the space of patch k.
+
+        None where one of its parts, which nearly make up for each other, does not meet that space.
+        """
+        overlaps = {n: self._overlap(k, n) for n in left}
+        if len(left) > MOST_PARTS or any(T is None for T in overlaps.values()):
+            return None
+        mean, moved = np.zeros((len(self._tau), self.modes)), np.zeros(self.modes)
+        for n, T in overlaps.items():
+            assert T is not None
+            own = self._recover(n, left[n], time)
+            mean += own @ T.T
+            moved += T @ (self._models.deviatoric[n] @ (self._share @ own))
+        return mean, moved
 
     def answers(self, moment: Moment) -> Answers:
         """Displacements of a moment: patch, weight and (r,) in the wide space of each part."""
@@ -208,7 +243,8 @@ class Follower:
         return [
             (n, weight, self._share @ self._recover(n, remains, moment.time))
             for _, weight, local in moment.active
-            for n, remains in local.remains.items()
+            for left in local.remains
+            for n, remains in left.items()
         ]
 
     def _overlap(self, k: int, n: int) -> Field | None:
@@ -227,15 +263,20 @@ class Follower:
             mean = mean + self._recover(k, remains[k], time)
         remains[k] = Remains(mean, time)
 
-    def _largest(self, remains: dict[int, Remains], time: float) -> dict[int, Remains]:
-        """What is worth keeping."""
-        sizes = {
-            k: float(np.linalg.norm(r.mean)) * math.exp((r.time - time) / self._slowest)
-            for k, r in remains.items()
-        }
-        least = FORGOTTEN * max(sizes.values(), default=0.0)
-        kept = sorted((k for k in sizes if sizes[k] > least), key=lambda k: -sizes[k])
-        return {k: remains[k] for k in kept[:MOST_REMAINS]}
+    def _largest(
+        self, remains: Sequence[dict[int, Remains]], time: float
+    ) -> tuple[dict[int, Remains], ...]:
+        """What is worth keeping, the latest first."""
+        sizes = [
+            max(
+                float(np.linalg.norm(r.mean)) * math.exp((r.time - time) / self._slowest)
+                for r in left.values()
+            )
+            for left in remains
+        ]
+        least = FORGOTTEN * max(sizes)
+        kept = [left for left, size in zip(remains, sizes, strict=True) if size > least]
+        return tuple(kept[:MOST_REMAINS])
 
     def _recover(self, k: int, remains: Remains, time: float) -> Array:
         """Mean (terms, r) of what remains at a time.
@@ -243,17 +284,7 @@ class Follower:
         Without a load ``u = D sum g z`` and ``tau dz/dt = u - z``, which an eigenvector of D of
         eigenvalue d turns into terms coupled by a matrix that ``sqrt(g tau)`` makes symmetric.
         """
-        Q, scale, rates, modes = self._spectrum(k)
-        y = np.einsum("rab,ra->rb", modes, (remains.mean @ Q).T * scale)
-        y *= np.exp(rates * (time - remains.time))
-        return np.asarray((np.einsum("rab,rb->ra", modes, y) / scale).T @ Q.T)
-
-    def _spectrum(self, k: int) -> tuple[Array, Array, Array, Array]:
-        if k not in self._spectra:
-            d, Q = np.linalg.eigh(self._models.deviatoric[k].astype(float))
-            scale = np.sqrt(self._share * self._tau)
-            coupling = np.sqrt(self._share / self._tau)
-            A = d[:, None, None] * np.outer(coupling, coupling) - np.diag(1.0 / self._tau)
-            rates, modes = np.linalg.eigh(A)
-            self._spectra[k] = Q, scale, rates, modes
-        return self._spectra[k]
+        Q, modes = self._vectors[k], self._coupled[k]
+        y = np.einsum("rab,ra->rb", modes, (remains.mean @ Q).T * self._scale)
+        y *= np.exp(self._rates[k] * (time - remains.time))
+        return np.asarray((np.einsum("rab,rb->ra", modes, y) / self._scale).T @ Q.T)

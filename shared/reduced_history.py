@@ -64,7 +64,7 @@ KNOTS = 8
 SYMMETRIC = 6
 """Components of a symmetric tensor, in the order of ``shared.viscosity``."""
 
-ACCURATE = 5e-4
+ACCURATE = 1e-3
 """Residual at equilibrium relative to load and past, as ``shared.reduced.TOLERANCE``."""
 
 MOST_ITERATIONS = 40
