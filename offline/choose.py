@@ -22,7 +22,7 @@ LADDER = (
     Size(patch_spacing=3.2, modes=24, cubature_points=64, region_modes=120),
     Size(patch_spacing=2.0, modes=32, cubature_points=80, region_modes=150),
     Size(patch_spacing=2.2, modes=44, cubature_points=96, region_modes=190),
-    Size(patch_spacing=1.8, modes=64, cubature_points=128, region_modes=246),
+    Size(patch_spacing=2.0, modes=56, cubature_points=112, region_modes=246),
     Size(patch_spacing=1.5, modes=80, cubature_points=176, region_modes=300),
 )
 """Sizes from the smallest to the largest; each next one has about two thirds of the error."""

@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 EXACT = 1e-9
 """Relative residual that needs no further point."""
 
+STATES = 32
+"""States whose stresses are held at once."""
+
 
 def compress(
     contributions: NDArray[np.floating[Any]], size: int, rng: np.random.Generator
@@ -142,11 +145,38 @@ def point_forces(
     return (points @ gradients)[:, 0]
 
 
-def damped_fit(A: Array, B: Array) -> Array:
-    """Least squares ``A X ~ B``, each column of A scaled to one and slightly damped."""
+def nonlinear_forces(
+    rows: NDArray[np.float32], weights: Array, mu: Array, lam: Array, states: Array
+) -> Array:
+    """Nonlinear force of all points together (k, r) at states (k, r); NaN where inverted.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (r, 9 c), 1/mm
+        Gradients of the modes in tiles.
+    weights : ndarray, shape (c,), mm^3
+    mu, lam : ndarray, shape (c,), kPa
+    states : ndarray, shape (k, r)
+    """
+    forces = np.empty(states.shape)
+    J, trace, linear = np.empty((3, len(weights)))
+    for start in range(0, len(states), STATES):
+        some = slice(start, start + STATES)
+        H = states[some].astype(np.float32) @ rows
+        P = np.empty_like(H)
+        for h, p in zip(H, P, strict=True):
+            nonlinear_stress(h, weights, mu, lam, J, trace, linear, p)
+            if not J.min() > 0.0:
+                p[:] = np.nan
+        forces[some] = P @ rows.T
+    return forces
+
+
+def damped_fit(A: Array, B: Array, damping: float = 1e-4) -> Array:
+    """Least squares ``A X ~ B``, each column of A scaled to one and damped."""
     scale = np.sqrt(np.mean(A**2, axis=0)) + 1e-300
     A = A / scale
-    ridge = 1e-4 * np.sqrt(len(A)) * np.eye(A.shape[1])
+    ridge = damping * np.sqrt(len(A)) * np.eye(A.shape[1])
     X = np.linalg.lstsq(np.vstack([A, ridge]), np.vstack([B, np.zeros((len(ridge), B.shape[1]))]))[
         0
     ]

@@ -280,6 +280,19 @@ class FullModel:
             self._at_rest = True
         return self._solver.solve(loads)
 
+    def relative_residual(self, u: Array, load: Array) -> float:
+        """What a displacement (free dofs,) mm leaves of a load, relative to it.
+
+        Both are measured as displacements in the energy of the rest state.  Infinite where the
+        displacement inverts an element.
+        """
+        try:
+            residual = load - self.internal_free(u)
+        except PalpateError:
+            return np.inf
+        energy = residual @ self.solve_linear(residual)
+        return float(np.sqrt(energy / (u @ (self.rest_stiffness @ u))))
+
     def stiffness(self, displacement: Array) -> csr_matrix:
         """Tangent stiffness (mN/mm) of the free dofs; the next call overwrites the matrix."""
         self._data[:] = 0.0

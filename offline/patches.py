@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offline.cubature import compress, damped_fit, nonnegative, point_forces
+from offline.cubature import compress, damped_fit, nonlinear_forces, nonnegative, point_forces
+from offline.full_model import FullModel
 from offline.sampling import cone, tangents
 from offline.spaces import RITZ_VECTORS, Footprint, local_modes
 from offline.tips import TipResult, compile_tip_query, train_tip
 from shared import equilibrium
 from shared.atlas import Body, LocalModels, State, assemble_patches
 from shared.bound import bind
-from shared.endoscope import LIMIT_FIELDS, TIP_DEPTH, pressure_limit
+from shared.endoscope import LIMIT_FIELDS, TIP_DEPTH, footprint, pressure_limit
 from shared.reduced import (
     ERROR_FEATURES,
     FEATURES,
@@ -25,12 +26,14 @@ from shared.reduced import (
     NARROW,
     PATH,
     PATH_FEATURES,
+    RESIDUAL_FEATURES,
     SECOND_FEATURES,
     STATUS,
     Patches,
     Terms,
     load_features,
     query,
+    residual_features,
 )
 from shared.scene import Scene, Size
 from shared.surface import Surface
@@ -47,9 +50,17 @@ most, random loads are rare."""
 OFF_EQUILIBRIUM = 0.03
 """Size of the random departure from equilibrium, relative to each mode's part in the states."""
 
-TEST_LOADS = 6
+RESIDUAL_LOADS = 64
+
+RESIDUAL_DAMPING = 0.15
+"""Of the fit of their logs: they scatter about any smooth function."""
+
+DEFECT_LOADS = 240
 
 GUESS_LOADS = 500
+
+NO_LIMIT = 1e100
+"""Largest pressure, kPa, that a local model in training answers for."""
 
 PATH_LOADS, FITTED_TILT = 24, 45.0
 """Directions of load to which a footprint's path derivatives are fitted, and their cone."""
@@ -129,8 +140,9 @@ class PatchResult:
     points: NDArray[np.int32]
     weights: Array
     path: NDArray[np.float16]
+    defect: NDArray[np.float16]
     guess: NDArray[np.float16]
-    error: float
+    residual: Array
     tip: TipResult | None = None
 
     def arrays(self) -> dict[str, Any]:
@@ -155,13 +167,14 @@ class LocalTrainer:
         self.models = models
         self.patches: Patches = assemble_patches(body, models, self.radius)
         self.state = State(self.patches, surface.clusters)
-        no_range = np.zeros((len(surface.vertices), LIMIT_FIELDS))
+        no_limit = np.tile(np.eye(LIMIT_FIELDS)[1:4].sum(0), (len(surface.vertices), 1))
+        no_limit[:, 0] = NO_LIMIT
         self.terms = bind(
             Terms(
-                ground=surface.ground(no_range),
+                ground=surface.ground(no_limit),
                 reach=scene.endoscope.reach,
                 max_tilt=scene.endoscope.max_tilt,
-                errors=models.errors,
+                residuals=models.residuals,
                 coefficients=np.zeros((2, ERROR_FEATURES)),
             )
         )
@@ -172,6 +185,13 @@ class LocalTrainer:
         state.forget()
         query(self.terms, state.bound, x, direction, pressure, self.radius)
         return bool(state.outcome.scalars[STATUS] == equilibrium.CONVERGED)
+
+    def internal_forces(self, states: Array) -> Array:
+        """What the law adds to linear elasticity's force: (k, r) in states (k, r)."""
+        patches = self.patches
+        rows = patches.gradients[0] * patches.steps[0][:, None]
+        law = patches.weights[0], patches.mu[0], patches.lam[0]
+        return nonlinear_forces(rows, *law, states)
 
     @property
     def wide(self) -> Array:
@@ -219,8 +239,9 @@ def compile_query(scene: Scene, body: Body, surface: Surface) -> None:
         points=np.zeros(1, np.int32),
         weights=np.ones(1),
         path=np.zeros((1, PATH_FEATURES, NARROW), np.float32),
+        defect=np.zeros((1, PATH_FEATURES, NARROW), np.float32),
         guess=np.zeros((1, FEATURES, LEADING + PATH), np.float32),
-        errors=np.zeros(1),
+        residuals=np.zeros((1, RESIDUAL_FEATURES)),
         extent=1.0,
         blend=1.0,
         tips=None,
@@ -233,9 +254,9 @@ def compile_query(scene: Scene, body: Body, surface: Surface) -> None:
 
 def train_patch(
     scene: Scene,
+    model: FullModel,
     body: Body,
     surface: Surface,
-    weights: Array,
     region: RegionResult,
     task: PatchTask,
 ) -> PatchResult:
@@ -244,15 +265,16 @@ def train_patch(
     Parameters
     ----------
     scene : Scene
+    model : FullModel
     body : Body
     surface : Surface
         Accessible.
-    weights : ndarray, shape (quadrature points,), mm^3
     region : RegionResult
         With the Ritz vectors of the task's footprints.
     task : PatchTask
     """
     rng = np.random.default_rng(task.seed)
+    weights = model.weights.ravel()
     frame = np.array([task.normal, *tangents(task.normal)])
     ritz = region.ritz.astype(np.float64)
     leading = local_modes(np.hstack(list(ritz)), task.size.modes)
@@ -263,23 +285,27 @@ def train_patch(
         points=np.arange(len(weights), dtype=np.int32),
         weights=weights,
         path=_fit_path(leading.T @ ritz[:, :, :RITZ_VECTORS], task, frame).astype(np.float16),
+        defect=np.zeros((PATH_FEATURES, leading.shape[1]), np.float16),
         guess=np.zeros((FEATURES, LEADING + PATH), np.float16),
-        error=0.0,
+        residual=np.zeros(RESIDUAL_FEATURES),
     )
     galerkin = local_trainer(scene, body, surface, region, task, everywhere)
     contributions = _training_forces(galerkin, scene, task, rng)[: len(weights)]
     points, chosen = _cubature(contributions, weights, task.size.cubature_points, rng)
     result = replace(everywhere, points=points.astype(np.int32), weights=chosen)
     reduced = local_trainer(scene, body, surface, region, task, result)
+    defect = _fit_defect(galerkin, reduced, scene, task, frame, rng)
+    result = replace(result, defect=defect.astype(np.float16))
+    reduced = local_trainer(scene, body, surface, region, task, result)
     guess = _fit_guess(reduced, scene, task, frame, rng)
-    error = _cubature_error(galerkin, reduced, scene, task, rng)
+    residual = _fit_residual(model, reduced, body, scene, task, frame, rng)
     tip = None
     if scene.endoscope.tip:
         tip = train_tip(
             body, surface, weights, reduced.models, region.orthonormal,
             task.contacts, task.normals, task.ranges[:, TIP_DEPTH], rng,
         )  # fmt: skip
-    return replace(result, guess=guess.astype(np.float16), error=error, tip=tip)
+    return replace(result, guess=guess.astype(np.float16), residual=residual, tip=tip)
 
 
 def local_trainer(
@@ -307,8 +333,9 @@ def local_trainer(
             points=result.points,
             weights=result.weights,
             path=result.path[None].astype(np.float32),
+            defect=result.defect[None].astype(np.float32),
             guess=result.guess[None].astype(np.float32),
-            errors=np.zeros(1),
+            residuals=np.zeros((1, RESIDUAL_FEATURES)),
             extent=task.extent,
             blend=task.blend,
             tips=None,
@@ -321,12 +348,12 @@ def _fit_path(ritz: Array, task: PatchTask, frame: Array) -> Array:
     rng = np.random.default_rng(task.seed)
     rows, second, third = [], [], []
     features = np.zeros(FEATURES)
-    for footprint, vectors in zip(task.footprints, ritz, strict=True):
-        loads = footprint.pressure * cone(footprint.normal, FITTED_TILT, PATH_LOADS, rng)
+    for place, vectors in zip(task.footprints, ritz, strict=True):
+        loads = place.pressure * cone(place.normal, FITTED_TILT, PATH_LOADS, rng)
         for load in loads:
-            load_features(frame, task.centre, footprint.point, load / task.pressure, features)
+            load_features(frame, task.centre, place.point, load / task.pressure, features)
             rows.append(features[:PATH_FEATURES].copy())
-        two, three = footprint.path_derivatives(vectors, loads)
+        two, three = place.path_derivatives(vectors, loads)
         second.append(two)
         third.append(three)
     A = np.array(rows)
@@ -338,21 +365,36 @@ def _fit_path(ritz: Array, task: PatchTask, frame: Array) -> Array:
     )
 
 
-def _cubature_error(
-    galerkin: LocalTrainer,
+def _fit_residual(
+    model: FullModel,
     reduced: LocalTrainer,
+    body: Body,
     scene: Scene,
     task: PatchTask,
+    frame: Array,
     rng: np.random.Generator,
-) -> float:
-    """Root mean square of the relative error of the cubature on other loads, energy norm."""
-    errors = []
-    for _ in range(TEST_LOADS):
-        load = random_load(scene, task, rng)
-        if galerkin.solve(*load) and reduced.solve(*load):
-            exact = galerkin.wide
-            errors.append(np.linalg.norm(reduced.wide - exact) / np.linalg.norm(exact))
-    return float(np.sqrt(np.mean(np.square(errors))))
+) -> Array:
+    """Log of the full model's relative residual (RESIDUAL_FEATURES,), by ``residual_features``."""
+    rows, logs = [], []
+    nodal, features = np.zeros(len(body.nodes)), np.zeros(RESIDUAL_FEATURES)
+    for _ in range(RESIDUAL_LOADS):
+        x, direction, limit = _limit(scene, task, rng, border=False)
+        share = np.sqrt(rng.random())
+        pressure = share * limit
+        if not reduced.solve(x, direction, pressure):
+            continue
+        outcome = reduced.state.outcome
+        footprint(body.boundary, outcome.point, outcome.normal, reduced.radius, nodal)
+        load = (pressure * nodal[:, None] * direction).ravel()[model.free]
+        residual = model.relative_residual(reduced.displacement.ravel()[model.free], load)
+        if 0 < residual < np.inf:
+            residual_features(frame, task.centre, x, direction, share, features)
+            rows.append(features.copy())
+            logs.append(np.log(residual))
+    mean = np.mean(logs)
+    fitted = damped_fit(np.array(rows), np.array(logs)[:, None] - mean, RESIDUAL_DAMPING)[:, 0]
+    fitted[0] += mean
+    return fitted
 
 
 def random_load(
@@ -425,6 +467,30 @@ def _cubature(
     A, b = compress(contributions, EQUATIONS, rng)
     chosen, x = nonnegative(A, b, most)
     return chosen, x * weights[chosen]
+
+
+def _fit_defect(
+    galerkin: LocalTrainer,
+    reduced: LocalTrainer,
+    scene: Scene,
+    task: PatchTask,
+    frame: Array,
+    rng: np.random.Generator,
+) -> Array:
+    """Force (PATH_FEATURES, r) that the cubature misses in equilibrium, relative to the answer."""
+    rows, states = [], []
+    features = np.zeros(FEATURES)
+    for _ in range(DEFECT_LOADS):
+        draw = extreme_load if rng.random() < EXTREME else random_load
+        x, direction, pressure = draw(scene, task, rng)
+        if reduced.solve(x, direction, pressure):
+            load_features(frame, task.centre, x, direction * pressure / task.pressure, features)
+            rows.append(features[:PATH_FEATURES].copy())
+            states.append(reduced.wide)
+    missed = galerkin.internal_forces(np.array(states)) - reduced.internal_forces(np.array(states))
+    scale = 1.0 / np.linalg.norm(states, axis=1, keepdims=True)
+    kept = np.isfinite(missed).all(axis=1)
+    return damped_fit((scale * rows)[kept], (scale * missed)[kept])
 
 
 def _fit_guess(

@@ -344,8 +344,9 @@ class Pipeline:
             points=np.concatenate([r.points for r in results]),
             weights=np.concatenate([r.weights for r in results]),
             path=np.stack([r.path for r in results]).astype(np.float32),
+            defect=np.stack([r.defect for r in results]).astype(np.float32),
             guess=np.stack([r.guess for r in results]).astype(np.float32),
-            errors=np.array([float(r.error) for r in results]),
+            residuals=np.stack([r.residual for r in results]),
             extent=layout.extent,
             blend=self.scene.training.blend,
             tips=_gather([r.tip for r in results]),
@@ -524,10 +525,15 @@ class Pipeline:
             "patch_path": Dataset(
                 models.path.astype(np.float16), one, "derivatives along a load path, polynomials"
             ),
+            "patch_defect": Dataset(
+                models.defect.astype(np.float16), "mN", "force that cubature misses, polynomials"
+            ),
             "patch_guess": Dataset(
                 models.guess.astype(np.float16), one, "first guess beyond the linear response"
             ),
-            "patch_errors": Dataset(models.errors, one, "relative error of cubature, energy norm"),
+            "patch_residuals": Dataset(
+                models.residuals, one, "log of the residual in the full model, polynomials"
+            ),
             "patch_extent": Dataset(np.array(models.extent), "mm", "reach of a local model"),
             "patch_blend": Dataset(np.array(models.blend), "mm", "width of blending"),
             "cubature_from": Dataset(models.point_from, one, "first point of each local model"),
@@ -597,19 +603,21 @@ def calibrate(rows: Sequence[Comparison]) -> Estimator:
     """Fit the error estimate to known errors: it covers ``COVERAGE`` of them in both quantities.
 
     A least-squares fit of their logs is raised by two constants, chosen so that the larger of the
-    two median over-estimates is least.
+    two median over-estimates is least.  What counts is how far a load lies from a fit to the
+    others, or the estimate would cover fewer of new loads.
     """
     rows = [r for r in rows if r.converged]
     X = np.array([r.features for r in rows])
+    leverage = np.sum(X * np.linalg.pinv(X).T, axis=1)
     coefficients, rests = [], []
     for name in ("displacement", "von_mises"):
         y = np.log([max(getattr(r, name), 1e-8) for r in rows])
         c = np.linalg.lstsq(X, y)[0]
         c[0] += np.median(y - X @ c)
         coefficients.append(c)
-        rests.append(y - X @ c)
+        rests.append((y - X @ c) / (1 - leverage))
     displacement, von_mises = rests
-    needed = int(np.ceil(COVERAGE * len(rows)))
+    needed = min(int(np.ceil(COVERAGE * (len(rows) + 1))), len(rows))
     best = (np.inf, np.inf)
     for shift in np.sort(von_mises)[needed - 1 :]:
         best = min(best, (np.sort(displacement[von_mises <= shift])[needed - 1], shift), key=max)

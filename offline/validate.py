@@ -39,8 +39,8 @@ class Comparison:
     pressure, limit : float, kPa
     load, tilt : float
         Fractions of the limits.
-    departure, cubature : float
-        Departure from the linear response and cubature error, see ``shared.atlas.Solution``.
+    departure, residual : float
+        Departure from the linear response and predicted residual, see ``shared.atlas.Solution``.
     features : ndarray
         Of the error estimate.
     displacement, von_mises : float
@@ -61,7 +61,7 @@ class Comparison:
     load: float
     tilt: float
     departure: float
-    cubature: float
+    residual: float
     displacement: float
     von_mises: float
     peak_displacement: float
@@ -171,7 +171,7 @@ def compare(workshop: Workshop, atlas: Atlas, load: Load, reference: Array) -> C
         load=load.pressure / solution.pressure_limit,
         tilt=solution.tilt / atlas.scene.endoscope.max_tilt,
         departure=solution.departure,
-        cubature=solution.cubature,
+        residual=solution.residual,
         displacement=relative(displacement, reference),
         von_mises=relative(stress[kept], exact[kept]),
         peak_displacement=float(np.linalg.norm(reference, axis=1).max()),

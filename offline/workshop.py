@@ -239,8 +239,7 @@ class Workshop:
 
     def patch(self, region: RegionResult, task: PatchTask) -> PatchResult:
         """Train a local model."""
-        weights = self.model.weights.ravel()
-        return train_patch(self.scene, self.body, self.surface, weights, region, task)
+        return train_patch(self.scene, self.model, self.body, self.surface, region, task)
 
     def trial(self, task: PatchTask) -> TrialResult:
         """Train a local model by itself and judge it on loads it has not seen."""

@@ -21,7 +21,6 @@ from shared.errors import QueryError
 from shared.history import Follower, History, Local, Moment, ViscousModels
 from shared.quadrature import stress_recovery, surface_quadrature, volume_quadrature
 from shared.reduced import (
-    CUBATURE,
     DEPARTURE,
     DISTANCE,
     ERROR_DISPLACEMENT,
@@ -34,6 +33,8 @@ from shared.reduced import (
     LIMIT,
     MAX_ACTIVE,
     NARROW,
+    RESIDUAL,
+    RESIDUAL_FEATURES,
     SCALARS,
     SMALLEST_J,
     STATE,
@@ -154,9 +155,12 @@ class LocalModels:
     weights : ndarray, shape (c,), mm^3
     path : ndarray, shape (p, PATH_FEATURES, r), float32
         Second and third derivative of the equilibrium along a load path, as polynomials.
+    defect : ndarray, shape (p, PATH_FEATURES, r), float32, mN
+        Force that the cubature misses in equilibrium, as polynomials of the load.
     guess : ndarray, shape (p, FEATURES, LEADING + PATH), float32
-    errors : ndarray, shape (p,)
-        Relative error of the cubature in the energy norm, on loads it was not fitted to.
+    residuals : ndarray, shape (p, RESIDUAL_FEATURES)
+        Log of the residual that answers leave in the full model, relative to them in the energy
+        norm at rest, by ``shared.reduced.residual_features``.
     extent : float, mm
         Largest distance of a contact point from the centre of a patch that answers for it.
     blend : float, mm
@@ -177,8 +181,9 @@ class LocalModels:
     points: NDArray[np.int32]
     weights: Array
     path: Field
+    defect: Field
     guess: Field
-    errors: Array
+    residuals: Array
     extent: float
     blend: float
     tips: LocalTips | None
@@ -235,6 +240,7 @@ def assemble_patches(body: Body, models: LocalModels, radius: float) -> Patches:
         face_nodes=np.vstack([r[1] for r in rows]).astype(np.int32),
         face_shape=surface.shape[near],
         path=models.path,
+        defect=models.defect,
         guess=np.pad(models.guess, ((0, 0), (0, 0), (0, NARROW - models.guess.shape[2]))),
         blend=models.blend,
     )
@@ -383,6 +389,7 @@ class State:
             stepped_state=np.zeros(r, np.float32),
             latest=np.zeros(r),
             features=np.zeros(FEATURES),
+            residual_features=np.zeros(RESIDUAL_FEATURES),
             nodal=np.zeros(int(np.diff(patches.node_from).max())),
             distance=np.zeros(patches.centres.shape[1]),
             surface=np.zeros(clusters + 6),
@@ -428,8 +435,9 @@ class Solution(NamedTuple):
         Of the direction from the inward normal.
     departure : float
         Of the answer from the linear response, relative to that, in the energy norm.
-    cubature : float
-        Cubature error of the patches that answer.
+    residual : float
+        That such answers leave in the full model, relative to them in the energy norm at rest, as
+        the patches learnt it.
     pressure, radius : float
         kPa at the footprint's centre, mm.
     pressure_limit : float, kPa
@@ -461,7 +469,7 @@ class Solution(NamedTuple):
     direction: Array
     tilt: float
     departure: float
-    cubature: float
+    residual: float
     pressure: float
     radius: float
     pressure_limit: float
@@ -538,7 +546,7 @@ class Atlas:
             ground=surface.ground(limits),
             reach=scene.endoscope.reach,
             max_tilt=scene.endoscope.max_tilt,
-            errors=models.errors,
+            residuals=models.residuals,
             coefficients=estimator.coefficients,
         )
         self._terms = bind(terms)
@@ -602,8 +610,9 @@ class Atlas:
                 points=arrays["cubature_points"],
                 weights=arrays["cubature_weights"],
                 path=arrays["patch_path"].astype(np.float32),
+                defect=arrays["patch_defect"].astype(np.float32),
                 guess=arrays["patch_guess"].astype(np.float32),
-                errors=arrays["patch_errors"],
+                residuals=arrays["patch_residuals"],
                 extent=float(arrays["patch_extent"]),
                 blend=float(arrays["patch_blend"]),
                 tips=_local_tips(arrays) if scene.endoscope.tip else None,
@@ -696,7 +705,7 @@ class Atlas:
             direction=record[_DIRECTION],
             tilt=tilt,
             departure=scalars[DEPARTURE],
-            cubature=scalars[CUBATURE],
+            residual=scalars[RESIDUAL],
             pressure=pressure,
             radius=radius,
             pressure_limit=limit,

@@ -26,6 +26,10 @@ that is small where the load is small, and lives near the contact, where the poi
 points and their own weights, and all modes, this is the Galerkin model; tissue law, load footprint
 and Newton's method are those of the full model.
 
+What the points still miss of the internal force in equilibrium, the *defect* of the cubature, is a
+smooth function of the load.  It is fitted by polynomials on each patch and taken off ``f``: the
+state at which the points are in equilibrium with the rest is that of the Galerkin model.
+
 A *warm* query, whose patch answered the last one too, is *followed* in the wide space itself: the
 rest stiffness there is the identity, and each residual shows a direction of the tangent, so a few
 secants (BFGS) make up for a tangent that is never formed.
@@ -513,6 +517,7 @@ class Patches(NamedTuple):
     face_nodes: NDArray[np.int32]  # (g, k), counted from the patch's first node
     face_shape: Array  # (g, k)
     path: Field  # (p, PATH_FEATURES, r) second and third derivative along the load path
+    defect: Field  # (p, PATH_FEATURES, r) force that the points miss, by load_features
     guess: Field  # (p, FEATURES, NARROW), the last column zero
     blend: float  # mm, excess distance over the nearest centre at which a patch fades out
 
@@ -550,6 +555,33 @@ def load_features(frame, centre, x, load, out):
                 out[k + 4] = monomial * s * t
                 out[k + 5] = monomial * t * t
                 k += POSITION_FEATURES
+
+
+RESIDUAL_FEATURES = 16
+
+LEAST_LOAD = 1e-2
+"""Share of the largest trained pressure below which residuals are taken for those there."""
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def residual_features(frame, centre, x, direction, share, out):
+    """What the residual of an answer depends on, (RESIDUAL_FEATURES,).
+
+    Monomials up to degree 2 in the position on the patch (mm from the centre) and in the two
+    tangential components of the unit direction, and the load's share of the largest trained
+    pressure, as it is and its log.
+    """
+    s = t = b = c = 0.0
+    for i in range(3):
+        s += frame[1, i] * (x[i] - centre[i])
+        t += frame[2, i] * (x[i] - centre[i])
+        b += frame[1, i] * direction[i]
+        c += frame[2, i] * direction[i]
+    share = min(max(share, LEAST_LOAD), 1.0)
+    log = math.log(share)
+    out[0], out[1], out[2], out[3], out[4], out[5] = 1.0, s, t, s * s, s * t, t * t
+    out[6], out[7], out[8], out[9], out[10] = b, c, b * b, b * c, c * c
+    out[11], out[12], out[13], out[14], out[15] = share, share**2, log, log * b, log * c
 
 
 class Memory(NamedTuple):
@@ -590,6 +622,7 @@ class Scratch(NamedTuple):
     stepped_state: Field  # (r,)
     latest: Array  # (r,)
     features: Array  # (FEATURES,)
+    residual_features: Array  # (RESIDUAL_FEATURES,)
     nodal: Array  # (most nodes of a patch,)
     distance: Array  # (p,)
     surface: Array  # (clusters of triangles + 6,)
@@ -617,7 +650,7 @@ ERROR_FEATURES = 11
     SMALLEST_J,
     AREA,
     DEPARTURE,
-    CUBATURE,
+    RESIDUAL,
     ENERGY,
     DISTANCE,
     TILT,
@@ -643,7 +676,7 @@ class Terms(NamedTuple):
     ground: Ground  # values at its vertices: the load range
     reach: float  # mm, farthest position from the surface
     max_tilt: float  # degrees
-    errors: Array  # (p,) of the patches' cubature
+    residuals: Array  # (p, RESIDUAL_FEATURES) log of the residual, by residual_features
     coefficients: Array  # (2, ERROR_FEATURES): displacement, von Mises
 
 
@@ -743,12 +776,23 @@ def _append(number, steps, scratch):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _path_modes(patches, k, x, direction, pressure, scratch):
+def _balance(defect, inside, features, load):
+    """Take the cubature's defect off a load (r,) mN.
+
+    ``inside`` is the largest trained pressure over that of the load, at most 1: beyond the range
+    the defect stays what it is at its end.
+    """
+    second, third = inside**2, inside**3
+    for f in range(PATH_FEATURES):
+        feature = np.float32(features[f] * (second if f < SECOND_FEATURES else third))
+        row = defect[f]
+        for i in range(len(load)):
+            load[i] -= feature * row[i]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _path_modes(patches, k, scratch):
     """Modes of the narrow space of patch k for ``scratch.wide_load``, but the residual."""
-    load = scratch.scaled_load
-    for i in range(3):
-        load[i] = direction[i] * pressure / patches.pressures[k]
-    load_features(patches.frames[k], patches.centres[:, k], x, load, scratch.features)
     scratch.load[:] = 0.0
     scratch.load[:LEADING] = scratch.wide_load[:LEADING]
     first, second, third = scratch.vectors[0], scratch.vectors[1], scratch.vectors[2]
@@ -834,9 +878,15 @@ def _merge(scratch):
 
 
 @njit(inline="always")
-def _solve_patch(patches, k, slot, warm, x, direction, pressure, memory, scratch, scalars):
+def _solve_patch(patches, k, slot, warm, x, direction, pressure, limit, memory, scratch, scalars):
     """Equilibrium of patch k under ``scratch.wide_load``; its answer goes to memory's slot."""
-    _path_modes(patches, k, x, direction, pressure, scratch)
+    for i in range(3):
+        scratch.scaled_load[i] = direction[i] * pressure / patches.pressures[k]
+    frame, centre = patches.frames[k], patches.centres[:, k]
+    load_features(frame, centre, x, scratch.scaled_load, scratch.features)
+    inside = limit / pressure if pressure > limit else 1.0
+    _balance(patches.defect[k], inside, scratch.features, scratch.wide_load)
+    _path_modes(patches, k, scratch)
     _first_guess(patches.guess[k], scratch)
     wide, guess, start, load = (
         memory.wide[slot],
@@ -962,7 +1012,7 @@ def _solve_narrow(patches, k, size, wide, scratch):
 
 
 @njit(inline="always")
-def _answer(solver, x, normal, direction, pressure, radius):
+def _answer(solver, x, normal, direction, pressure, limit, radius):
     patches, memory, scratch, outcome = (
         solver.patches, solver.memory, solver.scratch, solver.outcome,
     )  # fmt: skip
@@ -981,7 +1031,9 @@ def _answer(solver, x, normal, direction, pressure, radius):
             k = -2 - k
         area = _wide_load(patches, k, x, normal, direction, pressure, radius, scratch)
         scalars[AREA] = area
-        _solve_patch(patches, k, slot, warm, x, direction, pressure, memory, scratch, scalars)
+        _solve_patch(
+            patches, k, slot, warm, x, direction, pressure, limit, memory, scratch, scalars
+        )
         if area > 0.0:
             wide, unit = memory.wide[slot], scratch.unit_loads
             for i in range(3):
@@ -1022,7 +1074,7 @@ def query(terms, solver, position, direction, pressure, radius):
     tilt = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
     limit = pressure_limit(outcome.range, normal, towards)
     if distance <= terms.reach and tilt < 90.0:
-        _answer(solver, x, normal, towards, pressure, radius)
+        _answer(solver, x, normal, towards, pressure, limit, radius)
         _estimate(terms, solver, pressure / limit, tilt / max(terms.max_tilt, 1.0), pressure)
     scalars[DISTANCE], scalars[TILT], scalars[LIMIT] = distance, tilt, limit
 
@@ -1032,26 +1084,31 @@ def _estimate(terms, solver, load, tilt, pressure):
     """Force and estimated errors of an answer: ``log error = c . features``.
 
     The features: 1, tilt over the largest, smallest det F, the normal (where on the body), and the
-    logs of the pressure over its limit, of the departure from the linear response, of the patch's
-    cubature error, of the contact's displacement over pressure (mm/kPa) and of the displacement in
-    the energy norm.
+    logs of the pressure over its limit, of the departure from the linear response, of the residual
+    that such answers leave in the full model, of the contact's displacement over pressure (mm/kPa)
+    and of the displacement in the energy norm.
     """
     outcome, patch = solver.outcome, solver.memory.patch
     scalars, features = outcome.scalars, outcome.features
-    moved = cubature = 0.0
+    patches, looked_at = solver.patches, solver.scratch.residual_features
+    moved = residual = 0.0
     for i in range(3):
         outcome.force[i] = pressure * scalars[AREA] * outcome.direction[i]
         moved += outcome.displacement[i] ** 2
     for slot in range(MAX_ACTIVE):
         if outcome.weight[slot] > 0.0:
-            k = patch[slot]
-            cubature += outcome.weight[slot] * terms.errors[k if k >= 0 else -2 - k]
+            k = patch[slot] if patch[slot] >= 0 else -2 - patch[slot]
+            residual_features(
+                patches.frames[k], patches.centres[:, k], outcome.point, outcome.direction, load,
+                looked_at,
+            )  # fmt: skip
+            residual += outcome.weight[slot] * np.dot(terms.residuals[k], looked_at)
     compliance = math.sqrt(moved) / max(pressure, 1e-6)
-    scalars[CUBATURE] = cubature
+    scalars[RESIDUAL] = math.exp(residual)
     features[0], features[1], features[2] = 1.0, tilt, scalars[SMALLEST_J]
     features[3:6] = outcome.normal
     features[6], features[7] = math.log(max(load, 1e-6)), math.log(max(scalars[DEPARTURE], 1e-6))
-    features[8], features[9] = math.log(max(cubature, 1e-6)), math.log(max(compliance, 1e-6))
+    features[8], features[9] = residual, math.log(max(compliance, 1e-6))
     features[10] = math.log(max(scalars[ENERGY], 1e-6))
     scalars[ERROR_DISPLACEMENT] = math.exp(np.dot(terms.coefficients[0], features))
     scalars[ERROR_VON_MISES] = math.exp(np.dot(terms.coefficients[1], features))

@@ -391,7 +391,7 @@ def _details(solution: Solution) -> dict[str, Any]:
         "tilt": solution.tilt,
         "iterations": solution.iterations,
         "departure": solution.departure,
-        "cubature": solution.cubature,
+        "residual": solution.residual,
         "min_jacobian": solution.min_jacobian,
         "estimated_displacement": solution.error_displacement,
         "estimated_von_mises": solution.error_von_mises,

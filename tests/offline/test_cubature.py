@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from offline.cubature import compress, nonnegative
+from offline.cubature import STATES, compress, nonlinear_forces, nonnegative, point_forces
+from shared.reduced import LANES
 
 POINTS, EQUATIONS = 300, 20
 
@@ -67,3 +68,21 @@ def test_compression_keeps_what_matters(rng):
     for x in rng.standard_normal((10, POINTS)):
         exact = np.linalg.norm(contributions.T @ x)
         assert np.linalg.norm(A @ x) == pytest.approx(exact, rel=1e-3)
+
+
+def test_forces_of_all_points_are_the_sum_of_each_ones(rng):
+    count, modes = 2 * LANES, 8
+    gradients = rng.standard_normal((count, 9, modes)).astype(np.float32)
+    tiles = gradients.reshape(2, LANES, 9, modes)
+    rows = np.ascontiguousarray(tiles.transpose(3, 0, 2, 1)).reshape(modes, -1)
+    law = rng.uniform(1.0, 2.0, (3, count))
+    states = 0.02 * rng.standard_normal((STATES + 3, modes))
+    states[1] *= 100.0  # turns points inside out
+    together = nonlinear_forces(rows, *law, states)
+    for state, force in zip(states, together, strict=True):
+        each = point_forces(gradients, *law, state)
+        if each is None:
+            assert np.isnan(force).all()
+        else:
+            np.testing.assert_allclose(force, each.sum(axis=0), rtol=1e-4, atol=1e-5)
+    assert np.isnan(together).any(axis=1).sum() == 1

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numba import njit
 
+from offline.patches import LocalTrainer
 from offline.workshop import Load, Workshop
 from shared import equilibrium
 from shared.artifact import read_artifact
@@ -41,6 +42,7 @@ def galerkin(atlas, workshop):
         points=np.arange(len(weights), dtype=np.int32),
         weights=weights,
         path=models.path[:1],
+        defect=np.zeros_like(models.defect[:1]),
         guess=models.guess[:1],
     )
 
@@ -179,6 +181,50 @@ def test_correction_solves_with_the_tangent(patches, state, rng, shift):
 
 
 # --- answers -------------------------------------------------------------------------------------
+
+
+def test_points_and_defect_together_answer_as_all_points(atlas, galerkin):
+    models, k = atlas.models, 0
+    own = slice(models.point_from[k], models.point_from[k + 1])
+    few = replace(
+        galerkin,
+        point_from=np.array([0, own.stop - own.start]),
+        points=models.points[own],
+        weights=models.weights[own],
+    )
+    balanced = replace(few, defect=models.defect[[k]])
+    trainers = [
+        LocalTrainer(atlas.scene, atlas.body, atlas.surface, local)
+        for local in (galerkin, few, balanced)
+    ]
+    centre = models.centres[k]
+    limit = atlas.solve(centre, 1.0).pressure_limit
+    inward = -models.frames[k, 0]
+    errors = []
+    for share in np.linspace(0.3, 1.0, 8):
+        for trainer in trainers:
+            assert trainer.solve(centre, inward, share * limit)
+        exact, *others = (trainer.wide for trainer in trainers)
+        errors.append([norm(wide - exact) / norm(exact) for wide in others])
+    without, fitted = np.mean(errors, axis=0)
+    assert fitted < 0.5 * without
+
+
+def test_beyond_the_range_the_defect_stays_what_it_is_at_its_end(atlas):
+    centre = atlas.models.centres[0]
+    limit = atlas.solve(centre, 1.0).pressure_limit
+
+    def load(share):
+        state = atlas.new_state()
+        assert len(atlas.solve(centre, share * limit, state=state).patches) == 1
+        return state.scratch.wide_load.copy()
+
+    def bend(*shares):
+        first, middle, last = (load(share) for share in shares)
+        return norm(first - 2 * middle + last) / norm(last)
+
+    assert bend(1.0, 1.25, 1.5) < 1e-6
+    assert bend(0.5, 0.75, 1.0) > 1e-5
 
 
 @pytest.fixture(scope="module")
