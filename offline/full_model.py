@@ -181,11 +181,12 @@ class FullModel:
     @cached_property
     def relaxed(self) -> FullModel:
         """The model of what the tissue is after an infinite time, elastic."""
+        if not self.prony:
+            return self
         other = replace(self, prony=())
-        if self.prony:
-            other._past = np.zeros((*self.weights.shape, viscosity.COMPONENTS))
-            at_rest, weights = self.at_rest.points, viscosity.step_weights(self.prony, np.inf)
-            assembly.predict(at_rest, weights, other._past)
+        other._past = np.zeros((*self.weights.shape, viscosity.COMPONENTS))
+        at_rest, weights = self.at_rest.points, viscosity.step_weights(self.prony, np.inf)
+        assembly.predict(at_rest, weights, other._past)
         return other
 
     @property

@@ -92,7 +92,16 @@ def one_patch(atlas, prony, workshop, middle):
             models,
             **{
                 name: getattr(models, name)[[k]]
-                for name in ("centres", "frames", "pressures", "modes", "path", "defect", "guess", "residuals")
+                for name in (
+                    "centres",
+                    "frames",
+                    "pressures",
+                    "modes",
+                    "path",
+                    "defect",
+                    "guess",
+                    "residuals",
+                )
             },
             basis=models.basis[models.region[[k]]],
             steps=models.steps[models.region[[k]]],
