@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import qr_delete, solve_triangular
+from scipy.linalg import qr_delete, solve, solve_triangular
 
 from shared.reduced import LANES, nonlinear_stress
 
@@ -176,8 +176,5 @@ def damped_fit(A: Array, B: Array, damping: float = 1e-4) -> Array:
     """Least squares ``A X ~ B``, each column of A scaled to one and damped."""
     scale = np.sqrt(np.mean(A**2, axis=0)) + 1e-300
     A = A / scale
-    ridge = damping * np.sqrt(len(A)) * np.eye(A.shape[1])
-    X = np.linalg.lstsq(np.vstack([A, ridge]), np.vstack([B, np.zeros((len(ridge), B.shape[1]))]))[
-        0
-    ]
-    return X / scale[:, None]
+    normal = A.T @ A + damping**2 * len(A) * np.eye(A.shape[1])
+    return np.asarray(solve(normal, A.T @ B, assume_a="pos")) / scale[:, None]

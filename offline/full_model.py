@@ -281,18 +281,21 @@ class FullModel:
             self._at_rest = True
         return self._solver.solve(loads)
 
-    def relative_residual(self, u: Array, load: Array) -> float:
-        """What a displacement (free dofs,) mm leaves of a load, relative to it.
+    def relative_residuals(self, displacements: Array, loads: Array) -> Array:
+        """What displacements (k, free dofs) mm leave of loads (k, free dofs) mN, relative to them.
 
-        Both are measured as displacements in the energy of the rest state.  Infinite where the
+        Both are measured as displacements in the energy of the rest state; infinite where the
         displacement inverts an element.
         """
-        try:
-            residual = load - self.internal_free(u)
-        except PalpateError:
-            return np.inf
-        energy = residual @ self.solve_linear(residual)
-        return float(np.sqrt(energy / (u @ (self.rest_stiffness @ u))))
+        left, sound = np.zeros_like(loads), np.ones(len(loads), dtype=bool)
+        for i, (u, load) in enumerate(zip(displacements, loads, strict=True)):
+            try:
+                left[i] = load - self.internal_free(u)
+            except PalpateError:
+                sound[i] = False
+        energies = np.sum(left.T * self.solve_linear(left.T), axis=0)
+        own = np.sum(displacements.T * (self.rest_stiffness @ displacements.T), axis=0)
+        return np.where(sound, np.sqrt(energies / own), np.inf)
 
     def stiffness(self, displacement: Array) -> csr_matrix:
         """Tangent stiffness (mN/mm) of the free dofs; the next call overwrites the matrix."""

@@ -199,10 +199,15 @@ class LocalTrainer:
         return self.state.memory.wide[0].copy()
 
     @property
+    def nodal_modes(self) -> NDArray[np.float32]:
+        """Wide modes (r, 3 n) at the nodes."""
+        modes = self.models.steps[0][:, None] * self.models.modes[0]
+        return np.asarray(modes.T @ self.models.basis[0].astype(np.float32))
+
+    @property
     def displacement(self) -> Array:
         """Last answer at the nodes, (n, 3) mm."""
-        modes = self.models.steps[0][:, None] * self.models.modes[0]
-        return (self.wide @ modes.T @ self.models.basis[0]).reshape(-1, 3)
+        return np.asarray(self.wide @ self.nodal_modes).reshape(-1, 3)
 
     @property
     def load_size(self) -> float:
@@ -375,25 +380,24 @@ def _fit_residual(
     rng: np.random.Generator,
 ) -> Array:
     """Log of the full model's relative residual (RESIDUAL_FEATURES,), by ``residual_features``."""
-    rows, logs = [], []
+    rows, states, loads = [], [], []
     nodal, features = np.zeros(len(body.nodes)), np.zeros(RESIDUAL_FEATURES)
     for _ in range(RESIDUAL_LOADS):
         x, direction, limit = _limit(scene, task, rng, border=False)
         share = np.sqrt(rng.random())
-        pressure = share * limit
-        if not reduced.solve(x, direction, pressure):
-            continue
-        outcome = reduced.state.outcome
-        footprint(body.boundary, outcome.point, outcome.normal, reduced.radius, nodal)
-        load = (pressure * nodal[:, None] * direction).ravel()[model.free]
-        residual = model.relative_residual(reduced.displacement.ravel()[model.free], load)
-        if 0 < residual < np.inf:
+        if reduced.solve(x, direction, share * limit):
+            outcome = reduced.state.outcome
+            footprint(body.boundary, outcome.point, outcome.normal, reduced.radius, nodal)
             residual_features(frame, task.centre, x, direction, share, features)
             rows.append(features.copy())
-            logs.append(np.log(residual))
-    mean = np.mean(logs)
-    fitted = damped_fit(np.array(rows), np.array(logs)[:, None] - mean, RESIDUAL_DAMPING)[:, 0]
-    fitted[0] += mean
+            states.append(reduced.wide)
+            loads.append((share * limit * nodal[:, None] * direction).ravel())
+    answers = np.array(states) @ reduced.nodal_modes
+    residuals = model.relative_residuals(answers[:, model.free], np.array(loads)[:, model.free])
+    kept = (residuals > 0) & np.isfinite(residuals)
+    logs = np.log(residuals[kept])
+    fitted = damped_fit(np.array(rows)[kept], (logs - logs.mean())[:, None], RESIDUAL_DAMPING)[:, 0]
+    fitted[0] += logs.mean()
     return fitted
 
 
