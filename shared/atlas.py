@@ -18,7 +18,7 @@ from shared.artifact import Artifact, ArtifactError, read_artifact
 from shared.bound import bind
 from shared.endoscope import LIMIT_FIELDS, TIP_DEPTH, SurfaceQuadrature
 from shared.errors import QueryError
-from shared.history import Follower, History, Local, Moment, ViscousModels
+from shared.history import History, Moment, Stepper, ViscousModels
 from shared.quadrature import stress_recovery, surface_quadrature, volume_quadrature
 from shared.reduced import (
     DEPARTURE,
@@ -50,7 +50,7 @@ from shared.reduced import (
     expand,
     query,
 )
-from shared.reduced_history import copied, new_scratch, place, step_at
+from shared.reduced_history import place
 from shared.scene import Scene, SceneError, parse_scene
 from shared.stress import nodal_von_mises, nodal_von_mises_after, remember, remember_linearly
 from shared.surface import Ground, Surface, boundary_triangles
@@ -790,7 +790,7 @@ class Atlas:
         history : History
             ``History()`` is rest. It is not changed.
         dt : float, s
-            May be 0, for a sudden change, or infinite.
+            May be 0, for a sudden change.
         position : array_like, shape (3,), mm, optional
             As in ``solve``; without it nothing presses.
         pressure, direction, radius
@@ -805,49 +805,28 @@ class Atlas:
         Raises
         ------
         QueryError
-            As ``solve``, or if the tissue is elastic, or ``dt`` negative or not a number.
+            As ``solve``, or if the tissue is elastic, or ``dt`` negative or not finite.
         """
         started = time.perf_counter()
         if self.models.viscous is None:
             raise QueryError("time", f"scene {self.name!r} is elastic and knows none")
-        if not dt >= 0.0:
-            raise QueryError("time", f"steps must be >= 0 s, not {dt}")
+        if not 0.0 <= dt < math.inf:
+            raise QueryError("time", f"steps must be >= 0 s and finite, not {dt}")
         if position is None:
             last = history.position
             position, pressure = self.surface.vertices[0] if last is None else last, 0.0
         at, towards, radius = self._checked(position, pressure, direction, radius)
         state = self._state
         place(self._terms, state.bound, at, towards)
-        outcome, patch = state.outcome, state.memory.patch
-        self._check_place(outcome.scalars[DISTANCE], outcome.scalars[TILT])
-        weights = self._step_weights(dt)
-        found: dict[int, Local] = {}
-        moved, force_over_pressure = np.zeros(3), 0.0
-        iterations, smallest, converged = 0, math.inf, True
-        active = [
-            (-2 - number, share)
-            for number, share in zip(patch.tolist(), outcome.weight.tolist(), strict=True)
-            if share > 0.0
-        ]
-        part = np.zeros(3)
-        for k, share in active:
-            local = history.locals.get(k) or self._follower.follow(history, k)
-            memory = copied(local.memory)
-            status, count, least, area = step_at(
-                state.bound, k, pressure, radius, self.models.viscous.deviatoric[k], weights,
-                memory, self._past_scratch, part,
-            )  # fmt: skip
-            found[k] = Local(memory, local.remains)
-            moved += share * part
-            force_over_pressure = area
-            iterations, smallest = max(iterations, count), min(smallest, least)
-            converged = converged and status == equilibrium.CONVERGED
         record = state.record.copy()
         scalars = record[_SCALARS].tolist()
+        self._check_place(scalars[DISTANCE], scalars[TILT])
+        numbers, shares = state.memory.patch.tolist(), record[_WEIGHT].tolist()
+        active = [(-2 - k, share) for k, share in zip(numbers, shares, strict=True) if share > 0.0]
+        found = self._stepper.press(history, active, pressure, radius, self._step_weights(dt))
+        main = max(active, key=lambda pair: pair[1])[0]
+        after = History(history.time + dt, found.locals, main, record[_POINT])
         out_of_range = self._out_of_range(at, record, scalars, pressure, radius)
-        after = History(
-            history.time + dt, found, max(active, key=lambda pair: pair[1])[0], record[_POINT]
-        )
         moment = Moment(
             time=after.time,
             contact_point=record[_POINT],
@@ -858,17 +837,17 @@ class Atlas:
             pressure=pressure,
             radius=radius,
             pressure_limit=scalars[LIMIT],
-            force=pressure * force_over_pressure * record[_DIRECTION],
-            contact_displacement=moved,
-            converged=converged,
-            iterations=iterations,
+            force=pressure * found.area * record[_DIRECTION],
+            contact_displacement=found.displacement,
+            converged=found.converged,
+            iterations=found.iterations,
             in_range=not out_of_range,
             out_of_range=out_of_range,
-            min_jacobian=smallest,
-            active=tuple((k, share, found[k]) for k, share in active),
+            min_jacobian=found.min_jacobian,
+            active=tuple((k, share, found.locals[k]) for k, share in active),
             solve_seconds=time.perf_counter() - started,
         )
-        return moment, after if converged else history
+        return moment, after if moment.converged else history
 
     def _step_weights(self, dt: float) -> Weights:
         """Weights of a time step, which is often the last one's."""
@@ -877,14 +856,10 @@ class Atlas:
         return self._last_step[1]
 
     @cached_property
-    def _follower(self) -> Follower:
+    def _stepper(self) -> Stepper:
         assert self.models.viscous is not None, "or there would be no history"
         points = self.patches.weights.shape[1]
-        return Follower(self._state.bound, self.models.viscous, self.scene.tissue.prony, points)
-
-    @cached_property
-    def _past_scratch(self) -> Any:
-        return new_scratch(self._follower.modes, self.patches.weights.shape[1])
+        return Stepper(self._state.bound, self.models.viscous, self.scene.tissue.prony, points)
 
     @cached_property
     def tips(self) -> TipModels | None:
@@ -930,7 +905,7 @@ class Atlas:
     def coefficients(self, solution: Solution | Touch | Moment) -> dict[int, Field]:
         """Displacement as coefficients (M,) in the basis of each region that takes part."""
         if isinstance(solution, Moment):
-            return self._by_region(self.models.modes, self._follower.answers(solution))
+            return self._by_region(self.models.modes, self._stepper.answers(solution))
         modes = self.models.modes
         if isinstance(solution, Touch):
             assert self.models.tips is not None, "or there would be no such answer"
@@ -984,9 +959,9 @@ class Atlas:
     def _remembered(self, moment: Moment) -> Array:
         """``B`` of ``shared.viscosity`` (e, 6, 8) at the points of all elements."""
         B = np.zeros((len(self.body.elements), 6, 8))
-        for k, share, knot in self._follower.knots(moment):
+        for k, share, knot in self._stepper.knots(moment):
             remember(self._recovery, self._expanded([(k, 1.0, knot)]), share, B)
-        lasting = self._follower.lasting(moment)
+        lasting = self._stepper.lasting(moment)
         if lasting:
             remember_linearly(self._recovery, self._expanded(lasting), B)
         return B

@@ -13,12 +13,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from shared import equilibrium
 from shared.reduced_history import (
     Memory,
+    copied,
     new_memory,
     new_scratch,
     recall_points,
+    step_at,
 )
+from shared.viscosity import Weights
 
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
@@ -130,8 +134,19 @@ class Moment(NamedTuple):
     solve_seconds: float
 
 
-class Follower:
-    """Takes histories from patch to patch.
+class Pressed(NamedTuple):
+    """What pressing some patches for a time step has led to."""
+
+    locals: dict[int, Local]
+    displacement: Array  # (3,) mm, of the contact
+    area: float  # mm^2, force over pressure
+    converged: bool
+    iterations: int
+    min_jacobian: float
+
+
+class Stepper:
+    """Takes histories from step to step and from patch to patch.
 
     Parameters
     ----------
@@ -164,6 +179,31 @@ class Follower:
         coupling = np.sqrt(self._share / self._tau)
         coupled = d[:, :, None, None] * np.outer(coupling, coupling) - np.diag(1.0 / self._tau)
         self._rates, self._coupled = np.linalg.eigh(coupled)
+
+    def press(
+        self,
+        history: History,
+        active: Sequence[tuple[int, float]],
+        pressure: float,
+        radius: float,
+        weights: Weights,
+    ) -> Pressed:
+        """Press patches (number and weight) where ``place`` has found, at the end of a step."""
+        found: dict[int, Local] = {}
+        moved, part = np.zeros(3), np.zeros(3)
+        iterations, smallest, converged, area = 0, math.inf, True, 0.0
+        for k, share in active:
+            local = history.locals.get(k) or self.follow(history, k)
+            memory = copied(local.memory)
+            status, count, least, area = step_at(
+                self._solver, k, pressure, radius, self._models.deviatoric[k], weights,
+                memory, self._scratch, part,
+            )  # fmt: skip
+            found[k] = Local(memory, local.remains)
+            moved += share * part
+            iterations, smallest = max(iterations, count), min(smallest, least)
+            converged = converged and status == equilibrium.CONVERGED
+        return Pressed(found, moved, area, converged, iterations, smallest)
 
     def at_rest(self) -> Local:
         """A patch that nothing has happened to."""

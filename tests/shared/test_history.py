@@ -207,7 +207,7 @@ def test_what_remains_recovers_like_a_patch_under_small_loads(one_patch, atlas):
     for _ in range(200):
         patch.step(0.0, 0.005)
     k = int(np.argmin(np.linalg.norm(atlas.models.centres - patch.x, axis=1)))
-    recovered = atlas._follower._recover(k, start, 1.0)
+    recovered = atlas._stepper._recover(k, start, 1.0)
     expected = patch.memory.mean
     assert np.linalg.norm(expected) < 0.7 * np.linalg.norm(start.mean)
     assert np.linalg.norm(recovered - expected) <= 0.01 * np.linalg.norm(expected)
@@ -308,7 +308,7 @@ def test_a_long_rest_leaves_nothing(atlas, middle):
 def test_sudden_reversal_and_extreme_steps_have_answers(atlas, middle):
     x, limit = middle
     history = History()
-    for share, dt in ((1.0, 0.0), (0.0, 0.0), (1.0, 1e-9), (1.0, 1e9), (0.0, 1e-3), (1.0, np.inf)):
+    for share, dt in ((1.0, 0.0), (0.0, 0.0), (1.0, 1e-9), (1.0, 1e9), (0.0, 1e-3)):
         moment, history = atlas.step(history, dt, x, share * limit)
         assert moment.converged
         assert np.all(np.isfinite(atlas.displacement(moment)))
@@ -332,6 +332,7 @@ def test_beyond_the_range_is_flagged_and_never_nan(atlas, middle):
     [
         ({"dt": -1.0}, "time"),
         ({"dt": float("nan")}, "time"),
+        ({"dt": float("inf")}, "time"),
         ({"dt": 0.1, "position": [5.0, 5.0, 99.0], "pressure": 1.0}, "position"),
         ({"dt": 0.1, "position": [5.0, 5.0, 8.0], "pressure": -1.0}, "pressure"),
         ({"dt": 0.1, "position": [5.0, 5.0, 8.0], "direction": [0.0, 0.0, 1.0]}, "direction"),
