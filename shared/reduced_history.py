@@ -291,6 +291,18 @@ def advance_points(m, weights, history):
         last[i] = m[i]
 
 
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def multiply(A, x, out):
+    """``out = A x``: A (4 k, 4 k) float32, symmetric; x, out (4 k,)."""
+    for i in range(len(out)):
+        out[i] = 0.0
+    for j in range(0, len(A), 4):
+        a, b, c, d = x[j], x[j + 1], x[j + 2], x[j + 3]
+        p, q, r, s = A[j], A[j + 1], A[j + 2], A[j + 3]
+        for i in range(len(out)):
+            out[i] += a * p[i] + b * q[i] + c * r[i] + d * s[i]
+
+
 # --- a step of one local model as a system for shared.equilibrium --------------------------------
 
 
@@ -340,12 +352,11 @@ def _potential(system, u, residual):
         add_past_stress(system.H, weights, mu, J, system.B, system.S, system.loss, trace, system.P)
         energy += np.dot(weights, trace)
         project(system.gradients, system.P, residual)
+        softer = system.change  # its room; the secants need it later
+        multiply(system.deviatoric, u, softer)
         for i in range(len(u)):
             system.latest[i] = u[i]
-            row, softer = system.deviatoric[i], 0.0
-            for j in range(len(u)):
-                softer += row[j] * u[j]
-            stiff = u[i] - system.loss * softer
+            stiff = u[i] - system.loss * softer[i]
             residual[i] = residual[i] * steps[i] + stiff - system.load[i]
             energy += (0.5 * stiff - system.load[i]) * u[i]
         return energy, smallest
@@ -408,13 +419,11 @@ def step_patch(patches, k, deviatoric, time, load, memory, scratch):
         scratch.stepped[i] = past[i] * steps[i]
     superpose(gradients, scratch.stepped, scratch.H)
     loss = predict_points(scratch.H, memory.points, time, mu, scratch.B, scratch.S)
-    size = 0.0
+    exerted, size = scratch.change, 0.0
+    multiply(deviatoric, past, exerted)
     for i in range(len(past)):
-        exerted = 0.0
-        for j in range(len(past)):
-            exerted += deviatoric[i, j] * past[j]
-        scratch.load[i] = load[i] + exerted
-        size += max(load[i] ** 2, exerted**2)
+        scratch.load[i] = load[i] + exerted[i]
+        size += max(load[i] ** 2, exerted[i] ** 2)
     target = ACCURATE * max(math.sqrt(size), 1e-9)
     system = PastSystem(
         gradients, steps, weights, mu, lam, deviatoric, scratch.load, loss, scratch.B, scratch.S,
