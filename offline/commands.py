@@ -266,16 +266,18 @@ def chart(
 @click.option("--paths", type=click.IntRange(min=1), default=10, show_default=True)
 @click.option("--steps", type=click.IntRange(min=1), default=60, show_default=True)
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option("--tip", is_flag=True, help="Glide with a rigid tip; change of the force on it.")
 @json_option
-def continuity(artifact: Path, paths: int, steps: int, seed: int, as_json: bool) -> None:
+def continuity(artifact: Path, paths: int, steps: int, seed: int, tip: bool, as_json: bool) -> None:
     """Measure jumps of the artifact F as the contact glides.
 
     Largest change of the displacement field over steps of 0.05 mm that the full model does not
     show, in mm.
     """
-    from offline.studies.continuity import continuity
+    from offline.studies.continuity import continuity, tip_continuity
 
-    _show(continuity(artifact, paths, steps, seed), as_json)
+    measure = tip_continuity if tip else continuity
+    _show(measure(artifact, paths, steps, seed), as_json)
 
 
 @study.command("mesh-independence")

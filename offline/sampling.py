@@ -38,6 +38,14 @@ def random_points(surface: Surface, count: int, rng: np.random.Generator) -> Arr
     return np.einsum("pc,pci->pi", weights, surface.vertices[surface.triangles[triangle]])
 
 
+def random_points_and_rim(surface: Surface, count: int, rng: np.random.Generator) -> Array:
+    """As ``random_points``, but one in eight, the first among them, is on the rim."""
+    points, rim = random_points(surface, count, rng), surface.rim()
+    for i in range(0, count, 8):
+        points[i] = surface.vertices[rng.choice(rim)]
+    return points
+
+
 def spread_points(surface: Surface, count: int, rng: np.random.Generator) -> Array:
     """Points that fill the surface evenly, its rim included, (count, 3) mm.
 

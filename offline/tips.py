@@ -27,7 +27,6 @@ from shared.touch import (
     TIP_ERROR_FEATURES,
     TIP_FEATURES,
     LocalTips,
-    TipModels,
     TipState,
     query,
     tip_features,
@@ -35,8 +34,8 @@ from shared.touch import (
 
 Array = NDArray[np.float64]
 
-TIP_MODES = 24
-TIP_POINTS = 96
+TIP_MODES = 32
+TIP_POINTS = 80
 """Modes and cubature points under the tip."""
 
 NODAL = 36
@@ -55,6 +54,9 @@ DEPARTURE = 0.03
 """Size of the random departure from equilibrium, relative to each mode's part in the states."""
 
 EQUATIONS = 250
+
+GUESSED = 240
+"""Answers that the first guess is fitted to."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +169,7 @@ def train_tip(
         _untrained(space, np.arange(len(weights)), weights),
         _untrained(space, models.points, models.weights),
     )
-    pressed = _press(trainer, contacts, normals, depths, body.tip.radius, rng)
+    pressed = _press(trainer, contacts, normals, depths, rng)
     if not pressed:
         raise NoEquilibrium("endoscope.tip: no equilibrium found under it; is the load too large?")
     V = _modes(pressed)
@@ -180,11 +182,13 @@ def train_tip(
     ]
     A, b = compress(forces, EQUATIONS, rng)
     points, chosen = nonnegative(A, b, TIP_POINTS)
+    chosen *= weights[points]
+    trained = TipTrainer(body, surface, models, _untrained(modes, points, chosen))
     return TipResult(
         modes=modes,
         points=points.astype(np.int32),
-        weights=chosen * weights[points],
-        guess=_fit_guess(trainer.models, states).astype(np.float16),
+        weights=chosen,
+        guess=_fit_guess(trained, contacts, normals, depths, rng).astype(np.float16),
     )
 
 
@@ -195,7 +199,9 @@ def compile_tip_query(body: Body, surface: Surface, models: LocalModels) -> None
     trainer.solve(surface.vertices[0] + 2 * body.tip.radius * surface.normals[0])
 
 
-def _untrained(modes: Array, points: NDArray[np.integer[Any]], weights: Array) -> LocalTips:
+def _untrained(
+    modes: NDArray[np.floating[Any]], points: NDArray[np.integer[Any]], weights: Array
+) -> LocalTips:
     """A model in modes (M, m) with given points and no first guess."""
     return LocalTips(
         modes=modes[None].astype(np.float32),
@@ -231,7 +237,6 @@ def _press(
     contacts: Array,
     normals: Array,
     depths: Array,
-    radius: float,
     rng: np.random.Generator,
 ) -> list[_State]:
     """Push the tip in at contacts far apart, step by step to about the largest depth."""
@@ -240,7 +245,7 @@ def _press(
         trainer.state.forget()
         for share in (np.arange(DEPTHS) + rng.uniform(0.3, 1.0, DEPTHS)) / DEPTHS:
             depth = float(share * depths[i])
-            position = contacts[i] + (radius - depth) * normals[i]
+            position = contacts[i] + (trainer.state.radius - depth) * normals[i]
             if not trainer.solve(position):
                 break
             states.append(trainer.last(position, depth))
@@ -283,11 +288,22 @@ def _training_forces(
     return np.hstack(columns)
 
 
-def _fit_guess(models: TipModels, states: list[_State]) -> Array:
-    """Polynomials (TIP_FEATURES, m) of the answers."""
-    features = np.zeros(TIP_FEATURES)
-    rows = []
-    for state in states:
-        tip_features(models.frames[0], models.centres[:, 0], state.position, state.depth, features)
-        rows.append(features.copy())
-    return damped_fit(np.array(rows), np.array([state.q for state in states]))
+def _fit_guess(
+    trainer: TipTrainer,
+    contacts: Array,
+    normals: Array,
+    depths: Array,
+    rng: np.random.Generator,
+) -> Array:
+    """Polynomials (TIP_FEATURES, m) of the answers, over all contacts and depths."""
+    models, features = trainer.models, np.zeros(TIP_FEATURES)
+    rows, answers = [], []
+    for i in rng.integers(len(contacts), size=GUESSED):
+        depth = depths[i] * np.sqrt(rng.random())
+        position = contacts[i] + (trainer.state.radius - depth) * normals[i]
+        trainer.state.forget()
+        if trainer.solve(position):
+            tip_features(models.frames[0], models.centres[:, 0], position, depth, features)
+            rows.append(features.copy())
+            answers.append(trainer.state.memory.q[0].copy())
+    return damped_fit(np.array(rows), np.array(answers))

@@ -47,13 +47,21 @@ from offline.scenes import default_artifact, find_scene
 from offline.spaces import Footprint
 from offline.tips import TipResult
 from offline.touches import (
+    QUANTITIES,
     TouchComparison,
-    calibrate_touches,
     compare_touch,
     random_positions,
     summarise_touches,
 )
-from offline.validate import Comparison, compare, random_loads, summarise, write_rows
+from offline.validate import (
+    ESTIMATED,
+    Comparison,
+    calibrate,
+    compare,
+    random_loads,
+    summarise,
+    write_rows,
+)
 from offline.viscous import viscous_models
 from offline.workers import Tasks, resume, worker_pool
 from offline.workshop import Load, TouchSample, Workshop, open_workshop, run
@@ -84,8 +92,6 @@ TIP_SAMPLES = 120
 """Full solutions under the tip that validate and calibrate."""
 
 REFINED_LOADS = 4
-COVERAGE = 0.97
-"""Share of known loads whose errors the estimate must cover: above 95 %, for unseen ones to be."""
 
 
 def train(scene: str | Path, out: Path | None = None, workers: int | None = None) -> Path:
@@ -374,10 +380,10 @@ class Pipeline:
             if found[name]["displacement"].size
         ]
         for half, other in ((rows[::2], rows[1::2]), (rows[1::2], rows[::2])):
-            estimator = calibrate_touches(other)
+            estimator = calibrate(other, QUANTITIES)
             for row in half:
                 row.estimate(estimator)
-        return calibrate_touches(rows), rows
+        return calibrate(rows, QUANTITIES), rows
 
     def _validate(
         self, models: LocalModels, limits: Array
@@ -403,10 +409,10 @@ class Pipeline:
             if len(rows) >= LEAST and _accurate(rows, self.scene.tolerance):
                 break
         for half, other in ((rows[::2], rows[1::2]), (rows[1::2], rows[::2])):
-            estimator = calibrate(other)
+            estimator = calibrate(other, ESTIMATED)
             for row in half:
                 row.estimate(estimator)
-        estimator = calibrate(rows)
+        estimator = calibrate(rows, ESTIMATED)
         documents = {
             "provenance": self.provenance,
             "training": {"seconds": self.seconds, "mesh": mesh_quality(self.workshop.mesh)},
@@ -597,30 +603,3 @@ def _gather(results: Sequence[TipResult | None]) -> LocalTips | None:
         weights=np.concatenate([r.weights for r in trained]),
         guess=np.stack([r.guess for r in trained]).astype(np.float32),
     )
-
-
-def calibrate(rows: Sequence[Comparison]) -> Estimator:
-    """Fit the error estimate to known errors: it covers ``COVERAGE`` of them in both quantities.
-
-    A least-squares fit of their logs is raised by two constants, chosen so that the larger of the
-    two median over-estimates is least.  What counts is how far a load lies from a fit to the
-    others, or the estimate would cover fewer of new loads.
-    """
-    rows = [r for r in rows if r.converged]
-    X = np.array([r.features for r in rows])
-    leverage = np.sum(X * np.linalg.pinv(X).T, axis=1)
-    coefficients, rests = [], []
-    for name in ("displacement", "von_mises"):
-        y = np.log([max(getattr(r, name), 1e-8) for r in rows])
-        c = np.linalg.lstsq(X, y)[0]
-        c[0] += np.median(y - X @ c)
-        coefficients.append(c)
-        rests.append((y - X @ c) / (1 - leverage))
-    displacement, von_mises = rests
-    needed = min(int(np.ceil(COVERAGE * (len(rows) + 1))), len(rows))
-    best = (np.inf, np.inf)
-    for shift in np.sort(von_mises)[needed - 1 :]:
-        best = min(best, (np.sort(displacement[von_mises <= shift])[needed - 1], shift), key=max)
-    for c, shift in zip(coefficients, best, strict=True):
-        c[0] += shift
-    return Estimator(np.array(coefficients))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from offline.norms import relative, statistics
-from offline.sampling import cone, random_points
+from offline.sampling import cone, random_points_and_rim
 from offline.workers import completed, worker_pool
 from offline.workshop import Load, Workshop, open_artifact
 from shared.artifact import read_artifact
@@ -27,6 +27,14 @@ Array = NDArray[np.float64]
 
 UNSEEN = 100
 """Sets these random numbers apart from those of the stages of training, which count from 1."""
+
+ESTIMATED = ("displacement", "von_mises")
+
+COVERAGE = 0.95
+"""Share of errors that the estimate must cover."""
+
+DAMPING = 0.3
+"""Holds the coefficients of the estimate back, since known errors are few for many features."""
 
 
 @dataclass
@@ -72,6 +80,11 @@ class Comparison:
     features: Array = field(repr=False)
     estimated_displacement: float = field(default=float("nan"))
     estimated_von_mises: float = field(default=float("nan"))
+
+    @property
+    def typical(self) -> bool:
+        """Whether it counts for the error estimate."""
+        return self.converged
 
     def estimate(self, estimator: Estimator) -> None:
         """Fill in the estimated errors."""
@@ -140,12 +153,8 @@ def random_loads(
     Contact points are uniform over the area, one in eight on the rim of the surface; directions are
     uniform in the cone, one in eight on its border; pressures are denser towards the limit.
     """
-    points = random_points(surface, count, rng)
-    rim = surface.rim()
     loads = []
-    for i, point in enumerate(points):
-        if i % 8 == 0:
-            point = surface.vertices[rng.choice(rim)]
+    for i, point in enumerate(random_points_and_rim(surface, count, rng)):
         x, normal, _, fields = surface.locate(point, limits)
         tilt = scene.endoscope.max_tilt
         direction = cone(normal, tilt, 1, rng, border=i % 8 == 1)[0]
@@ -189,7 +198,7 @@ def summarise(rows: Sequence[Comparison]) -> dict[str, Any]:
     """Errors of the converged answers; ``covered``: the share within both estimates."""
     unconverged = sum(not r.converged for r in rows)
     rows = [r for r in rows if r.converged]
-    covered, ratios = coverage(rows, ("displacement", "von_mises"))
+    covered, ratios = coverage(rows, ESTIMATED)
     return {
         "queries": len(rows) + unconverged,
         "unconverged": unconverged,
@@ -199,6 +208,37 @@ def summarise(rows: Sequence[Comparison]) -> dict[str, Any]:
         "von_mises_p99": statistics([r.von_mises_p99 for r in rows]),
         "estimate_over_error_median": ratios,
     }
+
+
+def calibrate(rows: Sequence[Any], quantities: Sequence[str]) -> Estimator:
+    """Fit the error estimate to known errors: it covers ``COVERAGE`` of them in all quantities.
+
+    A least-squares fit of their logs is raised by a constant for each quantity.  The rows that need
+    not be covered are those that would raise one most.  What counts is how far a row lies from a
+    fit to the others, or the estimate would cover fewer of new ones.
+    """
+    rows = [r for r in rows if r.typical]
+    X = np.array([r.features for r in rows])
+    spread = X.std(axis=0)
+    scale = np.where(spread > 1e-9, spread, np.inf)  # the constant one; others may be, too
+    middle = X.mean(axis=0)
+    A = np.column_stack([(X - middle) / scale, np.ones(len(rows))])
+    damping = np.diag([DAMPING] * len(middle) + [0.0])
+    leverage = np.sum(A * np.linalg.pinv(np.vstack([A, damping])).T[: len(A)], axis=1)
+    coefficients, rests = [], []
+    for name in quantities:
+        y = np.log([max(getattr(r, name), 1e-8) for r in rows])
+        c = np.linalg.lstsq(np.vstack([A, damping]), np.append(y, np.zeros(len(damping))))[0]
+        c, constant = c[:-1] / scale, c[-1]
+        c[0] = constant - c @ middle
+        rest = y - X @ c
+        c[0] += np.median(rest)
+        coefficients.append(c)
+        rests.append((rest - np.median(rest)) / (1 - leverage))
+    covered = np.argsort(np.max(rests, axis=0))[: int(np.ceil(COVERAGE * (len(rows) + 1)))]
+    for c, rest in zip(coefficients, rests, strict=True):
+        c[0] += rest[covered].max()
+    return Estimator(np.array(coefficients))
 
 
 def coverage(rows: Sequence[Any], quantities: Sequence[str]) -> tuple[float, dict[str, float]]:

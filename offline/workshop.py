@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from offline.choose import TrialResult
 from offline.full_model import Equilibrium, FullModel, History, NoEquilibrium, TipContact
@@ -48,6 +49,9 @@ Array = NDArray[np.float64]
 
 POINTS_IN_BASIS = 50
 """Footprints all of whose Ritz vectors make a region's basis; of others the linear ones do."""
+
+DENTS = 24
+"""Modes of a region's basis that the tip's dents add to those of footprints."""
 
 TRIAL = 7
 """Sets the random numbers of a trial apart from those of training."""
@@ -209,6 +213,11 @@ class Workshop:
         basis, _ = energy_pod(model, np.hstack(wanted), modes)
         vectors = vectors.reshape(len(model.free), -1)
         amplitude = np.sqrt(np.mean(((model.rest_stiffness @ basis).T @ vectors) ** 2, axis=1))
+        if self.scene.endoscope.tip:
+            dents = self._dents(np.array([footprint.point for footprint in footprints]), basis)
+            # in front, where a truncation does not reach; in the finest steps
+            basis = np.hstack([dents, basis])
+            amplitude = np.concatenate([np.full(dents.shape[1], np.inf), amplitude])
         largest = np.abs(basis).max(axis=0)
         steps = np.clip(RESOLUTION / amplitude, largest / np.iinfo(np.int16).max, largest / 100)
         stored = np.round(basis / steps).astype(np.int16)
@@ -225,6 +234,23 @@ class Workshop:
             orthonormal=np.linalg.inv(L).T.astype(np.float32),
             ritz=np.moveaxis(ritz, 1, 0).astype(np.float32),
         )
+
+    def _dents(self, points: Array, basis: Array) -> Array:
+        """What the basis lacks of the responses to forces on single nodes near the points.
+
+        Footprints spread a load over a disc, which a rigid tip does not; (free dofs, <= DENTS).
+        """
+        model, radius = self.model, self.scene.endoscope.radius
+        nodes = self.body.touchable[1]
+        nodes = nodes[~self.mesh.clamped[nodes]]
+        nodes = nodes[cKDTree(points).query(self.mesh.nodes[nodes])[0] < radius]
+        loads = np.zeros((len(self.mesh.nodes), 3, len(nodes)))
+        for i, node in enumerate(nodes):
+            loads[node, :, i] = self.surface.project(self.mesh.nodes[node])[1]
+        dents = model.solve_linear(loads.reshape(-1, len(nodes))[model.free])
+        for _ in range(2):  # twice is enough for orthogonality
+            dents -= basis @ ((model.rest_stiffness @ basis).T @ dents)
+        return energy_pod(model, dents, DENTS)[0]
 
     def _ritz(self, footprint: Footprint) -> Array:
         """Nonlinear Ritz vectors, and those of the relaxed tissue if time changes it."""

@@ -53,7 +53,7 @@ from shared.reduced import (
 from shared.reduced_history import place
 from shared.scene import Scene, SceneError, parse_scene
 from shared.stress import nodal_von_mises, nodal_von_mises_after, remember, remember_linearly
-from shared.surface import Ground, Surface, boundary_triangles
+from shared.surface import UPRIGHT, Ground, Surface, boundary_triangles
 from shared.tip import Tip, TipSurface, tip_of, tip_surface
 from shared.tissue import lame
 from shared.touch import TIP_ERROR_FEATURES, LocalTips, Points, TipModels, TipState, Touch
@@ -979,7 +979,7 @@ def _local_tips(arrays: dict[str, NDArray[Any]]) -> LocalTips:
 
 def _beside(position: Array, contact: Array, normal: Array, distance: float) -> bool:
     """Whether a position lies rather beside the surface, beyond its rim, than above or below it."""
-    return abs(float(np.dot(position - contact, normal))) < 0.7 * distance
+    return abs(float(np.dot(position - contact, normal))) < UPRIGHT * distance
 
 
 def _number(slot: int) -> int:

@@ -375,19 +375,26 @@ def _correct(system, residual, step):
         return None
 
     def correct(system, residual, step):
-        L = system.factor
-        m = len(step)
-        for i in range(m):
-            total = -residual[i]
-            for k in range(i):
-                total -= L[i, k] * step[k]
-            step[i] = total / L[i, i]
-        for i in range(m - 1, -1, -1):
-            step[i] /= L[i, i]
-            for k in range(i):
-                step[k] -= L[i, k] * step[i]
+        for i in range(len(step)):
+            step[i] = -residual[i]
+        back_substitute(system.factor, step)
 
     return correct
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def back_substitute(L, x):
+    """Solve ``L L^T x = x`` in place."""
+    m = len(x)
+    for i in range(m):
+        total = x[i]
+        for k in range(i):
+            total -= L[i, k] * x[k]
+        x[i] = total / L[i, i]
+    for i in range(m - 1, -1, -1):
+        x[i] /= L[i, i]
+        for k in range(i):
+            x[k] -= L[i, k] * x[i]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

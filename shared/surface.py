@@ -44,6 +44,11 @@ def _closest_on_triangle(p, a, b, c, weights):
     weights[0], weights[1], weights[2] = 1.0 - v - w, v, w
 
 
+UPRIGHT = 0.7
+"""Cosine between the normal and the way to a point below which it is beside the surface, beyond its
+rim, rather than above or below."""
+
+
 class Ground(NamedTuple):
     """A surface as compiled code sees it, with fields given at its vertices."""
 

@@ -19,8 +19,9 @@ On a coarse one, whose faces cannot dent, the contact is far smaller: as on a ri
 needs the penetration sqrt(F / (pi k R)).  ``HARDNESS`` is set by the latter, and the points are so
 close (``SPACING``) that even such a contact holds several.
 
-Only faces whose surroundings the tip reaches are looked at.  A point whose outward normal (at rest)
-faces away from the tip's centre does not feel it: it belongs to the far side of a thin wall.
+Only faces whose surroundings the tip reaches are looked at, and of those only the blocks of points
+that it can reach.  A point whose outward normal (at rest) faces away from the tip's centre does not
+feel it: it belongs to the far side of a thin wall.
 """
 
 from __future__ import annotations
@@ -37,14 +38,22 @@ from shared.elements import quadrilateral, shape
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
-HARDNESS = 4000.0
+HARDNESS = 7000.0
 """Of the penalty, in units of Young's modulus over the tip's radius."""
 
-ONSET = 2.5e-4
+ONSET = 5e-4
 """Penetration over which the penalty sets in, in radii of the tip."""
 
-SPACING = 0.075
+SPACING = 0.05
 """Largest distance of integration points, in radii of the tip."""
+
+SIDE = 4
+BLOCK = SIDE * SIDE
+"""Points of a block: two vectors of double precision."""
+
+SAG = 4.0
+"""By which the squared distance of the tip's centre from a point of a block is at most less than
+from the nearest corner of the block, in squared half diagonals at rest; 1 on a plane."""
 
 SMOOTH = np.cos(np.radians(45.0))
 """Faces that meet at less than this angle go on in one another."""
@@ -66,13 +75,16 @@ class Tip(NamedTuple):
 
 
 class TipSurface(NamedTuple):
-    """Faces that a tip can touch, with q integration points each."""
+    """Faces that a tip can touch, with b blocks of ``BLOCK`` integration points each."""
 
     nodes: Array  # (n, 3) mm, at rest
     faces: Ints  # (f, k) rows of ``nodes``
-    shape: Array  # (k, q) shape functions at the points of a face
-    areas: Array  # (f, q) mm^2
-    normals: Array  # (f, 3, q) outward unit normals at rest
+    shape: Array  # (b, k, BLOCK) shape functions at the points of a face
+    corner_shape: Array  # (k, e) the same at the corners of blocks
+    corners: Ints  # (b, 4) those of each block
+    reach: Array  # (f, b) mm^2, squared distance of all corners at which the tip misses the block
+    areas: Array  # (f, b, BLOCK) mm^2
+    normals: Array  # (f, b, 3, BLOCK) outward unit normals at rest
 
 
 class Touching(NamedTuple):
@@ -84,7 +96,10 @@ class Touching(NamedTuple):
     own: Array  # (3, 3) mN/mm, in the place of the tip
     touched: NDArray[np.int64]  # (1,) number of faces
     deepest: Array  # (1,) mm, largest penetration
-    gap: Array  # (4, q) scratch: points of a face from the tip's centre, mm, and their distance
+    at: Array  # (k, 3) scratch: nodes of a face from the tip's centre, mm
+    gap: Array  # (4, BLOCK) scratch: points of a block from there, mm, and squared distances
+    row: Array  # (k,) scratch: shape functions at a point
+    ends: Array  # (4, e) scratch: the same of the corners of blocks
 
 
 def tip_of(radius: float, young: float) -> Tip:
@@ -107,26 +122,57 @@ def tip_surface(
         Of the tip; sets the distance of integration points.
     """
     touched = faces[_with_smooth_neighbours(nodes, faces, accessible)]
-    at = _grid(nodes[touched], SPACING * radius)
-    N, dN = shape(quadrilateral(faces.shape[1]), at)
+    reference = quadrilateral(faces.shape[1])
+    at, ends, corners = _grid(nodes[touched], SPACING * radius)
+    N, dN = shape(reference, at)
     tangents = np.einsum("fai,qaj->fijq", nodes[touched], dN)
     normals = np.cross(tangents[:, :, 0], tangents[:, :, 1], axis=1)
     areas = np.linalg.norm(normals, axis=1)
+    blocks = len(touched), -1, BLOCK
+    at_ends, _ = shape(reference, ends)
+    placed = np.einsum("fai,qa->fqi", nodes[touched], at_ends)[:, corners]  # (f, b, 4, 3)
+    diagonals = np.linalg.norm(placed[:, :, :2] - placed[:, :, 2:], axis=-1).max(axis=-1)
     return TipSurface(
         nodes=nodes,
         faces=np.ascontiguousarray(touched, dtype=np.int32),
-        shape=np.ascontiguousarray(N.T),
-        areas=areas * 4 / len(at),
-        normals=normals / areas[:, None],
+        shape=_in_blocks(N),
+        corner_shape=np.ascontiguousarray(at_ends.T),
+        corners=corners,
+        reach=np.ascontiguousarray(radius**2 + SAG * (diagonals / 2) ** 2),
+        areas=(areas * 4 / len(N)).reshape(blocks),
+        normals=np.ascontiguousarray(
+            np.moveaxis((normals / areas[:, None]).reshape(len(touched), 3, -1, BLOCK), 1, 2)
+        ),
     )
 
 
-def _grid(corners: Array, spacing: float) -> Array:
-    """Centres (q, 2) of equal cells of the reference face, at most ``spacing`` mm wide on any."""
-    edges = np.linalg.norm(corners[:, [1, 2, 3, 0]] - corners[:, :4], axis=2)
-    counts = [max(1, int(np.ceil(edges[:, axis::2].max() / spacing))) for axis in range(2)]
-    ticks = [(np.arange(count) + 0.5) * 2 / count - 1 for count in counts]
-    return np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 2)
+def _in_blocks(N: Array) -> Array:
+    """Shape functions (q, k) at points as (q / BLOCK, k, BLOCK)."""
+    return np.ascontiguousarray(N.reshape(-1, BLOCK, N.shape[1]).transpose(0, 2, 1))
+
+
+def _grid(nodes: Array, spacing: float) -> tuple[Array, Array, Ints]:
+    """Blocks of equal cells of the reference face, at most ``spacing`` mm wide on any face.
+
+    Returns
+    -------
+    centres : ndarray, shape (b BLOCK, 2)
+        Of the cells, block by block.
+    ends : ndarray, shape (e, 2)
+        Corners of the blocks.
+    corners : ndarray, shape (b, 4)
+        Which those of a block are; the first and third, and the others, are opposite.
+    """
+    edges = np.linalg.norm(nodes[:, [1, 2, 3, 0]] - nodes[:, :4], axis=2)
+    # a block more or less must not hang on round-off
+    m, n = (max(1, int(np.ceil(edges[:, i::2].max() / (SIDE * spacing) - 1e-6))) for i in range(2))
+    cells = [(np.arange(SIDE * count) + 0.5) * 2 / (SIDE * count) - 1 for count in (m, n)]
+    centres = np.stack(np.meshgrid(*cells, indexing="ij"), axis=-1)
+    centres = centres.reshape(m, SIDE, n, SIDE, 2).transpose(0, 2, 1, 3, 4).reshape(-1, 2)
+    borders = np.meshgrid(np.linspace(-1, 1, m + 1), np.linspace(-1, 1, n + 1), indexing="ij")
+    number = np.arange((m + 1) * (n + 1), dtype=np.int32).reshape(m + 1, n + 1)
+    corners = [number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]]
+    return centres, np.stack(borders, axis=-1).reshape(-1, 2), np.stack(corners, -1).reshape(-1, 4)
 
 
 def _with_smooth_neighbours(
@@ -167,7 +213,10 @@ def room_for(surface: TipSurface, f: int) -> Touching:
         own=np.zeros((3, 3)),
         touched=np.zeros(1, np.int64),
         deepest=np.zeros(1),
-        gap=np.zeros((4, surface.shape.shape[1])),
+        at=np.zeros((k, 3)),
+        gap=np.zeros((4, BLOCK)),
+        row=np.zeros(k),
+        ends=np.zeros((4, surface.corner_shape.shape[1])),
     )
 
 
@@ -183,44 +232,43 @@ def penalty(tip, d):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _within_reach(tip, surface, face, x, moved):
-    """Whether the tip at x reaches the surroundings of a deformed face."""
+def _within_reach(tip, surface, face, x, moved, at):
+    """Whether the tip at x reaches the surroundings of a deformed face; writes its nodes from x."""
+    nodes, faces = surface.nodes, surface.faces
     squared = largest = 0.0
-    nodes, own = surface.nodes, surface.faces[face]
-    middle = np.empty(3)
-    half = np.empty(3)
     for i in range(3):
         low, high = np.inf, -np.inf
-        for k in range(len(own)):
-            at = nodes[own[k], i] + moved[own[k], i]
-            low, high = min(low, at), max(high, at)
-        middle[i], half[i] = 0.5 * (low + high), 0.5 * (high - low)
-        largest = max(largest, half[i])
-    for i in range(3):
-        beyond = abs(x[i] - middle[i]) - half[i] - (REACH - 1.0) * largest
-        if beyond > 0.0:
-            squared += beyond * beyond
-    return squared < tip.radius * tip.radius
+        for k in range(faces.shape[1]):
+            node = faces[face, k]
+            at[k, i] = nodes[node, i] + moved[node, i] - x[i]
+            low, high = min(low, at[k, i]), max(high, at[k, i])
+        largest = max(largest, high - low)
+        # of all nodes from the tip's centre; what a curved face goes beyond them comes off below
+        beside = max(low, -high, 0.0)
+        squared += beside * beside
+    return math.sqrt(squared) - 0.5 * (REACH - 1.0) * math.sqrt(3.0) * largest < tip.radius
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc", "nsz"})
-def _gaps(surface, face, x, moved, gap):
-    """Points of a deformed face relative to x and their squared distances, into ``gap`` (4, q)."""
-    own, nodes, shape = surface.faces[face], surface.nodes, surface.shape
-    for i in range(3):
-        row = gap[i]
-        for q in range(len(row)):
-            row[q] = -x[i]
-        for k in range(0, len(own), 4):  # a face has 4 or 8 nodes
-            a, b = nodes[own[k], i] + moved[own[k], i], nodes[own[k + 1], i] + moved[own[k + 1], i]
-            c = nodes[own[k + 2], i] + moved[own[k + 2], i]
-            d = nodes[own[k + 3], i] + moved[own[k + 3], i]
-            K, L, M, N = shape[k], shape[k + 1], shape[k + 2], shape[k + 3]
-            for q in range(len(row)):
-                row[q] += K[q] * a + L[q] * b + M[q] * c + N[q] * d
-    y0, y1, y2, square = gap[0], gap[1], gap[2], gap[3]
-    for q in range(len(square)):
-        square[q] = y0[q] * y0[q] + y1[q] * y1[q] + y2[q] * y2[q]
+def _gaps(shape, at, gap):
+    """Points of a face from the tip's centre and their squared distances, into ``gap`` (4, n).
+
+    shape (k, n); k is 4 or 8.
+    """
+    x, y, z, squared = gap[0], gap[1], gap[2], gap[3]
+    for q in range(len(x)):
+        x[q] = y[q] = z[q] = 0.0
+    for k in range(0, len(at), 4):
+        K, L, M, N = shape[k], shape[k + 1], shape[k + 2], shape[k + 3]
+        a0, b0, c0, d0 = at[k, 0], at[k + 1, 0], at[k + 2, 0], at[k + 3, 0]
+        a1, b1, c1, d1 = at[k, 1], at[k + 1, 1], at[k + 2, 1], at[k + 3, 1]
+        a2, b2, c2, d2 = at[k, 2], at[k + 1, 2], at[k + 2, 2], at[k + 3, 2]
+        for q in range(len(x)):
+            x[q] += K[q] * a0 + L[q] * b0 + M[q] * c0 + N[q] * d0
+            y[q] += K[q] * a1 + L[q] * b1 + M[q] * c1 + N[q] * d1
+            z[q] += K[q] * a2 + L[q] * b2 + M[q] * c2 + N[q] * d2
+    for q in range(len(x)):
+        squared[q] = x[q] * x[q] + y[q] * y[q] + z[q] * z[q]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -252,67 +300,102 @@ def touch(tip, surface, near, x, moved, touching, wanted):
         Largest penetration.
     """
     count, energy, deepest = 0, 0.0, 0.0
-    radius, gap = tip.radius, touching.gap
-    y, n, H = np.empty(3), np.empty(3), touching.own
-    H[:] = 0.0
+    at, ends, corner = touching.at, touching.ends, touching.ends[3]
+    corners, reach = surface.corners, surface.reach
+    touching.own[:] = 0.0
     for place in range(len(near)):
         face = near[place]
-        if not _within_reach(tip, surface, face, x, moved):
+        if not _within_reach(tip, surface, face, x, moved, at):
             continue
-        _gaps(surface, face, x, moved, gap)
-        touches = False
-        outward, areas = surface.normals[face], surface.areas[face]
-        for q in range(gap.shape[1]):
-            if gap[3, q] >= radius * radius:
+        _gaps(surface.corner_shape, at, ends)
+        new = True
+        for b in range(len(corners)):
+            first = min(corner[corners[b, 0]], corner[corners[b, 1]])
+            if min(first, corner[corners[b, 2]], corner[corners[b, 3]]) >= reach[face, b]:
                 continue
-            for i in range(3):
-                y[i] = gap[i, q]
-            if outward[0, q] * y[0] + outward[1, q] * y[1] + outward[2, q] * y[2] >= 0.0:
-                continue
-            if not touches:
-                touches = True
+            _gaps(surface.shape[b], at, touching.gap)
+            density, depth = _touch_block(tip, surface, face, b, touching, count, new, wanted)
+            if depth > 0.0:
                 touching.face[count] = place
-                touching.force[count] = 0.0
-                if wanted > FORCE:
-                    touching.stiffness[count] = 0.0
-                count += 1
-            distance = math.sqrt(gap[3, q])
-            density, pressure, slope = penalty(tip, radius - distance)
-            energy += areas[q] * density
-            deepest = max(deepest, radius - distance)
-            for i in range(3):
-                n[i] = y[i] / distance
-            _press(surface.shape, q, areas[q] * pressure, n, touching.force[count - 1])
-            if wanted > FORCE:
-                along = areas[q] * slope
-                across = -areas[q] * pressure / distance if wanted == STIFFNESS else 0.0
-                _stiffen(surface.shape, q, along, across, n, touching.stiffness[count - 1], H)
+                new = False
+                energy += density
+                deepest = max(deepest, depth)
+        if not new:
+            count += 1
     touching.touched[0], touching.deepest[0] = count, deepest
     return count, energy, deepest
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _press(shape, q, push, n, force):
-    """Share a point's force among the nodes of its face: force (k, 3)."""
-    for k in range(len(force)):
-        for i in range(3):
-            force[k, i] += shape[k, q] * push * n[i]
+def _touch_block(tip, surface, face, block, touching, place, new, wanted):
+    """Add what the tip does to the points of a block whose ``gap`` is known: energy, penetration.
+
+    ``new`` faces have nothing at their place yet.
+    """
+    radius, gap, areas, normals = tip.radius, touching.gap, surface.areas, surface.normals
+    energy = deepest = 0.0
+    for q in range(BLOCK):
+        if gap[3, q] >= radius * radius:
+            continue
+        y0, y1, y2 = gap[0, q], gap[1, q], gap[2, q]
+        facing = normals[face, block, 0, q] * y0 + normals[face, block, 1, q] * y1
+        if facing + normals[face, block, 2, q] * y2 >= 0.0:
+            continue
+        if new:
+            new = False
+            touching.force[place] = 0.0
+            if wanted > FORCE:
+                touching.stiffness[place] = 0.0
+        distance, area = math.sqrt(gap[3, q]), areas[face, block, q]
+        density, pressure, slope = penalty(tip, radius - distance)
+        energy += area * density
+        deepest = max(deepest, radius - distance)
+        n0, n1, n2 = y0 / distance, y1 / distance, y2 / distance
+        _press(surface.shape, block, q, area * pressure, n0, n1, n2, touching.force, place)
+        if wanted > FORCE:
+            across = -area * pressure / distance if wanted == STIFFNESS else 0.0
+            _stiffen(surface.shape, block, q, area * slope, across, n0, n1, n2, touching, place)
+    return energy, deepest
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _stiffen(shape, q, along, across, n, K, own):
-    """Add a point's second derivative to that of its face, K (3, 3, k, k), upper blocks."""
-    for i in range(3):
-        for j in range(i, 3):
-            h = (along - across) * n[i] * n[j] + (across if i == j else 0.0)
-            own[i, j] += h
-            if i != j:
-                own[j, i] += h
-            block = K[i, j]
-            for a in range(len(block)):
-                value = h * shape[a, q]
-                for b in range(len(block)):
-                    block[a, b] += value * shape[b, q]
+def _press(shape, block, q, push, n0, n1, n2, force, place):
+    """Share a point's force among the nodes of its face."""
+    for k in range(shape.shape[1]):
+        share = shape[block, k, q] * push
+        force[place, k, 0] += share * n0
+        force[place, k, 1] += share * n1
+        force[place, k, 2] += share * n2
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _stiffen(shape, block, q, along, across, n0, n1, n2, touching, place):
+    """Add a point's second derivative to the upper blocks of its face's, and to the tip's own."""
+    K, own, steep = touching.stiffness, touching.own, along - across
+    h00, h01, h02 = steep * n0 * n0 + across, steep * n0 * n1, steep * n0 * n2
+    h11, h12, h22 = steep * n1 * n1 + across, steep * n1 * n2, steep * n2 * n2 + across
+    own[0, 0] += h00
+    own[1, 1] += h11
+    own[2, 2] += h22
+    own[0, 1] += h01
+    own[1, 0] += h01
+    own[0, 2] += h02
+    own[2, 0] += h02
+    own[1, 2] += h12
+    own[2, 1] += h12
+    row = touching.row
+    for k in range(len(row)):
+        row[k] = shape[block, k, q]
+    for a in range(len(row)):
+        N = row[a]
+        for b in range(len(row)):
+            value = N * row[b]
+            K[place, 0, 0, a, b] += h00 * value
+            K[place, 0, 1, a, b] += h01 * value
+            K[place, 0, 2, a, b] += h02 * value
+            K[place, 1, 1, a, b] += h11 * value
+            K[place, 1, 2, a, b] += h12 * value
+            K[place, 2, 2, a, b] += h22 * value
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -36,24 +36,24 @@ from shared.reduced import (
     FAST,
     LANES,
     MAX_ACTIVE,
-    REUSE,
     ROUND_OFF,
     STATE,
     TILE,
+    _added_energy,
     _cholesky,
     _is,
     _lower_products,
     activate,
+    back_substitute,
     increments,
     linearise,
     nonlinear_stress,
     project,
     superpose,
 )
-from shared.surface import Ground, locate
+from shared.surface import UPRIGHT, Ground, locate
 from shared.tip import (
     CONVEX,
-    FORCE,
     HARDNESS,
     STIFFNESS,
     Tip,
@@ -68,8 +68,13 @@ Array = NDArray[np.float64]
 Field = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
-TOLERANCE = 5e-4
-"""Residual at equilibrium relative to the response, both in the energy norm of the rest state."""
+TOLERANCE = 0.003
+"""Residual before the last correction relative to the response, both in the energy norm of the rest
+state.  Newton's method squares it (to 1e-5, say), which need not be evaluated."""
+
+LAG = 0.015
+"""Change of the response, relative to it, up to which the tissue's part of the tangent serves
+again.  The contact's never does: it is far stiffer and changes as fast as the tip moves."""
 
 LEAST = 1e-6
 """Response in that norm (square root of mN mm) that counts as none."""
@@ -79,9 +84,6 @@ MAX_ITERATIONS = 40
 SKIN = 0.02
 """Distance from the surface, in radii of the tip, at which contact is looked for: the triangles
 that say where the surface is cut its curves."""
-
-UPRIGHT = 0.7
-"""Cosine between normal and way to the tip's centre below which it is beside the surface."""
 
 RAMP = 8
 """Steps of the way in when an equilibrium cannot be found in one jump."""
@@ -165,6 +167,8 @@ class TipMemory(NamedTuple):
 
     patch: Ints  # (MAX_ACTIVE,)
     q: Array  # (MAX_ACTIVE, m)
+    bulk: Array  # (MAX_ACTIVE, m, m) part of the tangent
+    formed: Array  # (MAX_ACTIVE, m) state at which that was formed
     factor: Array  # (MAX_ACTIVE, m, m) of the tangent at the answer
     coupling: Array  # (MAX_ACTIVE, 3, m) B there
     position: Array  # (MAX_ACTIVE, 3) mm
@@ -180,10 +184,12 @@ class TipScratch(NamedTuple):
     linear: Array
     state: Field
     increments: Field  # (m, 9 c)
+    latest: Array  # (m,)
     tangent: Array  # (m, m)
     newton: Array  # (4, m)
     moved: Array  # (n, 3) mm, of the surface's nodes; only those near are written
-    folded: Array  # (3 k, m)
+    own: Array  # (3 k, m) modes at the nodes of a face
+    folded: Array  # (3 k, m) a face's stiffness times these
     touching: Touching
     distance: Array  # (p,)
     fade: Array  # (MAX_ACTIVE, 3) 1/mm, gradients of the weights
@@ -199,18 +205,21 @@ class TipOutcome(NamedTuple):
 
     weight: Array  # (MAX_ACTIVE,)
     foot: Array  # (3,) mm, on the surface, nearest to the tip's centre
-    normal: Array  # (3,) outward there
+    upward: Array  # (3,) outward normal there
     force: Array  # (3,) mN
     tangent: Array  # (3, 3) mN/mm
+    point: Array  # (3,) mm, see ``Touch.contact_point``
+    normal: Array  # (3,) from there to the tip's centre
     forces: Array  # (MAX_ACTIVE, 3) of the models
     tangents: Array  # (MAX_ACTIVE, 3, 3)
     limit: Array  # (1,) mm, largest trained depth there
     features: Array  # (TIP_ERROR_FEATURES,) of the error estimate
+    errors: Array  # (3,) estimated: displacement, von Mises stress, force
     scalars: Array  # (SCALARS,)
 
 
-(STATUS, ITERATIONS, SMALLEST_J, ENERGY, PENETRATION, TOUCHED, DEPTH, DISTANCE) = range(8)
-SCALARS = 8
+(STATUS, ITERATIONS, SMALLEST_J, ENERGY, PENETRATION, TOUCHED, DEPTH, DISTANCE, BESIDE) = range(9)
+SCALARS = 9
 
 
 class TipSolver(NamedTuple):
@@ -218,6 +227,7 @@ class TipSolver(NamedTuple):
 
     models: TipModels
     ground: Ground
+    coefficients: Array  # (3, TIP_ERROR_FEATURES) of the error estimate
     memory: TipMemory
     scratch: TipScratch
     outcome: TipOutcome
@@ -241,6 +251,9 @@ class TipSystem(NamedTuple):
     linear: Array
     state: Field
     increments: Field
+    bulk: Array  # (m, m) part of the tangent
+    formed: Array  # (m,) state at which that was formed
+    latest: Array  # (m,) state that ``touching`` is of
     tangent: Array
     factor: Array
     tip: Tip
@@ -252,6 +265,7 @@ class TipSystem(NamedTuple):
     x: Array
     step: Array  # (m,) scratch
     moved: Array
+    own: Array
     folded: Array
     touching: Touching
 
@@ -289,9 +303,9 @@ def _potential(system, u, residual):
         if not smallest > 0.0:
             return tissue.INVERTED, smallest
         project(system.gradients, system.P, residual)
-        count, energy, _ = _contact(system, u, FORCE)
-        for c in range(len(weights)):
-            energy += weights[c] * (tissue.energy(J[c], trace[c], mu[c], lam[c]) - linear[c])
+        count, energy, _ = _contact(system, u, STIFFNESS)
+        system.latest[:] = u
+        energy += _added_energy(weights, mu, lam, J, trace, linear)
         for j in range(len(u)):
             residual[j] += u[j]
             energy += 0.5 * u[j] * u[j]
@@ -313,45 +327,82 @@ def _factorise(system, u, shift):
         return None
 
     def factorise(system, u, shift):
-        gradients = system.tangent_gradients
-        H = system.H[: gradients.shape[1]]
-        superpose(gradients, u, H)
-        linearise(H, system.tangent_weights, system.tangent_mu, system.tangent_lam, system.state)
-        increments(system.state, gradients, system.increments)
-        _lower_products(gradients, system.increments, system.tangent)
-        for j in range(len(u)):
-            system.tangent[j, j] += 1.0
-        count, _, _ = _contact(system, u, CONVEX if shift > 0.0 else STIFFNESS)
-        for c in range(count):
-            _add_face(system, c)
-        return _cholesky(system.tangent, shift, system.factor)
+        known = _far(u, system.formed) <= LAG * LAG
+        if shift > 0.0:
+            _contact(system, u, CONVEX)
+            system.latest[:] = np.inf
+        elif _far(u, system.latest) > 0.0:
+            _contact(system, u, STIFFNESS)
+            system.latest[:] = u
+        while True:
+            if not known:
+                _form_bulk(system, u)
+            system.tangent[:] = system.bulk
+            for c in range(system.touching.touched[0]):
+                _add_face(system, c)
+            if _cholesky(system.tangent, shift, system.factor):
+                return True
+            if not known:
+                return False
+            known = False
 
     return factorise
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def _far(u, other):
+    """Squared distance of a state from another, relative to its size."""
+    size = distance = 0.0
+    for j in range(len(u)):
+        size += u[j] * u[j]
+        distance += (u[j] - other[j]) ** 2
+    return distance / max(size, LEAST * LEAST)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _form_bulk(system, u):
+    """The part of the tissue in the tangent at u, lower triangle."""
+    gradients, bulk = system.tangent_gradients, system.bulk
+    H = system.H[: gradients.shape[1]]
+    superpose(gradients, u, H)
+    linearise(H, system.tangent_weights, system.tangent_mu, system.tangent_lam, system.state)
+    increments(system.state, gradients, system.increments)
+    _lower_products(gradients, system.increments, bulk)
+    for j in range(len(u)):
+        bulk[j, j] += 1.0
+    system.formed[:] = u
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
 def _add_face(system, c):
     """Add a touching face's stiffness to the lower triangle of the tangent."""
-    K, folded, tangent = system.touching.stiffness[c], system.folded, system.tangent
-    own, modes = system.corners[system.touching.face[c]], system.modes
-    nodes = len(own)
-    folded[:] = 0.0
-    for i in range(3):
+    K, own, folded = system.touching.stiffness[c], system.own, system.folded
+    tangent = system.tangent
+    corners = system.corners[system.touching.face[c]]
+    nodes, m = len(corners), len(tangent)
+    for b in range(nodes):
         for j in range(3):
-            block = K[min(i, j), max(i, j)]
-            for a in range(nodes):
-                target = folded[3 * a + i]
-                for b in range(nodes):
-                    value, row = block[a, b], modes[own[b], j]
-                    for n in range(len(target)):
-                        target[n] += value * row[n]
-    for a in range(nodes):
-        for i in range(3):
-            row, other = modes[own[a], i], folded[3 * a + i]
-            for j in range(len(tangent)):
-                value = float(row[j])
-                for n in range(j + 1):
-                    tangent[j, n] += value * other[n]
+            row, target = system.modes[corners[b], j], own[nodes * j + b]
+            for n in range(m):
+                target[n] = row[n]
+    for i in range(3):
+        for a in range(nodes):
+            target = folded[nodes * i + a]
+            target[:] = 0.0
+            for j in range(3):
+                row = K[min(i, j), max(i, j), a]
+                for b in range(0, nodes, 4):  # a face has 4 or 8 nodes
+                    k, at = row[b : b + 4], nodes * j + b
+                    p, q, r, s = own[at], own[at + 1], own[at + 2], own[at + 3]
+                    for n in range(m):
+                        target[n] += k[0] * p[n] + k[1] * q[n] + k[2] * r[n] + k[3] * s[n]
+    for a in range(0, 3 * nodes, 4):
+        p, q, r, s = folded[a], folded[a + 1], folded[a + 2], folded[a + 3]
+        for j in range(m):
+            w, x, y, z = own[a, j], own[a + 1, j], own[a + 2, j], own[a + 3, j]
+            row = tangent[j]
+            for n in range(j + 1):
+                row[n] += w * p[n] + x * q[n] + y * r[n] + z * s[n]
 
 
 @overload(equilibrium.correct, jit_options={"error_model": "numpy"})
@@ -362,24 +413,9 @@ def _correct(system, residual, step):
     def correct(system, residual, step):
         for j in range(len(step)):
             step[j] = -residual[j]
-        _back_substitute(system.factor, step)
+        back_substitute(system.factor, step)
 
     return correct
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _back_substitute(L, x):
-    """Solve ``L L^T x = x`` in place."""
-    m = len(x)
-    for i in range(m):
-        total = x[i]
-        for k in range(i):
-            total -= L[i, k] * x[k]
-        x[i] = total / L[i, i]
-    for i in range(m - 1, -1, -1):
-        x[i] /= L[i, i]
-        for k in range(i):
-            x[k] -= L[i, k] * x[i]
 
 
 descend = njit(equilibrium.descend, error_model="numpy", nogil=True, cache=True)
@@ -396,9 +432,8 @@ def _settle(system, q, work, least, most):
     size = max(math.sqrt(np.dot(q, q)), least, LEAST)
     while True:
         status, more, energy, smallest = descend(
-            system, q, work, energy, smallest, TOLERANCE * size, REUSE, most,
-            system.factor[0, 0] > 0.0, ROUND_OFF,
-        )  # fmt: skip
+            system, q, work, energy, smallest, TOLERANCE * size, 0.0, most, False, ROUND_OFF
+        )
         iterations += more
         found = math.sqrt(np.dot(q, q))
         if status != equilibrium.CONVERGED or size <= 2.0 * found or size <= LEAST:
@@ -428,6 +463,9 @@ def _system(models, k, slot, x, memory, scratch):
             scratch.linear,
             scratch.state,
             scratch.increments,
+            memory.bulk[slot],
+            memory.formed[slot],
+            scratch.latest,
             scratch.tangent,
             memory.factor[slot],
             models.tip,
@@ -439,6 +477,7 @@ def _system(models, k, slot, x, memory, scratch):
             x,
             scratch.newton[1],
             scratch.moved,
+            scratch.own,
             scratch.folded,
             scratch.touching,
         )
@@ -458,11 +497,9 @@ def _guess(models, k, x, depth, features, q):
 @njit(cache=True, error_model="numpy", nogil=True)
 def _predict(memory, slot, x, q, step):
     """Follow the last answer's derivatives to the position x."""
-    if not memory.factor[slot, 0, 0] > 0.0:
-        return
     for i in range(3):
         step[:] = memory.coupling[slot, i]
-        _back_substitute(memory.factor[slot], step)
+        back_substitute(memory.factor[slot], step)
         for j in range(len(q)):
             q[j] += step[j] * (x[i] - memory.position[slot, i])
 
@@ -478,7 +515,6 @@ def _settle_on_the_way(system, q, work, least, depth, normal):
     for _ in range(RAMP):
         if status == equilibrium.CONVERGED:
             at -= away / RAMP
-            system.factor[0, 0] = 0.0
             status, more, energy, smallest = _settle(system, q, work, least, MAX_ITERATIONS)
             iterations += more
     return status, iterations, energy, smallest
@@ -487,13 +523,14 @@ def _settle_on_the_way(system, q, work, least, depth, normal):
 @njit(cache=True, error_model="numpy", nogil=True)
 def _solve(models, k, slot, warm, x, normal, depth, most, memory, scratch, outcome):
     """Equilibrium of model k, its force and tangent into memory's slot and the outcome."""
-    q, at, factor = memory.q[slot], memory.position[slot], memory.factor[slot]
+    q, at = memory.q[slot], memory.position[slot]
     if warm:
         _predict(memory, slot, x, q, scratch.newton[1])
     else:
         _guess(models, k, x, depth, scratch.features, q)
-        factor[0, 0] = 0.0
+        memory.formed[slot] = np.inf
     at[:] = x
+    scratch.latest[:] = np.inf
     tip = models.tip
     least = 0.1 * depth * tip.radius * math.sqrt(tip.stiffness / HARDNESS)
     system = _system(models, k, slot, at, memory, scratch)
@@ -507,7 +544,14 @@ def _solve(models, k, slot, warm, x, normal, depth, most, memory, scratch, outco
     if status == equilibrium.CONVERGED and not equilibrium.factorise(system, q, 0.0):
         status = equilibrium.STALLED  # a saddle
     if status == equilibrium.CONVERGED:
-        _react(system, memory.coupling[slot], outcome.forces[slot], outcome.tangents[slot])
+        coupling, force = memory.coupling[slot], outcome.forces[slot]
+        _react(system, coupling, force, outcome.tangents[slot])
+        residual, step = scratch.newton[0], scratch.newton[1]
+        equilibrium.correct(system, residual, step)
+        energy += 0.5 * np.dot(residual, step)
+        q += step
+        for i in range(3):
+            force[i] += np.dot(coupling[i], step)
     else:
         outcome.forces[slot] = 0.0
         outcome.tangents[slot] = 0.0
@@ -540,7 +584,7 @@ def _react(system, coupling, force, tangent):
     step = system.step
     for i in range(3):
         step[:] = coupling[i]
-        _back_substitute(system.factor, step)
+        back_substitute(system.factor, step)
         for j in range(3):
             tangent[j, i] = np.dot(coupling[j], step) - touching.own[j, i]
 
@@ -584,20 +628,24 @@ def query(solver, x, most):
     models, memory, scratch, outcome = (
         solver.models, solver.memory, solver.scratch, solver.outcome,
     )  # fmt: skip
-    scalars, foot, normal = outcome.scalars, outcome.foot, outcome.normal
+    scalars, foot, upward = outcome.scalars, outcome.foot, outcome.upward
     scalars[:] = 0.0
     scalars[SMALLEST_J] = 1.0
     outcome.force[:] = 0.0
     outcome.tangent[:] = 0.0
     outcome.weight[:] = 0.0
-    distance = locate(solver.ground, x, scratch.ground, foot, normal, outcome.limit)
+    outcome.errors[:] = 0.0
+    outcome.features[:] = 0.0
+    distance = locate(solver.ground, x, scratch.ground, foot, upward, outcome.limit)
+    outcome.point[:] = foot
+    outcome.normal[:] = upward
     above = 0.0
     for i in range(3):
-        above += (x[i] - foot[i]) * normal[i]
+        above += (x[i] - foot[i]) * upward[i]
     radius = models.tip.radius
     beside = abs(above) < UPRIGHT * distance
     depth = radius - (distance if beside else math.copysign(distance, above))
-    scalars[DEPTH], scalars[DISTANCE] = depth, distance
+    scalars[DEPTH], scalars[DISTANCE], scalars[BESIDE] = depth, distance, 1.0 if beside else 0.0
     if depth > radius or depth < -SKIN * radius:
         return
     activate(models, x, memory, scratch.distance, outcome.weight)
@@ -607,7 +655,7 @@ def query(solver, x, most):
             k = memory.patch[slot]
             warm = k >= 0
             k = k if warm else -2 - k
-            _solve(models, k, slot, warm, x, normal, depth, most, memory, scratch, outcome)
+            _solve(models, k, slot, warm, x, upward, depth, most, memory, scratch, outcome)
             share = outcome.weight[slot]
             for i in range(3):
                 outcome.force[i] += share * outcome.forces[slot, i]
@@ -616,26 +664,43 @@ def query(solver, x, most):
                         share * outcome.tangents[slot, i, j]
                         + outcome.forces[slot, i] * scratch.fade[slot, j]
                     )
-
-    _features(outcome)
+    if scalars[TOUCHED] > 0.0:
+        _conclude(solver, x)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _features(outcome):
-    """What the error estimate is made of.
+def _conclude(solver, x):
+    """Where the force acts, and the estimated errors: ``log error = c . features``.
 
-    1, the depth over its limit and its log, smallest det F, the normal (where on the body), and the
-    logs of force over depth (mN/mm) and of the energy over that of a linear spring.
+    The features: 1, the depth over its limit and its log, smallest det F, the normal (where on the
+    body), and the logs of force over depth (mN/mm) and of the energy over that of a linear spring.
     """
-    scalars, features = outcome.scalars, outcome.features
+    outcome = solver.outcome
+    scalars, features, force = outcome.scalars, outcome.features, outcome.force
+    pushed = math.sqrt(np.dot(force, force))
+    if pushed > 0.0:
+        for i in range(3):
+            outcome.normal[i] = force[i] / pushed
+            outcome.point[i] = x[i] - solver.models.tip.radius * outcome.normal[i]
     depth = max(scalars[DEPTH], 1e-6)
     share = depth / max(outcome.limit[0], 1e-6)
-    pushed = math.sqrt(np.dot(outcome.force, outcome.force))
     features[0], features[1], features[2] = 1.0, share, math.log(share)
     features[3] = scalars[SMALLEST_J]
-    features[4:7] = outcome.normal
+    features[4:7] = outcome.upward
     features[7] = math.log(max(pushed / depth, 1e-6))
     features[8] = math.log(max(2.0 * scalars[ENERGY] / max(pushed * depth, 1e-9), 1e-3))
+    for i in range(3):
+        outcome.errors[i] = math.exp(np.dot(solver.coefficients[i], features))
+
+
+_WEIGHT = slice(0, MAX_ACTIVE)
+_FORCE, _POINT, _NORMAL = (slice(_WEIGHT.stop + 3 * i, _WEIGHT.stop + 3 * i + 3) for i in range(3))
+_TANGENT = slice(_NORMAL.stop, _NORMAL.stop + 9)
+_FEATURES = slice(_TANGENT.stop, _TANGENT.stop + TIP_ERROR_FEATURES)
+_ERRORS = slice(_FEATURES.stop, _FEATURES.stop + 3)
+_LIMIT = slice(_ERRORS.stop, _ERRORS.stop + 1)
+_SCALARS = slice(_LIMIT.stop, _LIMIT.stop + SCALARS)
+"""Where the parts of an outcome lie in a state's record."""
 
 
 class TipState:
@@ -651,14 +716,15 @@ class TipState:
     """
 
     def __init__(self, models: TipModels, ground: Ground, coefficients: Array) -> None:
-        self.tip = models.tip
-        self.coefficients = coefficients
+        self.radius = models.tip.radius
         count, m, entries = models.points.gradients.shape
         tangent_entries = models.tangent_points.gradients.shape[2]
         points = LANES * (entries // TILE)
         self.memory = TipMemory(
             patch=np.full(MAX_ACTIVE, -1, np.int64),
             q=np.zeros((MAX_ACTIVE, m)),
+            bulk=np.zeros((MAX_ACTIVE, m, m)),
+            formed=np.zeros((MAX_ACTIVE, m)),
             factor=np.zeros((MAX_ACTIVE, m, m)),
             coupling=np.zeros((MAX_ACTIVE, 3, m)),
             position=np.zeros((MAX_ACTIVE, 3)),
@@ -671,9 +737,11 @@ class TipState:
             linear=np.zeros(points),
             state=np.zeros(STATE * LANES * (tangent_entries // TILE), np.float32),
             increments=np.zeros((m, tangent_entries), np.float32),
+            latest=np.zeros(m),
             tangent=np.zeros((m, m)),
             newton=np.zeros((4, m)),
             moved=np.zeros(models.surface.nodes.shape),
+            own=np.zeros((3 * models.corners.shape[1], m)),
             folded=np.zeros((3 * models.corners.shape[1], m)),
             touching=room_for(models.surface, int(np.diff(models.face_from).max())),
             distance=np.zeros(count),
@@ -681,19 +749,27 @@ class TipState:
             features=np.zeros(TIP_FEATURES),
             ground=np.zeros(len(ground.radii) + 6),
         )
+        # one array, so that an answer is kept by one copy
+        self.record = record = np.zeros(_SCALARS.stop)
         self.outcome = TipOutcome(
-            weight=np.zeros(MAX_ACTIVE),
+            weight=record[_WEIGHT],
             foot=np.zeros(3),
-            normal=np.zeros(3),
-            force=np.zeros(3),
-            tangent=np.zeros((3, 3)),
+            upward=np.zeros(3),
+            force=record[_FORCE],
+            tangent=record[_TANGENT].reshape(3, 3),
+            point=record[_POINT],
+            normal=record[_NORMAL],
             forces=np.zeros((MAX_ACTIVE, 3)),
             tangents=np.zeros((MAX_ACTIVE, 3, 3)),
-            limit=np.zeros(1),
-            features=np.zeros(TIP_ERROR_FEATURES),
-            scalars=np.zeros(SCALARS),
+            limit=record[_LIMIT],
+            features=record[_FEATURES],
+            errors=record[_ERRORS],
+            scalars=record[_SCALARS],
         )
-        self.bound = bind(TipSolver(models, ground, self.memory, scratch, self.outcome))
+        solver = TipSolver(
+            models, ground, np.ascontiguousarray(coefficients), self.memory, scratch, self.outcome
+        )
+        self.bound = bind(solver)
 
     def forget(self) -> None:
         """Make the next answer independent of the last."""
@@ -777,39 +853,34 @@ def answer(state: TipState, position: Array, started: float, most: int = MAX_ITE
         If the tip's centre lies below the surface.
     """
     query(state.bound, position, most)
-    outcome, memory, radius = state.outcome, state.memory, state.tip.radius
-    scalars = outcome.scalars.tolist()
-    depth, limit = scalars[DEPTH], float(outcome.limit[0])
+    record, memory, radius = state.record.copy(), state.memory, state.radius
+    weights, scalars = record[_WEIGHT].tolist(), record[_SCALARS].tolist()
+    errors, limit = record[_ERRORS].tolist(), record[_LIMIT].item()
+    depth = scalars[DEPTH]
     if depth > radius:
         raise QueryError(
             "position",
             f"the tip's centre lies {depth - radius:.2f} mm below the accessible surface",
         )
     contact = scalars[TOUCHED] > 0
-    force, point, normal = outcome.force.copy(), outcome.foot.copy(), outcome.normal.copy()
     out_of_range: tuple[str, ...] = ()
-    if contact and abs(float((position - point) @ normal)) < UPRIGHT * scalars[DISTANCE]:
+    if contact and scalars[BESIDE]:
         out_of_range += ("position",)
     if depth > limit * (1 + 1e-9):
         out_of_range += ("depth",)
-    pushed = math.sqrt(float(force @ force))
-    if pushed > 0:
-        normal = force / pushed
-        point = position - radius * normal
-    errors = np.exp(state.coefficients @ outcome.features).tolist() if contact else [0.0] * 3
     patches = []
     if contact:
-        for slot, weight in enumerate(outcome.weight.tolist()):
+        for slot, weight in enumerate(weights):
             if weight > 0:
                 k = int(memory.patch[slot])
                 patches.append((k if k >= 0 else -2 - k, weight, memory.q[slot].copy()))
     return Touch(
         position=position,
         contact=contact,
-        force=force,
-        tangent=outcome.tangent.copy(),
-        contact_point=point,
-        normal=normal,
+        force=record[_FORCE],
+        tangent=record[_TANGENT].reshape(3, 3),
+        contact_point=record[_POINT],
+        normal=record[_NORMAL],
         depth=depth,
         depth_limit=limit,
         penetration=scalars[PENETRATION],
@@ -822,7 +893,7 @@ def answer(state: TipState, position: Array, started: float, most: int = MAX_ITE
         error_von_mises=errors[1],
         error_force=errors[2],
         min_jacobian=scalars[SMALLEST_J],
-        features=outcome.features.copy(),
+        features=record[_FEATURES],
         patches=tuple(patches),
         solve_seconds=time.perf_counter() - started,
     )

@@ -5,7 +5,16 @@ import csv
 import pytest
 
 from offline.studies import mesh_error, newton_step
+from offline.studies.continuity import tip_continuity
 from offline.studies.mesh_error import Discretisation
+
+
+def test_the_force_on_a_gliding_tip_jumps_no_more_than_the_full_models(artifact):
+    found = tip_continuity(artifact, 2, 6, 3)
+    assert found["steps"] + found["left_out"] == 12
+    assert found["left_out"] < 6
+    assert 0 < found["excess"]["max"] <= 0.01
+    assert found["excess"]["median"] < found["change"]["median"]
 
 
 @pytest.mark.parametrize("element", ["hex8", "hex20"])

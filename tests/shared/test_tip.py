@@ -82,6 +82,21 @@ def test_force_and_stiffness_are_derivatives_of_the_energy(kind, rng):
     assert np.abs(own).max() <= 1e-6 * np.abs(touching.own @ away).max()
 
 
+@pytest.mark.parametrize("kind", [4, 8])
+def test_the_blocks_that_are_not_looked_at_are_not_touched(kind, rng):
+    nodes, faces = plate(kind)
+    surface = surface_of(nodes, faces)
+    everywhere = surface._replace(reach=np.full_like(surface.reach, np.inf))
+    for _ in range(20):
+        bend = rng.uniform(-0.5, 0.5, 2)  # 1/mm
+        moved = 0.03 * rng.standard_normal(nodes.shape)
+        moved[:, 2] += nodes[:, :2] ** 2 @ bend / 2
+        x = np.array([*rng.uniform(-1.5, 1.5, 2), 1.95 + np.abs(bend).max()])
+        _, near, _, deepest, _ = pressed(surface, x, moved)
+        assert np.array_equal(near, pressed(everywhere, x, moved)[1])
+        assert deepest > 0 or not near.any()
+
+
 def test_the_force_does_not_depend_on_the_frame(rng):
     nodes, faces = plate()
     moved = 0.02 * rng.standard_normal(nodes.shape)
@@ -98,11 +113,11 @@ def test_on_a_rigid_plane_the_force_is_known():
     nodes, faces = plate()
     depth = 0.05
     *_, force, deepest, _ = pressed(surface_of(nodes, faces), np.array([0, 0, 1.95]), 0 * nodes)
-    # pressure k d in the depth d(r) = depth - r^2 / 2R, integrated over the disc
-    expected = np.pi * TIP.stiffness * TIP.radius * depth**2
+    # the pressure in the depth d(r) = depth - r^2 / 2R, integrated over the disc
+    expected = 2 * np.pi * TIP.radius * penalty(TIP, depth)[0]
     assert force[2] == pytest.approx(expected, rel=0.04)
     off = SPACING * TIP.radius / np.sqrt(2)  # the nearest point may be so far off
-    assert depth - off**2 / (2 * TIP.radius) <= deepest <= depth
+    assert TIP.radius - np.hypot(TIP.radius - depth, off) <= deepest + 1e-12 <= depth
     assert np.abs(force[:2]).max() < 1e-9 * force[2]
 
 

@@ -60,7 +60,7 @@ def path(atlas, depth, points):
 
 
 def test_the_tangent_is_the_derivative_of_the_force(atlas):
-    h = 0.02  # the solver's tolerance is noise in the force
+    h = 0.005
     for at in ((0.5, 0.5), (0.31, 0.62), (0.7, 0.44)):
         x = above(atlas, 0.6, at)
         tangent = atlas.touch(x).tangent
@@ -68,7 +68,7 @@ def test_the_tangent_is_the_derivative_of_the_force(atlas):
             step = h * np.eye(3)[axis]
             forces = [atlas.touch(x + s * step).force for s in (1, -1)]
             slope = (forces[0] - forces[1]) / (2 * h)
-            assert np.abs(tangent[:, axis] - slope).max() <= 0.02 * np.abs(tangent).max()
+            assert np.abs(tangent[:, axis] - slope).max() <= 0.01 * np.abs(tangent).max()
 
 
 def test_energy_put_in_comes_out_again(atlas):
@@ -88,6 +88,15 @@ def test_energy_put_in_comes_out_again(atlas):
     assert work[:59].sum() == pytest.approx(answers[59].energy, rel=0.02)
 
 
+def jumps(answers):
+    """Change of the force from answer to answer that their tangents do not foretell, (k - 1,)."""
+    x, force, tangent = (
+        np.array([getattr(a, name) for a in answers]) for name in ("position", "force", "tangent")
+    )
+    foretold = np.einsum("kij,kj->ki", (tangent[1:] + tangent[:-1]) / 2, np.diff(x, axis=0))
+    return np.linalg.norm(np.diff(force, axis=0) - foretold, axis=1)
+
+
 def test_the_force_has_no_jumps_on_a_path(atlas):
     """In steps of 0.05 mm across all local models, in and out of contact."""
     width = atlas.nodes[:, 0].max()
@@ -97,12 +106,12 @@ def test_the_force_has_no_jumps_on_a_path(atlas):
     force = np.array([a.force for a in glide])
     largest = np.linalg.norm(force, axis=1).max()
     assert len({k for a in glide for k, _, _ in a.patches}) >= 3
+    assert jumps(glide).max() <= 0.01 * largest
     assert np.linalg.norm(np.diff(force, axis=0), axis=1).max() <= 0.02 * largest
     state = atlas.new_state()
-    depths = np.arange(0.3, -0.1, -0.01)
-    fading = [np.linalg.norm(atlas.touch(above(atlas, d), state).force) for d in depths]
-    assert fading[-1] == 0.0
-    assert np.abs(np.diff(fading)).max() <= 0.02 * largest
+    fading = [atlas.touch(above(atlas, d), state) for d in np.arange(0.4, -0.1, -0.02)]
+    assert not fading[-1].force.any()
+    assert jumps(fading).max() <= 0.01 * largest
 
 
 def test_where_it_came_from_does_not_matter(atlas):
@@ -112,7 +121,7 @@ def test_where_it_came_from_does_not_matter(atlas):
     for depth in (0.1, 0.9, 0.5):
         atlas.touch(above(atlas, depth, (0.5, 0.5)), state)
     warm = atlas.touch(x, state)
-    np.testing.assert_allclose(warm.force, cold.force, atol=5e-3 * np.linalg.norm(cold.force))
+    np.testing.assert_allclose(warm.force, cold.force, atol=1e-3 * np.linalg.norm(cold.force))
 
 
 def test_what_is_outside_the_range_is_flagged(atlas):
