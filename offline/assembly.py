@@ -10,12 +10,15 @@ elements, whose points share one dilatation theta through ``Fbar = (theta / J)^(
   hexahedra: Flanagan & Belytschko 1981.)
 
 Both derive from ``sum_q w_q W(Fbar_q)``, hence symmetric tangents.
+
+``viscous`` loops add what the past does to the stress, to either kind of element: it is isochoric,
+so F and Fbar are the same to it.
 """
 
 import numpy as np
 from numba import njit
 
-from shared import tissue
+from shared import tissue, viscosity
 
 
 @njit(cache=True, error_model="numpy")
@@ -249,3 +252,74 @@ def dilatation_tangent(conn, grad, weight, theta_grad, theta_weight, mu, lam, u,
                         s = 3 * b + k
                         K[i, k, a, b] += Bm[p] * g[s] + g[p] * Bm[s] + r * g[s]
         _scatter(K, slots[e], data)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def predict(history, weights, B):
+    """``viscosity.predict`` at every point: history (e, q, terms + 1, 7), B (e, q, 7)."""
+    for e in range(len(B)):
+        for q in range(B.shape[1]):
+            viscosity.predict(history[e, q], weights, B[e, q])
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def advance(conn, grad, u, weights, history):
+    """``viscosity.advance`` to the displacement ``u`` at every point, in place."""
+    F, Finv, m = np.empty(9), np.empty(9), np.empty(viscosity.COMPONENTS)
+    for e in range(len(conn)):
+        for q in range(grad.shape[1]):
+            _deformation_gradient(conn[e], grad[e, q], u, F)
+            viscosity.driving(F, Finv, m)
+            viscosity.advance(history[e, q], m, weights)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def viscous_residual(conn, grad, weight, mu, B, u, r):
+    """Add the force of the past at ``u``, where nothing is inverted, to ``r``; return its energy.
+
+    B (e, q, 7), see ``shared.viscosity``; else as ``standard_residual``.
+    """
+    F, Finv, P = np.empty(9), np.empty(9), np.empty(9)
+    energy = 0.0
+    for e in range(len(conn)):
+        for q in range(weight.shape[1]):
+            _deformation_gradient(conn[e], grad[e, q], u, F)
+            J = tissue.inverse_and_jacobian(F, Finv)
+            P[:] = 0.0
+            w = weight[e, q]
+            energy += w * viscosity.add_stress(F, B[e, q], mu[e], J, P)
+            for a in range(conn.shape[1]):
+                for i in range(3):
+                    f = 0.0
+                    for j in range(3):
+                        f += P[3 * i + j] * grad[e, q, a, j]
+                    r[3 * conn[e, a] + i] += w * f
+    return energy
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def viscous_tangent(conn, grad, weight, mu, B, u, slots, data):
+    """Add the tangent of ``viscous_residual`` to CSR ``data`` (mN/mm)."""
+    n = conn.shape[1]
+    F, Finv, FB, A = np.empty(9), np.empty(9), np.empty(9), np.empty((9, 9))
+    G, C, K = np.empty((3, n)), np.empty((9, n)), np.empty((3, 3, n, n))
+    for e in range(len(conn)):
+        K[:] = 0.0
+        for q in range(weight.shape[1]):
+            _deformation_gradient(conn[e], grad[e, q], u, F)
+            A[:] = 0.0
+            viscosity.add_tangent(F, B[e, q], mu[e], Finv, FB, A)
+            _add_point_tangent(grad[e, q], A, weight[e, q], G, C, K)
+        _scatter(K, slots[e], data)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def dissipated_power(conn, grad, weight, mu, u, history, weights, tau):
+    """Integral (mN mm/s) of ``viscosity.dissipation``; history (e, q, terms + 1, 7)."""
+    F = np.empty(9)
+    power = 0.0
+    for e in range(len(conn)):
+        for q in range(weight.shape[1]):
+            _deformation_gradient(conn[e], grad[e, q], u, F)
+            power += weight[e, q] * viscosity.dissipation(F, history[e, q], weights, tau, mu[e])
+    return power

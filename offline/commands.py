@@ -139,19 +139,37 @@ def picture(
     help="Of the random loads.",
 )
 @click.option("--tip", is_flag=True, help="Push with the rigid tip, not with pressures.")
+@click.option(
+    "--histories",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Follow so many histories of visco-elastic tissue, not single loads.",
+)
 @click.option("--csv", type=OUTPUT, metavar="OUT", help="Write one row per query.")
 @json_option
 def validate(
-    artifact: Path, queries: int, seed: int, tip: bool, csv: Path | None, as_json: bool
+    artifact: Path,
+    queries: int,
+    seed: int,
+    tip: bool,
+    histories: int | None,
+    csv: Path | None,
+    as_json: bool,
 ) -> None:
     """Compare the artifact F with the full model.
 
-    Both solve new random loads, or positions of the tip, over the artifact's whole range. Errors
-    are relative L2 norms, as fractions.
+    Both solve new random loads, positions of the tip, or histories of loads, over the artifact's
+    whole range. Errors are relative L2 norms, as fractions; of histories, over all moments too.
     """
+    from offline.histories import validate_histories
     from offline.touches import validate_touches
     from offline.validate import validate
 
+    if histories is not None:
+        if tip:
+            raise click.UsageError("--tip and --histories exclude each other")
+        _show(validate_histories(artifact, histories, seed, csv), as_json)
+        return
     _show((validate_touches if tip else validate)(artifact, queries, seed, csv), as_json)
 
 
@@ -353,6 +371,24 @@ def stability(scene: str, artifact: Path | None, cases: int, seed: int, as_json:
 
     path = artifact or default_artifact(find_scene(scene))
     _show(stability(path, cases, seed), as_json)
+
+
+@study.command()
+@artifact_argument
+@click.option("--at", "position", type=VECTOR, metavar="X Y Z", help="mm  [default: the middle]")
+@json_option
+def relaxation(artifact: Path, position: tuple[float, float, float] | None, as_json: bool) -> None:
+    """Press the visco-elastic tissue of the artifact F, hold, release, wait.
+
+    Force and depth over time, of the full and the reduced model, go to NAME/report/relaxation.csv
+    and .png beside the artifact.
+    """
+    import numpy as np
+
+    from offline.studies.relaxation import relaxation
+
+    at = None if position is None else np.array(position)
+    _show(relaxation(artifact, at), as_json)
 
 
 def _show(report: Mapping[str, object], as_json: bool) -> None:

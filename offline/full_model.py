@@ -7,7 +7,7 @@ It gives ``shared.equilibrium`` its potential, tangent and correction on the fre
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,7 +17,7 @@ from scipy.sparse import csr_matrix
 from offline import assembly
 from offline.linear_solver import NotPositiveDefinite, sparse_solver
 from offline.mesh import Mesh
-from shared import equilibrium, tip
+from shared import equilibrium, tip, viscosity
 from shared.errors import PalpateError
 from shared.quadrature import volume_quadrature
 from shared.scene import ElementName, Scene
@@ -28,6 +28,9 @@ Array = NDArray[np.float64]
 
 TOLERANCE = 1e-9
 """Residual of an equilibrium relative to the load, both in the Euclidean norm of nodal forces."""
+
+ROUND_OFF = 1e-13
+"""Of forces, relative to those that deform the whole body."""
 
 MAX_ITERATIONS = 40
 REUSE = 0.05
@@ -56,6 +59,14 @@ class TipEquilibrium(Equilibrium):
     tangent: Array  # (3, 3) mN/mm, derivative of the force in the tip's position
     penetration: float  # mm, largest
     energy: float  # mN mm, stored in tissue and penalty
+
+
+@dataclass(frozen=True)
+class History:
+    """What tissue remembers; see ``shared.viscosity``."""
+
+    displacement: Array  # (nodes, 3) mm, the last
+    points: Array  # (e, q, terms + 1, 7), at quadrature points
 
 
 class TipContact:
@@ -128,19 +139,24 @@ class FullModel:
     mesh : Mesh
     element : {"hex8", "hex8-mean-dilatation", "hex8-fbar", "hex20"}
     young, poisson : float
-        kPa and 1.
+        kPa and 1; of tissue that had no time to relax.
+    prony : tuple of (float, float)
+        Share of the isochoric stress that is lost with each time constant (s). Only ``step`` knows
+        of time: ``solve`` and ``touch`` answer instantly.
     """
 
     mesh: Mesh
     element: ElementName
     young: float
     poisson: float
+    prony: tuple[tuple[float, float], ...] = ()
     _load: Array = field(init=False, repr=False)
 
     @classmethod
     def of(cls, scene: Scene, mesh: Mesh) -> FullModel:
         """Full model of a scene on its mesh."""
-        return cls(mesh, scene.geometry.element, scene.tissue.young, scene.tissue.poisson)
+        tissue = scene.tissue
+        return cls(mesh, scene.geometry.element, tissue.young, tissue.poisson, tissue.prony)
 
     def __post_init__(self) -> None:
         mesh = self.mesh
@@ -160,6 +176,27 @@ class FullModel:
         self._solver = sparse_solver(self.pattern)
         self._at_rest = False
         self._contact: TipContact | None = None
+        self._past: Array | None = None
+
+    @cached_property
+    def relaxed(self) -> FullModel:
+        """The model of what the tissue is after an infinite time, elastic."""
+        if not self.prony:
+            return self
+        other = replace(self, prony=())
+        other._past = np.zeros((*self.weights.shape, viscosity.COMPONENTS))
+        at_rest, weights = self.at_rest.points, viscosity.step_weights(self.prony, np.inf)
+        assembly.predict(at_rest, weights, other._past)
+        return other
+
+    @property
+    def at_rest(self) -> History:
+        """Tissue that nothing has happened to."""
+        terms = len(self.prony) + 1
+        return History(
+            np.zeros((len(self.mesh.nodes), 3)),
+            np.zeros((*self.weights.shape, terms, viscosity.COMPONENTS)),
+        )
 
     def _theta_points(self) -> tuple[Array, Array] | None:
         """Gradients and weights of the points whose J make up an element's dilatation."""
@@ -212,10 +249,16 @@ class FullModel:
         force[:] = 0.0
         args = (self.connectivity, self.gradients, self.weights)
         if self._theta is None:
-            return assembly.standard_residual(*args, self.mu, self.lam, displacement, force)
-        return assembly.dilatation_residual(
-            *args, *self._theta, self.mu, self.lam, displacement, force
-        )
+            energy, smallest = assembly.standard_residual(
+                *args, self.mu, self.lam, displacement, force
+            )
+        else:
+            energy, smallest = assembly.dilatation_residual(
+                *args, *self._theta, self.mu, self.lam, displacement, force
+            )
+        if self._past is not None and smallest > 0.0:
+            energy += assembly.viscous_residual(*args, self.mu, self._past, displacement, force)
+        return energy, smallest
 
     def internal_free(self, u: Array) -> Array:
         """Internal force (free dofs,) mN of a displacement (free dofs,) mm.
@@ -263,12 +306,23 @@ class FullModel:
             assembly.standard_tangent(*args, *rest)
         else:
             assembly.dilatation_tangent(*args, *self._theta, *rest)
+        if self._past is not None:
+            assembly.viscous_tangent(
+                *args, self.mu, self._past, displacement, self._slots, self._data
+            )
         return csr_matrix((self._data, self.pattern.indices, self.pattern.indptr), copy=False)
 
     @cached_property
     def rest_stiffness(self) -> csr_matrix:
-        """Stiffness (mN/mm) of the free dofs at rest."""
-        return self.stiffness(np.zeros_like(self._full)).copy()
+        """Stiffness (mN/mm) of the free dofs at rest, where nothing has happened before."""
+        data, past = self._data, self._past
+        self._data = np.zeros_like(data)
+        if self.prony:
+            self._past = None
+        try:
+            return self.stiffness(np.zeros_like(self._full))
+        finally:
+            self._data, self._past = data, past
 
     # what shared.equilibrium asks for ------------------------------------------------------------
 
@@ -307,6 +361,7 @@ class FullModel:
         start: Array | None = None,
         reuse: float = REUSE,
         smallest_step: float = 1 / 64,
+        least: float = 1e-12,
     ) -> Equilibrium:
         """Equilibrium under a dead load, in one jump if that converges, else in load steps.
 
@@ -319,6 +374,8 @@ class FullModel:
             See ``shared.equilibrium.newton``.
         smallest_step : float
             Fraction of the load below which a step is given up.
+        least : float, mN
+            Residual that counts as equilibrium under any load, however small.
 
         Raises
         ------
@@ -329,8 +386,63 @@ class FullModel:
         def apply(fraction: float) -> None:
             np.multiply(full_load, fraction, out=self._load)
 
-        target = max(TOLERANCE * float(np.linalg.norm(full_load)), 1e-12)
+        target = max(TOLERANCE * float(np.linalg.norm(full_load)), least)
         return self._follow(apply, target, start, reuse, smallest_step, "pressure")[0]
+
+    def step(
+        self, history: History, load: Array, dt: float, start: Array | None = None
+    ) -> tuple[Equilibrium, History]:
+        """Equilibrium under a dead load ``dt`` after the end of a history, and the longer history.
+
+        Parameters
+        ----------
+        history : History
+        load : ndarray, shape (nodes, 3), mN
+        dt : float, s
+            May be 0, for a sudden change, or infinite.
+        start : ndarray, shape (nodes, 3), mm, optional
+            First guess; the history's last displacement if absent.
+
+        Raises
+        ------
+        NoEquilibrium
+        """
+        weights = viscosity.step_weights(self.prony, dt)
+        self._past = np.zeros((*self.weights.shape, viscosity.COMPONENTS))
+        assembly.predict(history.points, weights, self._past)
+        if start is None:
+            start = history.displacement
+        try:
+            found = self.solve(load, start, least=self._least_residual(history))
+        finally:
+            self._past, self._at_rest = None, False
+        points = history.points.copy()
+        u = found.displacement.reshape(-1)
+        assembly.advance(self.connectivity, self.gradients, u, weights, points)
+        return found, History(found.displacement, points)
+
+    def _least_residual(self, history: History) -> float:
+        """Residual (mN) that counts as equilibrium: small beside what the past exerts, or none."""
+        force = np.zeros_like(self._full)
+        assembly.viscous_residual(
+            self.connectivity, self.gradients, self.weights, self.mu, self._past,
+            history.displacement.reshape(-1), force,
+        )  # fmt: skip
+        none = ROUND_OFF * self.young * self.weights.sum() ** (2 / 3)
+        return max(TOLERANCE * float(np.linalg.norm(force[self.free])), float(none))
+
+    def energies(self, history: History) -> tuple[float, float]:
+        """Stored energy (mN mm) and dissipated power (mN mm/s) at the end of a history."""
+        u = history.displacement.reshape(-1)
+        weights = viscosity.step_weights(self.prony, 0.0)
+        past = np.zeros((*self.weights.shape, viscosity.COMPONENTS))
+        assembly.predict(history.points, weights, past)
+        args = (self.connectivity, self.gradients, self.weights, self.mu)
+        stored, _ = self.internal(u, self._force)
+        stored += assembly.viscous_residual(*args, past, u, self._force)
+        stored -= 1.5 * float(np.einsum("e,eq,eq->", self.mu, self.weights, past[..., 6]))
+        tau = np.array([tau for _, tau in self.prony])
+        return stored, assembly.dissipated_power(*args, u, history.points, weights, tau)
 
     def touch(
         self,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from offline.cubature import compress, damped_fit, nonlinear_forces, nonnegative, point_forces
 from offline.full_model import FullModel
 from offline.sampling import cone, tangents
-from offline.spaces import Footprint, local_modes
+from offline.spaces import RITZ_VECTORS, Footprint, local_modes
 from offline.tips import TipResult, compile_tip_query, train_tip
 from shared import equilibrium
 from shared.atlas import Body, LocalModels, State, assemble_patches
@@ -80,7 +80,7 @@ class RegionResult:
     """Basis of a region, (M, 3 n) int16 in steps (M,), and what patches learn from.
 
     ``orthonormal`` (M, M) holds, as columns in the basis, modes orthonormal in the energy of the
-    rest state; ``ritz`` (k, M, 19) are Ritz vectors in those.
+    rest state; ``ritz`` (k, M, 19 or more) are Ritz vectors in those, of the relaxed tissue last.
     """
 
     basis: NDArray[np.int16]
@@ -289,7 +289,7 @@ def train_patch(
         modes=(region.orthonormal @ leading).astype(np.float16),
         points=np.arange(len(weights), dtype=np.int32),
         weights=weights,
-        path=_fit_path(leading.T @ ritz, task, frame).astype(np.float16),
+        path=_fit_path(leading.T @ ritz[:, :, :RITZ_VECTORS], task, frame).astype(np.float16),
         defect=np.zeros((PATH_FEATURES, leading.shape[1]), np.float16),
         guess=np.zeros((FEATURES, LEADING + PATH), np.float16),
         residual=np.zeros(RESIDUAL_FEATURES),

@@ -61,6 +61,7 @@ from offline.validate import (
     summarise,
     write_rows,
 )
+from offline.viscous import viscous_models
 from offline.workers import Tasks, resume, worker_pool
 from offline.workshop import Load, TouchSample, Workshop, open_workshop, run
 from shared.artifact import Dataset, write_artifact
@@ -336,7 +337,7 @@ class Pipeline:
             )
         found = self._stage("local models", tasks, PatchResult.arrays)
         results = [PatchResult.of(found[name]) for name in tasks]
-        return LocalModels(
+        models = LocalModels(
             basis=np.stack([result.basis for result, _ in regions]),
             steps=np.stack([result.steps for result, _ in regions]),
             region=layout.region,
@@ -355,6 +356,9 @@ class Pipeline:
             blend=self.scene.training.blend,
             tips=_gather([r.tip for r in results]),
         )
+        if self.scene.tissue.prony:
+            models = replace(models, viscous=viscous_models(self.workshop.model, models))
+        return models
 
     def _validate_tip(
         self, models: LocalModels, limits: Array
@@ -558,6 +562,17 @@ class Pipeline:
                 ),
                 "tip_error_coefficients": Dataset(
                     tip_estimator.coefficients, one, "as error_coefficients; third row: force"
+                ),
+            }
+        if models.viscous is not None:
+            viscous = models.viscous
+            datasets |= {
+                "viscous_deviatoric": Dataset(
+                    viscous.deviatoric.astype(np.float16), one, "deviatoric stiffness in the modes"
+                ),
+                "viscous_pairs": Dataset(viscous.pairs, one, "local models whose spaces meet"),
+                "viscous_overlap": Dataset(
+                    viscous.overlap.astype(np.float16), one, "products of their modes, in energy"
                 ),
             }
         documents["provenance"]["wall_seconds"] = round(sum(self.seconds.values()), 1)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from offline.choose import TrialResult
-from offline.full_model import Equilibrium, FullModel, NoEquilibrium, TipContact
+from offline.full_model import Equilibrium, FullModel, History, NoEquilibrium, TipContact
 from offline.load_path import LoadPath, pressure_that_moves
 from offline.mesh import Mesh, build_mesh, local_thickness
 from offline.norms import relative
@@ -34,14 +34,14 @@ from offline.patches import (
     train_patch,
 )
 from offline.refinement import refined, twin
-from offline.spaces import Footprint, energy_pod, ritz_vectors
+from offline.spaces import RITZ_VECTORS, Footprint, energy_pod, ritz_vectors
 from offline.surface_mesh import accessible_surface
 from shared.artifact import Artifact, read_artifact
 from shared.atlas import Body
 from shared.endoscope import footprint
 from shared.quadrature import stress_recovery
 from shared.scene import Scene, parse_scene
-from shared.stress import StressRecovery, nodal_von_mises
+from shared.stress import StressRecovery, nodal_von_mises, nodal_von_mises_after
 from shared.surface import Surface
 from shared.tip import tip_of, tip_surface
 
@@ -160,6 +160,19 @@ class Workshop:
         nodal_von_mises(self._recovery, np.ascontiguousarray(displacement, dtype=float), out)
         return out
 
+    def von_mises_after(self, history: History) -> Array:
+        """Nodal von Mises stress (n,) kPa at the end of a history."""
+        shares = np.array([share for share, _ in self.model.prony])
+        past = np.einsum("a,eqai->eiq", shares, history.points[:, :, :-1, :6])
+        out = np.zeros(len(self.mesh.nodes))
+        nodal_von_mises_after(self._recovery, history.displacement, np.ascontiguousarray(past), out)
+        return out
+
+    def under(self, position: Array, displacement: Array) -> Array:
+        """Mean displacement (3,) under a footprint, weighted with its pressure."""
+        nodal, _ = self.unit_load(position)
+        return np.asarray(nodal @ displacement / nodal.sum())
+
     # --- tasks ---------------------------------------------------------------------------------
 
     def load_range(self, position: Array) -> Array:
@@ -168,20 +181,21 @@ class Workshop:
         The limit along the normal is where the tissue moves by the scene's indentation, or beyond
         which it has no equilibrium; the depth of the tip is how far the footprint has sunk then.
         """
+        model = self.model.relaxed  # for as long as it takes
         nodal, normal = self.unit_load(position)
-        unit = np.einsum("n,ij->nij", nodal, np.eye(3)).reshape(-1, 3)[self.model.free]
-        linear = self.model.solve_linear(unit)
+        unit = np.einsum("n,ij->nij", nodal, np.eye(3)).reshape(-1, 3)[model.free]
+        linear = model.solve_linear(unit)
         C = unit.T @ linear / nodal.sum()
         thickness = local_thickness(self.mesh, position[None], normal[None])[0]
         wanted = self.scene.load.max_indentation * thickness
         pressure = wanted / np.linalg.norm((linear @ normal).reshape(-1, 3), axis=1).max()
-        path = LoadPath(self.model, -unit @ normal)
+        path = LoadPath(model, -unit @ normal)
         # no load steps in the full model: where a jump fails, the pressure between is asked for
         near = pressure_that_moves(path.solve, wanted, pressure)
 
         def full(pressure: float, start: Array | None) -> Array:
             force = -pressure * nodal[:, None] * normal
-            return self.model.solve(force, start, smallest_step=1.0).displacement
+            return model.solve(force, start, smallest_step=1.0).displacement
 
         limit, _, moved = pressure_that_moves(full, wanted, *near)
         depth = 0.0 if moved is None else -float(nodal @ moved @ normal) / nodal.sum()
@@ -192,7 +206,9 @@ class Workshop:
         """Basis of a region and the Ritz vectors of footprints in it."""
         model = self.model
         vectors = np.stack([self._ritz(footprint) for footprint in footprints], axis=1)
-        linear, rest = vectors[:, :, :3], vectors[:, :: -(-len(footprints) // POINTS_IN_BASIS), 3:]
+        first = np.arange(vectors.shape[2]) % RITZ_VECTORS < 3
+        apart = -(-len(footprints) // POINTS_IN_BASIS)
+        linear, rest = vectors[:, :, first], vectors[:, ::apart, ~first]
         wanted = [part.reshape(len(model.free), -1) for part in (linear, rest)]
         basis, _ = energy_pod(model, np.hstack(wanted), modes)
         vectors = vectors.reshape(len(model.free), -1)
@@ -237,9 +253,11 @@ class Workshop:
         return energy_pod(model, dents, DENTS)[0]
 
     def _ritz(self, footprint: Footprint) -> Array:
+        """Nonlinear Ritz vectors, and those of the relaxed tissue if time changes it."""
         nodal, _ = self.unit_load(footprint.point)
-        loads = (nodal[:, None, None] * footprint.loads.T).reshape(-1, 3)
-        return ritz_vectors(self.model, loads[self.model.free])
+        loads = (nodal[:, None, None] * footprint.loads.T).reshape(-1, 3)[self.model.free]
+        models = [self.model, self.model.relaxed] if self.model.prony else [self.model]
+        return np.hstack([ritz_vectors(model, loads) for model in models])
 
     def compile_query(self) -> None:
         """Compile what ``patch`` runs."""
@@ -325,6 +343,23 @@ class Workshop:
             np.array(found.energy),
             np.array(found.penetration),
         )
+
+    def follow(
+        self, loads: list[Load], times: list[float]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        """Full displacements (t, n, 3) mm and von Mises stresses (t, n) kPa of a history.
+
+        None where there is no equilibrium.
+        """
+        history, displacements, stresses = self.model.at_rest, [], []
+        try:
+            for load, dt in zip(loads, times, strict=True):
+                _, history = self.model.step(history, self.load_vector(load), dt)
+                displacements.append(history.displacement.astype(np.float32))
+                stresses.append(self.von_mises_after(history).astype(np.float32))
+        except NoEquilibrium:
+            return None
+        return np.array(displacements), np.array(stresses)
 
     def sample(self, load: Load) -> NDArray[np.float32] | None:
         """Full displacement (n, 3) mm, None where there is no equilibrium."""

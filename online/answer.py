@@ -14,7 +14,7 @@ from online import wire
 from online.errors import Refusal
 from online.metrics import PHASES, Metrics
 from online.negotiation import JSON
-from online.schemas import SolveRequest, parse_request
+from online.schemas import HistoryRequest, SolveRequest, parse_request
 from online.store import Model
 from shared.answer import describe
 from shared.atlas import Atlas, Solution
@@ -43,7 +43,7 @@ def answer(
     atlas = model.atlas
     contact = request.contacts[0]
     if media_type == JSON:
-        _check_size(atlas, request, max_json_numbers)
+        check_size(atlas, request, max_json_numbers)
     if contact.pressure > ABSURD * atlas.pressure_max:
         raise Refusal(
             "unanswerable_query",
@@ -96,7 +96,7 @@ def answer(
     return Response(content, media_type=media_type, headers={"server-timing": timing})
 
 
-def _check_size(atlas: Atlas, request: SolveRequest, limit: int) -> None:
+def check_size(atlas: Atlas, request: SolveRequest | HistoryRequest, limit: int) -> None:
     """Refuse fields that would keep the event loop busy writing decimals."""
     nodes = {"none": 0, "surface": len(atlas.surface_nodes), "all": len(atlas.nodes)}
     per_node = 3 * ("displacement" in request.outputs) + ("von_mises" in request.outputs)

@@ -15,10 +15,11 @@ from pydantic.json_schema import models_json_schema
 
 from online import errors, guard, session
 from online.answer import answer
+from online.history import answer_history
 from online.metrics import Metrics
-from online.negotiation import OFFERED
+from online.negotiation import JSON, OFFERED
 from online.routes import add_routes
-from online.schemas import SolveRequest
+from online.schemas import HistoryRequest, SolveRequest
 from online.settings import Settings
 from online.store import Model, Store
 
@@ -115,7 +116,23 @@ def _warm(model: Model) -> None:
         body = orjson.dumps({"contacts": [model.example], "region": region})
         for media_type in OFFERED:
             answer(model, body, media_type, 10**9, uncounted)
+    _warm_history(model, uncounted)
     session.warm(model, uncounted)
+
+
+def _warm_history(model: Model, metrics: Metrics) -> None:
+    """From one local model to the next and back: everything that a history may need."""
+    if not model.atlas.scene.tissue.prony:
+        return
+    models = model.atlas.models
+    assert models.viscous is not None, "or the tissue would be elastic"
+    here, there = models.centres[models.viscous.pairs[0]].tolist()
+    steps = [
+        {"time": 0.1 * number, "contact": {"position": position, "pressure": 0.1}}
+        for number, position in enumerate((here, there, here))
+    ]
+    body = orjson.dumps({"steps": steps, "region": "all"})
+    answer_history(model, body, JSON, 10**9, metrics)
 
 
 def _describe_request(app: FastAPI) -> None:
@@ -125,7 +142,8 @@ def _describe_request(app: FastAPI) -> None:
     def openapi() -> dict[str, Any]:
         document = generate()
         _, definitions = models_json_schema(
-            [(SolveRequest, "validation")], ref_template="#/components/schemas/{model}"
+            [(SolveRequest, "validation"), (HistoryRequest, "validation")],
+            ref_template="#/components/schemas/{model}",
         )
         document["components"]["schemas"].update(definitions["$defs"])
         return document

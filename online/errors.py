@@ -22,6 +22,7 @@ STATUS = {
     "foreign_origin": 403,
     "unknown_scene": 404,
     "no_tip": 404,
+    "no_time": 404,
     "not_found": 404,
     "method_not_allowed": 405,
     "not_acceptable": 406,

@@ -13,12 +13,14 @@ from online.answer import answer
 from online.echo import ECHO, Echo
 from online.errors import Refusal
 from online.guard import METRICS
+from online.history import answer_history
 from online.metrics import CONTENT_TYPE, Metrics
 from online.negotiation import BINARY, JSON, MSGPACK, negotiate
 from online.schemas import (
     Accessible,
     Answer,
     Checked,
+    HistoryAnswer,
     Mesh,
     MeshRegion,
     Problem,
@@ -95,6 +97,32 @@ def add_routes(app: FastAPI, store: Store, settings: Settings, metrics: Metrics)
         model = store.model(request.path_params["name"])
         body = await _read(request, settings.max_body)
         return answer(model, body, media_type, settings.max_json_numbers, metrics)
+
+    @app.post(
+        "/scenes/{name}/history",
+        tags=["scenes"],
+        response_model=None,
+        responses={
+            **_document(HistoryAnswer, "How the tissue answers, step by step"),
+            **_problems(404, 406, 413, 415, 422),
+        },
+        openapi_extra={
+            "parameters": [_NAME],
+            "requestBody": {
+                "required": True,
+                "content": {JSON: {"schema": {"$ref": "#/components/schemas/HistoryRequest"}}},
+            },
+        },
+    )
+    async def history(request: Request) -> Response:
+        """Press visco-elastic tissue over time: force and displacement at every step.
+
+        Every request starts at rest. Elastic scenes know no time and refuse.
+        """
+        media_type = _media_type(request)
+        model = store.model(request.path_params["name"])
+        body = await _read(request, settings.max_body)
+        return answer_history(model, body, media_type, settings.max_json_numbers, metrics)
 
     @app.post(
         "/scenes/{name}/check",

@@ -36,6 +36,18 @@ EXAMPLE: dict[str, JsonValue] = {
 }
 
 
+MOST_STEPS = 200
+"""Of a history: they keep others waiting for some 50 ms."""
+
+EXAMPLE_HISTORY: dict[str, JsonValue] = {
+    "steps": [
+        {"time": 0.1, "contact": EXAMPLE_CONTACT},
+        {"time": 1.0, "contact": EXAMPLE_CONTACT},
+        {"time": 1.1, "contact": None},
+    ],
+}
+
+
 class _Strict(BaseModel):
     """Refuses unknown keys, NaN, infinities, and booleans or strings in place of numbers."""
 
@@ -94,6 +106,42 @@ class SolveRequest(_Strict):
     )
 
 
+class Step(_Strict):
+    """What presses at a time."""
+
+    time: float = Field(ge=0, le=1e6, description="Since rest, s; no less than the step before.")
+    contact: Contact | None = Field(
+        None, description="The load then; it changed evenly since the step before. None: released."
+    )
+
+
+class HistoryRequest(_Strict):
+    """Loads over time on tissue at rest, and what to answer about their end."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [EXAMPLE_HISTORY]})
+
+    steps: list[Step] = Field(
+        min_length=1,
+        max_length=MOST_STEPS,
+        description="In order of time. Steps should be short beside the time constants of the "
+        "tissue while the load changes; two at one time are a sudden change.",
+    )
+    outputs: list[FieldName] = Field(
+        ["displacement", "von_mises"], max_length=2, description="The fields to return."
+    )
+    region: Region = Field(
+        "none", description="The nodes to return the fields of the last step for, as in solve."
+    )
+
+    @field_validator("steps")
+    @classmethod
+    def _time_goes_on(cls, steps: list[Step]) -> list[Step]:
+        times = [step.time for step in steps]
+        if times != sorted(times):
+            raise PydanticCustomError("time_order", "Times should not decrease", {"order": "time"})
+        return steps
+
+
 class SessionRequest(_Strict):
     """A position of the tip, in the JSON mode of a session."""
 
@@ -115,6 +163,21 @@ def parse_request(body: bytes) -> SolveRequest:
     except ValidationError as error:
         details = error.errors(include_url=False, include_input=False)
         raise invalid(details, _NAMES) from None
+
+
+_HISTORY_NAMES = {
+    "": list(HistoryRequest.model_fields),
+    "steps": [*Step.model_fields, *Contact.model_fields],
+}
+
+
+def parse_history(body: bytes) -> HistoryRequest:
+    """Make a history of its JSON text; raise `Refusal` with the field that is wrong."""
+    try:
+        return HistoryRequest.model_validate_json(body)
+    except ValidationError as error:
+        details = error.errors(include_url=False, include_input=False)
+        raise invalid(details, _HISTORY_NAMES) from None
 
 
 def parse_session_request(text: str) -> Request:
@@ -183,6 +246,37 @@ class Answer(BaseModel):
     force: Vector = Field(description="Force on the tissue, mN.")
     contact_displacement: Vector = Field(description="Displacement of the contact point, mm.")
     trust: Trust
+    fields: Fields
+    timing: Timing
+
+
+class MomentTrust(BaseModel):
+    """Whether and how far to believe a step's answer."""
+
+    converged: bool = Field(description="Always true: a load without equilibrium is refused.")
+    iterations: int = Field(description="Newton steps taken.")
+    in_range: bool = Field(
+        description="Whether the load is in the range the model was trained for."
+    )
+    out_of_range: list[str] = Field(description="The contact's fields that are not.")
+    min_jacobian: float = Field(description="Smallest volume ratio met; 1 at rest, 0 is collapse.")
+
+
+class MomentAnswer(BaseModel):
+    """How the tissue answers at the time of a step."""
+
+    time: float = Field(description="s")
+    contact: ContactAnswer
+    force: Vector = Field(description="Force on the tissue, mN.")
+    contact_displacement: Vector = Field(description="Displacement of the contact point, mm.")
+    trust: MomentTrust
+
+
+class HistoryAnswer(BaseModel):
+    """How the tissue answers a history."""
+
+    scene: str
+    steps: list[MomentAnswer]
     fields: Fields
     timing: Timing
 

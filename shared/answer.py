@@ -5,21 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 from shared.atlas import Solution
+from shared.history import Moment
 
 
 def describe(scene: str, solution: Solution) -> dict[str, Any]:
     """Write the part of an answer that does not grow with the mesh, JSON-able."""
     return {
         "scene": scene,
-        "contact": {
-            "position": solution.contact_point.tolist(),
-            "normal": solution.normal.tolist(),
-            "distance": solution.distance,
-            "direction": solution.direction.tolist(),
-            "pressure": solution.pressure,
-            "radius": solution.radius,
-            "pressure_limit": solution.pressure_limit,
-        },
+        "contact": _contact(solution),
         "force": solution.force.tolist(),
         "contact_displacement": solution.contact_displacement.tolist(),
         "trust": {
@@ -33,4 +26,33 @@ def describe(scene: str, solution: Solution) -> dict[str, Any]:
             },
             "min_jacobian": solution.min_jacobian,
         },
+    }
+
+
+def describe_moment(moment: Moment) -> dict[str, Any]:
+    """Write the answer at the end of a time step, JSON-able."""
+    return {
+        "time": moment.time,
+        "contact": _contact(moment),
+        "force": moment.force.tolist(),
+        "contact_displacement": moment.contact_displacement.tolist(),
+        "trust": {
+            "converged": moment.converged,
+            "iterations": moment.iterations,
+            "in_range": moment.in_range,
+            "out_of_range": moment.out_of_range,
+            "min_jacobian": moment.min_jacobian,
+        },
+    }
+
+
+def _contact(solution: Solution | Moment) -> dict[str, Any]:
+    return {
+        "position": solution.contact_point.tolist(),
+        "normal": solution.normal.tolist(),
+        "distance": solution.distance,
+        "direction": solution.direction.tolist(),
+        "pressure": solution.pressure,
+        "radius": solution.radius,
+        "pressure_limit": solution.pressure_limit,
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +18,7 @@ from shared.artifact import Artifact, ArtifactError, read_artifact
 from shared.bound import bind
 from shared.endoscope import LIMIT_FIELDS, TIP_DEPTH, SurfaceQuadrature
 from shared.errors import QueryError
+from shared.history import History, Moment, Stepper, ViscousModels
 from shared.quadrature import stress_recovery, surface_quadrature, volume_quadrature
 from shared.reduced import (
     DEPARTURE,
@@ -48,12 +50,14 @@ from shared.reduced import (
     expand,
     query,
 )
+from shared.reduced_history import place
 from shared.scene import Scene, SceneError, parse_scene
-from shared.stress import nodal_von_mises
+from shared.stress import nodal_von_mises, nodal_von_mises_after, remember, remember_linearly
 from shared.surface import UPRIGHT, Ground, Surface, boundary_triangles
 from shared.tip import Tip, TipSurface, tip_of, tip_surface
 from shared.tissue import lame
 from shared.touch import TIP_ERROR_FEATURES, LocalTips, Points, TipModels, TipState, Touch
+from shared.viscosity import Weights, step_weights
 
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
@@ -162,6 +166,8 @@ class LocalModels:
     blend : float, mm
     tips : LocalTips, optional
         The same patches under the rigid tip.
+    viscous : ViscousModels, optional
+        Of tissue that remembers.
     """
 
     basis: NDArray[np.int16]
@@ -181,6 +187,7 @@ class LocalModels:
     extent: float
     blend: float
     tips: LocalTips | None
+    viscous: ViscousModels | None = None
 
 
 def assemble_patches(body: Body, models: LocalModels, radius: float) -> Patches:
@@ -549,6 +556,7 @@ class Atlas:
         )
         self._stress = np.zeros(len(body.nodes))
         self._state = self.new_state()
+        self._last_step: tuple[float, Weights] | None = None
 
     @classmethod
     def load(cls, path: str | Path) -> Atlas:
@@ -608,6 +616,13 @@ class Atlas:
                 extent=float(arrays["patch_extent"]),
                 blend=float(arrays["patch_blend"]),
                 tips=_local_tips(arrays) if scene.endoscope.tip else None,
+                viscous=ViscousModels(
+                    arrays["viscous_deviatoric"].astype(np.float32),
+                    arrays["viscous_pairs"],
+                    arrays["viscous_overlap"].astype(np.float32),
+                )
+                if scene.tissue.prony
+                else None,
             ),
             estimator=Estimator(arrays["error_coefficients"]),
             tip_estimator=Estimator(
@@ -665,46 +680,16 @@ class Atlas:
             If a field is not finite, out of reach or makes no sense; see its message.
         """
         started = time.perf_counter()
-        endoscope = self.scene.endoscope
-        if not (math.isfinite(pressure) and pressure >= 0):
-            raise QueryError("pressure", f"must be a finite number >= 0 kPa, not {pressure}")
-        at = _vector("position", position)
-        if radius is None:
-            radius = endoscope.radius
-        elif not endoscope.radius / 2 <= radius <= endoscope.radius:
-            allowed = f"[{endoscope.radius / 2}, {endoscope.radius}] mm"
-            raise QueryError("radius", f"must be in {allowed}, not {radius}")
-        if direction is None:
-            towards = _INWARD
-        else:
-            towards = _vector("direction", direction)
-            if not any(towards.tolist()):
-                raise QueryError("direction", "must not be the zero vector")
+        at, towards, radius = self._checked(position, pressure, direction, radius)
         if state is None:
             state = self._state
             state.forget()
         query(self._terms, state.bound, at, towards, pressure, radius)
         record = state.record.copy()
         scalars = record[_SCALARS].tolist()
-        distance, tilt = scalars[DISTANCE], scalars[TILT]
-        if distance > endoscope.reach:
-            raise QueryError(
-                "position",
-                f"{distance:.2f} mm from the accessible surface, "
-                f"at most {endoscope.reach} mm allowed",
-            )
-        if not tilt < 90.0:
-            raise QueryError("direction", "must point into the tissue")
-        limit = scalars[LIMIT]
-        out_of_range: tuple[str, ...] = ()
-        if distance > BESIDE and _beside(at, record[_POINT], record[_NORMAL], distance):
-            out_of_range += ("position",)
-        if pressure > limit * (1 + 1e-9):
-            out_of_range += ("pressure",)
-        if tilt > endoscope.max_tilt + 1e-6:
-            out_of_range += ("direction",)
-        if radius != endoscope.radius:
-            out_of_range += ("radius",)
+        distance, tilt, limit = scalars[DISTANCE], scalars[TILT], scalars[LIMIT]
+        self._check_place(distance, tilt)
+        out_of_range = self._out_of_range(at, record, scalars, pressure, radius)
         memory, numbers = state.memory.wide, state.memory.patch.tolist()
         patches = tuple(
             [
@@ -737,6 +722,144 @@ class Atlas:
             patches=patches,
             solve_seconds=time.perf_counter() - started,
         )
+
+    def _checked(
+        self,
+        position: ArrayLike,
+        pressure: float,
+        direction: ArrayLike | None,
+        radius: float | None,
+    ) -> tuple[Array, Array, float]:
+        """Position, direction (zero for the inward normal) and radius of a well-formed load."""
+        endoscope = self.scene.endoscope
+        if not (math.isfinite(pressure) and pressure >= 0):
+            raise QueryError("pressure", f"must be a finite number >= 0 kPa, not {pressure}")
+        at = _vector("position", position)
+        if radius is None:
+            radius = endoscope.radius
+        elif not endoscope.radius / 2 <= radius <= endoscope.radius:
+            allowed = f"[{endoscope.radius / 2}, {endoscope.radius}] mm"
+            raise QueryError("radius", f"must be in {allowed}, not {radius}")
+        if direction is None:
+            return at, _INWARD, radius
+        towards = _vector("direction", direction)
+        if not any(towards.tolist()):
+            raise QueryError("direction", "must not be the zero vector")
+        return at, towards, radius
+
+    def _check_place(self, distance: float, tilt: float) -> None:
+        """Raise ``QueryError`` if a load is out of reach or does not press."""
+        reach = self.scene.endoscope.reach
+        if distance > reach:
+            raise QueryError(
+                "position",
+                f"{distance:.2f} mm from the accessible surface, at most {reach} mm allowed",
+            )
+        if not tilt < 90.0:
+            raise QueryError("direction", "must point into the tissue")
+
+    def _out_of_range(
+        self, at: Array, record: Array, scalars: list[float], pressure: float, radius: float
+    ) -> tuple[str, ...]:
+        """Fields of a load that are not of the kind the model was trained for."""
+        endoscope, distance = self.scene.endoscope, scalars[DISTANCE]
+        fields: tuple[str, ...] = ()
+        if distance > BESIDE and _beside(at, record[_POINT], record[_NORMAL], distance):
+            fields += ("position",)
+        if pressure > scalars[LIMIT] * (1 + 1e-9):
+            fields += ("pressure",)
+        if scalars[TILT] > endoscope.max_tilt + 1e-6:
+            fields += ("direction",)
+        if radius != endoscope.radius:
+            fields += ("radius",)
+        return fields
+
+    def step(
+        self,
+        history: History,
+        dt: float,
+        position: ArrayLike | None = None,
+        pressure: float = 0.0,
+        direction: ArrayLike | None = None,
+        radius: float | None = None,
+    ) -> tuple[Moment, History]:
+        """Press ``dt`` after the end of a history of visco-elastic tissue.
+
+        Parameters
+        ----------
+        history : History
+            ``History()`` is rest. It is not changed.
+        dt : float, s
+            May be 0, for a sudden change.
+        position : array_like, shape (3,), mm, optional
+            As in ``solve``; without it nothing presses.
+        pressure, direction, radius
+            As in ``solve``.
+
+        Returns
+        -------
+        moment : Moment
+        history : History
+            To go on from; the old one if the answer did not converge.
+
+        Raises
+        ------
+        QueryError
+            As ``solve``, or if the tissue is elastic, or ``dt`` negative or not finite.
+        """
+        started = time.perf_counter()
+        if self.models.viscous is None:
+            raise QueryError("time", f"scene {self.name!r} is elastic and knows none")
+        if not 0.0 <= dt < math.inf:
+            raise QueryError("time", f"steps must be >= 0 s and finite, not {dt}")
+        if position is None:
+            last = history.position
+            position, pressure = self.surface.vertices[0] if last is None else last, 0.0
+        at, towards, radius = self._checked(position, pressure, direction, radius)
+        state = self._state
+        place(self._terms, state.bound, at, towards)
+        record = state.record.copy()
+        scalars = record[_SCALARS].tolist()
+        self._check_place(scalars[DISTANCE], scalars[TILT])
+        numbers, shares = state.memory.patch.tolist(), record[_WEIGHT].tolist()
+        active = [(-2 - k, share) for k, share in zip(numbers, shares, strict=True) if share > 0.0]
+        found = self._stepper.press(history, active, pressure, radius, self._step_weights(dt))
+        main = max(active, key=lambda pair: pair[1])[0]
+        after = History(history.time + dt, found.locals, main, record[_POINT])
+        out_of_range = self._out_of_range(at, record, scalars, pressure, radius)
+        moment = Moment(
+            time=after.time,
+            contact_point=record[_POINT],
+            normal=record[_NORMAL],
+            distance=scalars[DISTANCE],
+            direction=record[_DIRECTION],
+            tilt=scalars[TILT],
+            pressure=pressure,
+            radius=radius,
+            pressure_limit=scalars[LIMIT],
+            force=pressure * found.area * record[_DIRECTION],
+            contact_displacement=found.displacement,
+            converged=found.converged,
+            iterations=found.iterations,
+            in_range=not out_of_range,
+            out_of_range=out_of_range,
+            min_jacobian=found.min_jacobian,
+            active=tuple((k, share, found.locals[k]) for k, share in active),
+            solve_seconds=time.perf_counter() - started,
+        )
+        return moment, after if moment.converged else history
+
+    def _step_weights(self, dt: float) -> Weights:
+        """Weights of a time step, which is often the last one's."""
+        if self._last_step is None or self._last_step[0] != dt:
+            self._last_step = dt, step_weights(self.scene.tissue.prony, dt)
+        return self._last_step[1]
+
+    @cached_property
+    def _stepper(self) -> Stepper:
+        assert self.models.viscous is not None, "or there would be no history"
+        points = self.patches.weights.shape[1]
+        return Stepper(self._state.bound, self.models.viscous, self.scene.tissue.prony, points)
 
     @cached_property
     def tips(self) -> TipModels | None:
@@ -779,38 +902,69 @@ class Atlas:
     def _tip_ground(self) -> Ground:
         return self.surface.ground(self.limits[:, [TIP_DEPTH]])
 
-    def coefficients(self, solution: Solution | Touch) -> dict[int, Field]:
+    def coefficients(self, solution: Solution | Touch | Moment) -> dict[int, Field]:
         """Displacement as coefficients (M,) in the basis of each region that takes part."""
-        total: dict[int, Field] = {}
+        if isinstance(solution, Moment):
+            return self._by_region(self.models.modes, self._stepper.answers(solution))
         modes = self.models.modes
         if isinstance(solution, Touch):
             assert self.models.tips is not None, "or there would be no such answer"
             modes = self.models.tips.modes
-        for k, weight, c in solution.patches:
+        return self._by_region(modes, solution.patches)
+
+    def _by_region(
+        self, modes: Field, answers: Sequence[tuple[int, float, Array]]
+    ) -> dict[int, Field]:
+        total: dict[int, Field] = {}
+        for k, weight, c in answers:
             region = int(self.models.region[k])
             share = modes[k] @ (weight * c).astype(np.float32)
             total[region] = total[region] + share if region in total else share
         return total
 
-    def displacement(self, solution: Solution | Touch, region: Region = "all") -> Field:
-        """Nodal displacement (k, 3) mm, of all nodes or those of ``surface_nodes``."""
+    def _expanded(self, answers: Sequence[tuple[int, float, Array]]) -> Field:
+        """Displacement (n, 3) mm of patches with weights and answers in their wide spaces."""
+        return self._field(self._by_region(self.models.modes, answers))
+
+    def _field(self, coefficients: Mapping[int, Field]) -> Field:
         field = np.zeros(self.models.basis.shape[2], np.float32)
-        for number, coefficients in self.coefficients(solution).items():
-            expand(self.models.basis[number], self.models.steps[number] * coefficients, field)
-        displacement = field.reshape(-1, 3)
+        for number, part in coefficients.items():
+            expand(self.models.basis[number], self.models.steps[number] * part, field)
+        return field.reshape(-1, 3)
+
+    def displacement(self, solution: Solution | Touch | Moment, region: Region = "all") -> Field:
+        """Nodal displacement (k, 3) mm, of all nodes or those of ``surface_nodes``."""
+        displacement = self._field(self.coefficients(solution))
         return displacement if region == "all" else displacement[self.surface_nodes]
 
     def von_mises(
-        self, solution: Solution | Touch, region: Region = "all", displacement: Field | None = None
+        self,
+        solution: Solution | Touch | Moment,
+        region: Region = "all",
+        displacement: Field | None = None,
     ) -> Field:
         """Nodal von Mises stress (k,) kPa; ``displacement`` of all nodes saves its recovery."""
         if displacement is None:
             displacement = self.displacement(solution, "all")
-        nodal_von_mises(self._recovery, displacement, self._stress)
+        if isinstance(solution, Moment):
+            past = self._remembered(solution)
+            nodal_von_mises_after(self._recovery, displacement, past, self._stress)
+        else:
+            nodal_von_mises(self._recovery, displacement, self._stress)
         stress = self._stress if region == "all" else self._stress[self.surface_nodes]
         # an answer that did not converge may be beyond single precision
         with np.errstate(over="ignore"):
             return stress.astype(np.float32)
+
+    def _remembered(self, moment: Moment) -> Array:
+        """``B`` of ``shared.viscosity`` (e, 6, 8) at the points of all elements."""
+        B = np.zeros((len(self.body.elements), 6, 8))
+        for k, share, knot in self._stepper.knots(moment):
+            remember(self._recovery, self._expanded([(k, 1.0, knot)]), share, B)
+        lasting = self._stepper.lasting(moment)
+        if lasting:
+            remember_linearly(self._recovery, self._expanded(lasting), B)
+        return B
 
 
 def _local_tips(arrays: dict[str, NDArray[Any]]) -> LocalTips:

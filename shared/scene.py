@@ -122,6 +122,22 @@ class Tissue(_Part):
     law: Literal["neo-hookean"]
     young: Positive = Field(description="Young's modulus at rest, kPa")
     poisson: float = Field(ge=0, lt=0.5, description="Poisson's ratio at rest")
+    prony: tuple[tuple[Fraction, Positive], ...] = Field(
+        (),
+        max_length=6,
+        description="[[share, time constant in s], ...]: what the isochoric stress loses with time",
+    )
+
+    @model_validator(mode="after")
+    def _some_stiffness_stays(self) -> Tissue:
+        total = sum(share for share, _ in self.prony)
+        if not total < 1.0:
+            raise PydanticCustomError(
+                "prony",
+                "the shares of prony must sum to less than 1, not {total}",
+                {"total": total},
+            )
+        return self
 
 
 class Patch(_Part):
@@ -223,6 +239,15 @@ class Scene(_Part):
     def folder(self) -> Path | None:
         """Where the files named by the scene lie; None for a scene without files at hand."""
         return self._folder
+
+    @model_validator(mode="after")
+    def _tip_presses_elastic_tissue(self) -> Scene:
+        if self.endoscope.tip and self.tissue.prony:
+            raise PydanticCustomError(
+                "tip",
+                "endoscope.tip: the rigid tip knows elastic tissue only, without tissue.prony",
+            )
+        return self
 
     @model_validator(mode="after")
     def _sides_exist(self) -> Scene:

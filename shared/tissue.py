@@ -231,6 +231,12 @@ def von_mises(f0, f1, f2, f3, f4, f5, f6, f7, f8, mu, lam):
     J, _, p0, p1, p2, p3, p4, p5, p6, p7, p8 = first_piola(
         f0, f1, f2, f3, f4, f5, f6, f7, f8, mu, lam
     )
+    return equivalent(f0, f1, f2, f3, f4, f5, f6, f7, f8, p0, p1, p2, p3, p4, p5, p6, p7, p8, J)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def equivalent(f0, f1, f2, f3, f4, f5, f6, f7, f8, p0, p1, p2, p3, p4, p5, p6, p7, p8, J):
+    """Von Mises equivalent of the Cauchy stress ``P F^T / J``, in the unit of ``P``."""
     s00, s11 = p0 * f0 + p1 * f1 + p2 * f2, p3 * f3 + p4 * f4 + p5 * f5
     s22, s01 = p6 * f6 + p7 * f7 + p8 * f8, p0 * f3 + p1 * f4 + p2 * f5
     s02, s12 = p0 * f6 + p1 * f7 + p2 * f8, p3 * f6 + p4 * f7 + p5 * f8

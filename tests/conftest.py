@@ -16,10 +16,21 @@ def rng():
     return np.random.default_rng(20260101)
 
 
+def trained(scene, folder):
+    """Train a scene in a process of its own."""
+    path = folder / f"{scene}.h5"
+    train = "from shared.cli import main; main()", "train", scene, "--out", str(path)
+    subprocess.run([sys.executable, "-c", *train], check=True, capture_output=True)
+    return path
+
+
 @pytest.fixture(scope="session")
 def artifact(tmp_path_factory):
     """Return the artifact of the quick scene, trained here and now."""
-    path = tmp_path_factory.mktemp("trained") / "quick.h5"
-    train = "from shared.cli import main; main()", "train", "quick", "--out", str(path)
-    subprocess.run([sys.executable, "-c", *train], check=True, capture_output=True)
-    return path
+    return trained("quick", tmp_path_factory.mktemp("trained"))
+
+
+@pytest.fixture(scope="session")
+def visco_artifact(tmp_path_factory):
+    """Return the artifact of the quick scene of visco-elastic tissue."""
+    return trained("quick-visco", tmp_path_factory.mktemp("visco"))

@@ -96,7 +96,7 @@ class FakeAtlas:
             direction=push,
             tilt=float(np.degrees(np.arccos(-push @ normal))),
             departure=0.0,
-            cubature=0.0,
+            residual=0.0,
             pressure=pressure,
             radius=radius,
             pressure_limit=self.pressure_max,

@@ -66,6 +66,18 @@ length = 40
     assert scene.folder is None
 
 
+def test_tissue_is_elastic_unless_it_says_otherwise() -> None:
+    assert parse_scene(SLAB).tissue.prony == ()
+    visco = SLAB.replace("0.45", "0.45\nprony = [[0.3, 0.1], [0.2, 1.0]]")
+    assert parse_scene(visco).tissue.prony == ((0.3, 0.1), (0.2, 1.0))
+
+
+def test_the_tip_does_not_press_tissue_that_knows_time() -> None:
+    text = SLAB.replace("0.45", "0.45\nprony = [[0.3, 0.1]]").replace("reach", "tip = true\nreach")
+    with pytest.raises(SceneError, match=r"endoscope.tip: the rigid tip knows elastic tissue only"):
+        parse_scene(text)
+
+
 def test_a_scene_is_immutable() -> None:
     scene = parse_scene(SLAB)
     with pytest.raises(ValidationError):
@@ -92,6 +104,14 @@ def test_load_scene_knows_its_folder(tmp_path) -> None:
         ("young = 15.0", "young = nan", r"tissue.young = nan: .*finite"),
         ("young = 15.0", "young = inf", r"tissue.young = inf: .*finite"),
         ("young = 15.0", 'young = "15"', r"tissue.young = '15': .*valid number"),
+        (
+            "0.45",
+            "0.45\nprony = [[0.6, 0.1], [0.4, 1.0]]",
+            r"tissue: .*prony must sum to less than 1",
+        ),
+        ("0.45", "0.45\nprony = [[0.0, 0.1]]", r"tissue.prony.0.0 = 0.0: .*greater than 0"),
+        ("0.45", "0.45\nprony = [[0.5, 0.0]]", r"tissue.prony.0.1 = 0.0: .*greater than 0"),
+        ("0.45", "0.45\nprony = [[0.5]]", r"tissue.prony.0.1 = .*required"),
         ("young = 15.0", "young = true", r"tissue.young = True: .*valid number"),
         ("[10.0, 8, 5.0]", "[10.0, -8, 5.0]", r"geometry.size.1 = -8: .*greater than 0"),
         ("[10.0, 8, 5.0]", "[10.0, 8]", r"geometry.size.2"),

@@ -1,0 +1,589 @@
+"""The reduced model in time: history at the cubature points of the local models in use.
+
+Theory.  See ``shared.viscosity`` for the law and ``shared.reduced`` for local models.  A step finds
+the equilibrium in the wide space ``u = B c`` of a local model.  Like linear elasticity, linear
+visco-elasticity needs no cubature: with ``D = B^T K_dev B``, ``K_dev`` the deviatoric part of the
+rest stiffness, and the means ``z_a`` of the answers over the past, its potential is
+
+    c.c/2 - sum_a g_a c . D (decay_a z_a + old_a c_n + new_a c/2) - f . c.
+
+Only what the law adds to that is summed over the cubature points, each of which keeps its history
+(``shared.viscosity``; a local model has the same points for the elastic part).
+
+When another local model takes over, the history follows.  Its displacements are projected on the
+new wide space in the energy of the rest state.  They are few: *knots* of the path of answers, each
+with its weight in the mean of every term.  A step adds a knot; where there are too many, two
+neighbours become their mean, those that the sum of squared distances misses least (Ward, J. Am.
+Stat. Assoc. 58 (1963) 236-244).  The new points' histories are the weighted sums of what the knots
+drive them to, with the linear part corrected to the exact means.  What the new space cannot hold,
+such as a dent that the tool has left far behind, *remains*: it recovers by linear visco-elasticity
+in the space it was made in (``Remains``), beside the answer of the new one, and costs nothing until
+fields are asked for.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numba.extending import overload
+from numpy.typing import NDArray
+
+from shared import equilibrium, tissue, viscosity
+from shared.endoscope import pressure_limit
+from shared.reduced import (
+    DISTANCE,
+    LANES,
+    LIMIT,
+    ROUND_OFF,
+    TILE,
+    TILT,
+    _added_energy,
+    _forget_secants,
+    _is,
+    _learn,
+    _wide_load,
+    activate,
+    descend,
+    nonlinear_stress,
+    project,
+    superpose,
+)
+from shared.surface import locate
+
+Array = NDArray[np.float64]
+Field = NDArray[np.float32]
+
+FAST = {"contract", "reassoc", "nsz"}
+
+KNOTS = 8
+"""Of the path of answers; the last is the last answer."""
+
+SYMMETRIC = 6
+"""Components of a symmetric tensor, in the order of ``shared.viscosity``."""
+
+ACCURATE = 1e-3
+"""Residual at equilibrium relative to load and past, as ``shared.reduced.TOLERANCE``."""
+
+MOST_ITERATIONS = 40
+MOST_ITERATIONS_ANEW = 200
+
+
+class Memory(NamedTuple):
+    """What one local model remembers."""
+
+    wide: Array  # (r,) last answer
+    load: Array  # (r,) last load
+    mean: Array  # (terms, r) of the answers over the past
+    points: Field  # (terms + 1, 6 c) histories of the cubature points, in tiles
+    knots: Array  # (KNOTS, r)
+    share: Array  # (KNOTS, terms) weight of a knot in each mean; sums to 1
+    secants: Array  # (r, r) inverse tangent, see shared.reduced.WideSystem
+
+
+class Scratch(NamedTuple):
+    """Working memory of a step."""
+
+    H: Field  # (9 c,)
+    P: Field  # (9 c,)
+    J: Array  # (c,)
+    trace: Array  # (c,)
+    linear: Array  # (c,)
+    B: Field  # (6 c,) in tiles, what the past drives the points to
+    S: Field  # (6 c,) in tiles, kPa, the linear part of it
+    stepped: Field  # (r,)
+    origin: Array  # (2, r)
+    latest: Array  # (r,)
+    change: Array  # (r,)
+    load: Array  # (r,)
+    past: Array  # (r,)
+    newton: Array  # (4, r)
+    start: Array  # (r,)
+
+
+def new_memory(terms: int, modes: int, points: int) -> Memory:
+    """Of a local model that nothing has happened to."""
+    share = np.zeros((KNOTS, terms))
+    share[-1] = 1.0
+    return Memory(
+        wide=np.zeros(modes),
+        load=np.zeros(modes),
+        mean=np.zeros((terms, modes)),
+        points=np.zeros((terms + 1, SYMMETRIC * points), np.float32),
+        knots=np.zeros((KNOTS, modes)),
+        share=share,
+        secants=np.eye(modes),
+    )
+
+
+def copied(memory: Memory) -> Memory:
+    """A memory that can go on without changing this one."""
+    return Memory(
+        memory.wide.copy(), memory.load.copy(), memory.mean.copy(), memory.points.copy(),
+        memory.knots.copy(), memory.share.copy(), memory.secants.copy(),
+    )  # fmt: skip
+
+
+def new_scratch(modes: int, points: int) -> Scratch:
+    """Of models with so many modes and points."""
+    return Scratch(
+        H=np.zeros(9 * points, np.float32),
+        P=np.zeros(9 * points, np.float32),
+        J=np.zeros(points),
+        trace=np.zeros(points),
+        linear=np.zeros(points),
+        B=np.zeros(SYMMETRIC * points, np.float32),
+        S=np.zeros(SYMMETRIC * points, np.float32),
+        stepped=np.zeros(modes, np.float32),
+        origin=np.zeros((2, modes)),
+        latest=np.zeros(modes),
+        change=np.zeros(modes),
+        load=np.zeros(modes),
+        past=np.zeros(modes),
+        newton=np.zeros((4, modes)),
+        start=np.zeros(modes),
+    )
+
+
+# --- the law at many points ----------------------------------------------------------------------
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _inverse_cube_root(J):
+    """``J^(-1/3)`` to double precision for J from 0.2 to 5 by Newton's method: vector code."""
+    y = 3.0 / (2.0 + J)
+    for _ in range(5):
+        y *= (4.0 - J * y * y * y) / 3.0
+    return y
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def predict_points(L, history, weights, mu, B, S):
+    """What is known of the end of a step before it is solved.
+
+    Parameters
+    ----------
+    L : ndarray, shape (9 c,)
+        Gradient of ``sum g (decay z + old c_n)``, in tiles.
+    history : ndarray, shape (terms + 1, 6 c)
+    weights : Weights
+    mu : ndarray, shape (c,), kPa
+    B, S : ndarray, shape (6 c,), out
+        ``B`` of ``shared.viscosity``, and minus the stress (kPa) that ``L`` leads to if linear.
+    """
+    terms = len(history) - 1
+    loss = 0.0
+    for a in range(terms):
+        loss += weights.share[a] * weights.new[a]
+    B[:] = np.float32(0.0)
+    last = history[terms]
+    for a in range(terms):
+        row = history[a]
+        kept = np.float32(weights.share[a] * weights.decay[a])
+        old = np.float32(weights.share[a] * weights.old[a])
+        for i in range(len(B)):
+            B[i] += kept * row[i] + old * last[i]
+    for tile in range(len(mu) // LANES):
+        b = B[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
+        s = S[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
+        h = L[TILE * tile : TILE * (tile + 1)]
+        m = mu[LANES * tile : LANES * (tile + 1)]
+        for c in range(3 * LANES):
+            b[c] -= np.float32(loss)
+        for c in range(LANES):
+            h0, h4, h8 = h[c], h[4 * LANES + c], h[8 * LANES + c]
+            third = (h0 + h4 + h8) / 3.0
+            s[c], s[LANES + c] = 2.0 * m[c] * (h0 - third), 2.0 * m[c] * (h4 - third)
+            s[2 * LANES + c] = 2.0 * m[c] * (h8 - third)
+            s[3 * LANES + c] = m[c] * (h[5 * LANES + c] + h[7 * LANES + c])
+            s[4 * LANES + c] = m[c] * (h[2 * LANES + c] + h[6 * LANES + c])
+            s[5 * LANES + c] = m[c] * (h[LANES + c] + h[3 * LANES + c])
+    return loss
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def add_past_stress(H, weights, mu, J, B, S, loss, energy, P):
+    """Add what the past does beyond linear visco-elasticity, times weight, to the stress ``P``.
+
+    ``energy`` (c,) is overwritten with its energy density (kPa), but for a constant.
+    """
+    for tile in range(len(weights) // LANES):
+        h, p = H[TILE * tile : TILE * (tile + 1)], P[TILE * tile : TILE * (tile + 1)]
+        b = B[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
+        s = S[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
+        at = LANES * tile
+        w, m, j, e = (
+            weights[at : at + LANES], mu[at : at + LANES], J[at : at + LANES],
+            energy[at : at + LANES],
+        )  # fmt: skip
+        for c in range(LANES):
+            h0, h1, h2 = float(h[c]), float(h[LANES + c]), float(h[2 * LANES + c])
+            h3, h4, h5 = float(h[3 * LANES + c]), float(h[4 * LANES + c]), float(h[5 * LANES + c])
+            h6, h7, h8 = float(h[6 * LANES + c]), float(h[7 * LANES + c]), float(h[8 * LANES + c])
+            b0, b1, b2 = float(b[c]), float(b[LANES + c]), float(b[2 * LANES + c])
+            b3, b4, b5 = float(b[3 * LANES + c]), float(b[4 * LANES + c]), float(b[5 * LANES + c])
+            root = _inverse_cube_root(j[c])
+            scale = m[c] * root * root
+            contraction, q0, q1, q2, q3, q4, q5, q6, q7, q8 = viscosity.overstress(
+                1.0 + h0, h1, h2, h3, 1.0 + h4, h5, h6, h7, 1.0 + h8,
+                b0, b1, b2, b3, b4, b5, j[c], scale,
+            )  # fmt: skip
+            # linear: -(S + 2 mu loss dev sym H)
+            soft = loss * m[c]
+            third = (h0 + h4 + h8) / 3.0
+            l0, l1, l2 = (
+                2.0 * soft * (h0 - third),
+                2.0 * soft * (h4 - third),
+                2.0 * soft * (h8 - third),
+            )
+            l3, l4, l5 = soft * (h5 + h7), soft * (h2 + h6), soft * (h1 + h3)
+            s0, s1, s2 = float(s[c]), float(s[LANES + c]), float(s[2 * LANES + c])
+            s3, s4, s5 = float(s[3 * LANES + c]), float(s[4 * LANES + c]), float(s[5 * LANES + c])
+            e[c] = (
+                0.5 * (scale * contraction - m[c] * (b0 + b1 + b2))
+                + (s0 + 0.5 * l0) * h0 + (s1 + 0.5 * l1) * h4 + (s2 + 0.5 * l2) * h8
+                + (s3 + 0.5 * l3) * (h5 + h7) + (s4 + 0.5 * l4) * (h2 + h6)
+                + (s5 + 0.5 * l5) * (h1 + h3)
+            )  # fmt: skip
+            t0, t1, t2, t3, t4, t5 = s0 + l0, s1 + l1, s2 + l2, s3 + l3, s4 + l4, s5 + l5
+            p[c] += w[c] * (q0 + t0)
+            p[LANES + c] += w[c] * (q1 + t5)
+            p[2 * LANES + c] += w[c] * (q2 + t4)
+            p[3 * LANES + c] += w[c] * (q3 + t5)
+            p[4 * LANES + c] += w[c] * (q4 + t1)
+            p[5 * LANES + c] += w[c] * (q5 + t3)
+            p[6 * LANES + c] += w[c] * (q6 + t4)
+            p[7 * LANES + c] += w[c] * (q7 + t3)
+            p[8 * LANES + c] += w[c] * (q8 + t2)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def drive_points(H, m):
+    """``m - I`` of ``shared.viscosity`` (6 c,) in tiles, of displacement gradients (9 c,)."""
+    for tile in range(len(H) // TILE):
+        h = H[TILE * tile : TILE * (tile + 1)]
+        d = m[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
+        for c in range(LANES):
+            m0, m1, m2, m3, m4, m5 = viscosity.driven(
+                1.0 + h[c], float(h[LANES + c]), float(h[2 * LANES + c]),
+                float(h[3 * LANES + c]), 1.0 + h[4 * LANES + c], float(h[5 * LANES + c]),
+                float(h[6 * LANES + c]), float(h[7 * LANES + c]), 1.0 + h[8 * LANES + c],
+            )  # fmt: skip
+            d[c], d[LANES + c], d[2 * LANES + c] = m0, m1, m2
+            d[3 * LANES + c], d[4 * LANES + c], d[5 * LANES + c] = m3, m4, m5
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def advance_points(m, weights, history):
+    """Go to the end of a step, where the points are driven to ``m`` (6 c,); history in place."""
+    terms = len(history) - 1
+    last = history[terms]
+    for a in range(terms):
+        row = history[a]
+        decay, old, new = (
+            np.float32(weights.decay[a]), np.float32(weights.old[a]), np.float32(weights.new[a]),
+        )  # fmt: skip
+        for i in range(len(row)):
+            row[i] = decay * row[i] + old * last[i] + new * m[i]
+    for i in range(len(last)):
+        last[i] = m[i]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def multiply(A, x, out):
+    """``out = A x``: A (4 k, 4 k) float32, symmetric; x, out (4 k,)."""
+    for i in range(len(out)):
+        out[i] = 0.0
+    for j in range(0, len(A), 4):
+        a, b, c, d = x[j], x[j + 1], x[j + 2], x[j + 3]
+        p, q, r, s = A[j], A[j + 1], A[j + 2], A[j + 3]
+        for i in range(len(out)):
+            out[i] += a * p[i] + b * q[i] + c * r[i] + d * s[i]
+
+
+# --- a step of one local model as a system for shared.equilibrium --------------------------------
+
+
+class PastSystem(NamedTuple):
+    """A patch under a load and its past, in all its wide modes; see ``WideSystem``."""
+
+    gradients: NDArray[np.int16]  # (r, 9 c) in tiles
+    steps: Field  # (r,) 1/mm
+    weights: Array  # (c,) mm^3
+    mu: Array  # (c,) kPa
+    lam: Array  # (c,) kPa
+    deviatoric: Field  # (r, r) D
+    load: Array  # (r,) with what the past exerts
+    loss: float  # sum of g new
+    B: Field  # (6 c,)
+    S: Field  # (6 c,)
+    H: Field  # (9 c,)
+    P: Field  # (9 c,)
+    J: Array  # (c,)
+    trace: Array  # (c,)
+    linear: Array  # (c,)
+    stepped: Field  # (r,)
+    secants: Array  # (r, r)
+    origin: Array  # (2, r)
+    latest: Array  # (r,)
+    change: Array  # (r,)
+
+
+@overload(equilibrium.potential, jit_options={"error_model": "numpy"})
+def _potential(system, u, residual):
+    if not _is(PastSystem, system):
+        return None
+
+    def potential(system, u, residual):
+        steps, stepped = system.steps, system.stepped
+        for i in range(len(u)):
+            stepped[i] = u[i] * steps[i]
+        superpose(system.gradients, stepped, system.H)
+        J, trace, linear = system.J, system.trace, system.linear
+        weights, mu, lam = system.weights, system.mu, system.lam
+        nonlinear_stress(system.H, weights, mu, lam, J, trace, linear, system.P)
+        smallest = J.min()
+        if not smallest > 0.0:
+            return tissue.INVERTED, smallest
+        energy = _added_energy(weights, mu, lam, J, trace, linear)
+        # trace has served; its room is that of the energies
+        add_past_stress(system.H, weights, mu, J, system.B, system.S, system.loss, trace, system.P)
+        energy += np.dot(weights, trace)
+        project(system.gradients, system.P, residual)
+        softer = system.change  # its room; the secants need it later
+        multiply(system.deviatoric, u, softer)
+        for i in range(len(u)):
+            system.latest[i] = u[i]
+            stiff = u[i] - system.loss * softer[i]
+            residual[i] = residual[i] * steps[i] + stiff - system.load[i]
+            energy += (0.5 * stiff - system.load[i]) * u[i]
+        return energy, smallest
+
+    return potential
+
+
+@overload(equilibrium.factorise, jit_options={"error_model": "numpy"})
+def _factorise(system, u, shift):
+    if not _is(PastSystem, system):
+        return None
+    # the secants are always those of the last steps
+    return lambda system, u, shift: True
+
+
+@overload(equilibrium.correct, jit_options={"error_model": "numpy"})
+def _correct(system, residual, step):
+    if not _is(PastSystem, system):
+        return None
+
+    def correct(system, residual, step):
+        _learn(system.secants, system.origin, system.latest, residual, system.load, system.change)
+        for i in range(len(step)):
+            step[i] = -np.dot(system.secants[i], residual)
+
+    return correct
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def step_patch(patches, k, deviatoric, time, load, memory, scratch):
+    """Equilibrium of local model k under a load at the end of a time step.
+
+    Parameters
+    ----------
+    patches : Patches
+    deviatoric : ndarray, shape (r, r)
+    time : Weights
+        Of the step.
+    load : ndarray, shape (r,)
+    memory : Memory
+        Goes to the end of the step if that has an answer, else it stays as it is.
+    scratch : Scratch
+
+    Returns
+    -------
+    status, iterations : int
+        As ``shared.equilibrium.newton``.
+    smallest : float
+        Smallest det F.
+    """
+    gradients, steps, weights = patches.gradients[k], patches.steps[k], patches.weights[k]
+    mu, lam = patches.mu[k], patches.lam[k]
+    past, wide, terms = scratch.past, memory.wide, len(memory.mean)
+    past[:] = 0.0
+    for a in range(terms):
+        g = time.share[a]
+        for i in range(len(past)):
+            past[i] += g * (time.decay[a] * memory.mean[a, i] + time.old[a] * wide[i])
+    for i in range(len(past)):
+        scratch.stepped[i] = past[i] * steps[i]
+    superpose(gradients, scratch.stepped, scratch.H)
+    loss = predict_points(scratch.H, memory.points, time, mu, scratch.B, scratch.S)
+    exerted, size = scratch.change, 0.0
+    multiply(deviatoric, past, exerted)
+    for i in range(len(past)):
+        scratch.load[i] = load[i] + exerted[i]
+        size += max(load[i] ** 2, exerted[i] ** 2)
+    target = ACCURATE * max(math.sqrt(size), 1e-9)
+    system = PastSystem(
+        gradients, steps, weights, mu, lam, deviatoric, scratch.load, loss, scratch.B, scratch.S,
+        scratch.H, scratch.P, scratch.J, scratch.trace, scratch.linear, scratch.stepped,
+        memory.secants, scratch.origin, scratch.latest, scratch.change,
+    )  # fmt: skip
+    start, work = scratch.start, scratch.newton
+    status, iterations, smallest = equilibrium.STALLED, 0, 0.0
+    for attempt in range(2):
+        most = MOST_ITERATIONS if attempt == 0 else MOST_ITERATIONS_ANEW
+        scratch.origin[:] = np.nan
+        for i in range(len(start)):
+            # at once tissue answers about as it does at rest
+            start[i] = wide[i] + (load[i] - memory.load[i] if attempt == 0 else 0.0)
+        if attempt == 1:
+            _forget_secants(memory.secants, scratch.origin)
+        energy, smallest = equilibrium.potential(system, start, work[0])
+        status, more, energy, smallest = descend(
+            system, start, work, energy, smallest, target, np.inf, most, True, ROUND_OFF
+        )
+        iterations += more
+        if status == equilibrium.CONVERGED:
+            break
+    if status != equilibrium.CONVERGED:
+        _forget_secants(memory.secants, scratch.origin)
+        return status, iterations, smallest
+    # the last evaluation was of the answer
+    drive_points(scratch.H, scratch.B)
+    advance_points(scratch.B, time, memory.points)
+    for a in range(terms):
+        for i in range(len(start)):
+            memory.mean[a, i] = (
+                time.decay[a] * memory.mean[a, i] + time.old[a] * wide[i] + time.new[a] * start[i]
+            )
+    wide[:] = start
+    memory.load[:] = load
+    _add_knot(memory, time)
+    return status, iterations, smallest
+
+
+# --- the path of answers -------------------------------------------------------------------------
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _add_knot(memory, time):
+    """Append the last answer to the knots; two of the others become one."""
+    knots, share = memory.knots, memory.share
+    last = len(knots) - 1
+    for a in range(share.shape[1]):
+        for j in range(last + 1):
+            share[j, a] *= time.decay[a]
+        share[last, a] += time.old[a]
+    best, least = 0, np.inf
+    for j in range(last):
+        x, y = 0.0, 0.0
+        for a in range(share.shape[1]):
+            x += time.share[a] * share[j, a]
+            y += time.share[a] * share[j + 1, a]
+        distance = 0.0
+        for i in range(knots.shape[1]):
+            distance += (knots[j, i] - knots[j + 1, i]) ** 2
+        cost = x * y / (x + y) * distance if x * y > 0.0 else 0.0
+        if cost < least:
+            best, least, ratio = j, cost, (y / (x + y) if x + y > 0.0 else 1.0)
+    for i in range(knots.shape[1]):
+        knots[best, i] += ratio * (knots[best + 1, i] - knots[best, i])
+    for a in range(share.shape[1]):
+        share[best, a] += share[best + 1, a]
+    for j in range(best + 1, last):
+        knots[j] = knots[j + 1]
+        share[j] = share[j + 1]
+    knots[last] = memory.wide
+    for a in range(share.shape[1]):
+        share[last, a] = time.new[a]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def recall_points(solver, k, memory, scratch):
+    """Give the points of local model k the history that the knots and the means tell."""
+    patches = solver.patches
+    gradients, steps, points = patches.gradients[k], patches.steps[k], memory.points
+    terms, last = len(memory.mean), len(memory.knots) - 1
+    points[:] = np.float32(0.0)
+    for j in range(last + 1):
+        for i in range(len(steps)):
+            scratch.stepped[i] = memory.knots[j, i] * steps[i]
+        superpose(gradients, scratch.stepped, scratch.H)
+        drive_points(scratch.H, scratch.B)
+        for a in range(terms):
+            points[a] += np.float32(memory.share[j, a]) * scratch.B
+        if j == last:
+            points[terms] = scratch.B
+    for a in range(terms):
+        for i in range(len(steps)):
+            missed = memory.mean[a, i]
+            for j in range(last + 1):
+                missed -= memory.share[j, a] * memory.knots[j, i]
+            scratch.stepped[i] = missed * steps[i]
+        superpose(gradients, scratch.stepped, scratch.H)
+        _add_linear(scratch.H, points[a])
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def _add_linear(H, m):
+    """Add ``-2 dev sym H`` to ``m`` (6 c,): what a small gradient (9 c,) drives points to."""
+    for tile in range(len(H) // TILE):
+        h = H[TILE * tile : TILE * (tile + 1)]
+        d = m[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
+        for c in range(LANES):
+            third = (h[c] + h[4 * LANES + c] + h[8 * LANES + c]) / np.float32(3.0)
+            d[c] -= np.float32(2.0) * (h[c] - third)
+            d[LANES + c] -= np.float32(2.0) * (h[4 * LANES + c] - third)
+            d[2 * LANES + c] -= np.float32(2.0) * (h[8 * LANES + c] - third)
+            d[3 * LANES + c] -= h[5 * LANES + c] + h[7 * LANES + c]
+            d[4 * LANES + c] -= h[2 * LANES + c] + h[6 * LANES + c]
+            d[5 * LANES + c] -= h[LANES + c] + h[3 * LANES + c]
+
+
+# --- the atlas -----------------------------------------------------------------------------------
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def place(terms, solver, position, direction):
+    """Contact point nearest to ``position``, its load range, and the patches that answer there.
+
+    As ``shared.reduced.query`` without an answer: writes point, normal, direction, range, weights
+    and three of the scalars of the outcome, and which patches (``-2 - k``) into the memory.
+    """
+    outcome = solver.outcome
+    x, normal, towards, scalars = outcome.point, outcome.normal, outcome.direction, outcome.scalars
+    distance = locate(terms.ground, position, solver.scratch.surface, x, normal, outcome.range)
+    length = math.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
+    cosine = 0.0
+    for i in range(3):
+        towards[i] = direction[i] / length if length > 0.0 else -normal[i]
+        cosine -= towards[i] * normal[i]
+    scalars[DISTANCE] = distance
+    scalars[TILT] = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
+    scalars[LIMIT] = pressure_limit(outcome.range, normal, towards)
+    solver.memory.patch[:] = -1
+    activate(solver.patches, x, solver.memory, solver.scratch.distance, outcome.weight)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def step_at(solver, k, pressure, radius, deviatoric, time, memory, scratch, moved):
+    """Press local model k where ``place`` has found; ``moved`` (3,) is the contact's displacement.
+
+    Returns status, iterations, smallest det F and force over pressure (mm^2).
+    """
+    outcome, own = solver.outcome, solver.scratch
+    area = _wide_load(
+        solver.patches, k, outcome.point, outcome.normal, outcome.direction, pressure, radius, own
+    )
+    status, iterations, smallest = step_patch(
+        solver.patches, k, deviatoric, time, own.wide_load, memory, scratch
+    )
+    r = len(memory.wide)
+    for i in range(3):
+        moved[i] = 0.0
+        if area > 0.0:
+            for j in range(r):
+                moved[i] += own.unit_loads[r * i + j] * memory.wide[j] / area
+    return status, iterations, smallest, area
