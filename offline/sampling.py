@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -38,12 +40,13 @@ def random_points(surface: Surface, count: int, rng: np.random.Generator) -> Arr
     return np.einsum("pc,pci->pi", weights, surface.vertices[surface.triangles[triangle]])
 
 
-def random_points_and_rim(surface: Surface, count: int, rng: np.random.Generator) -> Array:
-    """As ``random_points``, but one in eight, the first among them, is on the rim."""
+def random_points_and_rim(
+    surface: Surface, count: int, rng: np.random.Generator
+) -> Iterator[Array]:
+    """As ``random_points``, one by one, but one in eight, the first among them, is on the rim."""
     points, rim = random_points(surface, count, rng), surface.rim()
-    for i in range(0, count, 8):
-        points[i] = surface.vertices[rng.choice(rim)]
-    return points
+    for i, point in enumerate(points):
+        yield surface.vertices[rng.choice(rim)] if i % 8 == 0 else point
 
 
 def spread_points(surface: Surface, count: int, rng: np.random.Generator) -> Array:
