@@ -417,6 +417,13 @@ def extreme_load(
     return x, direction, limit * (1 - 0.15 * rng.random())
 
 
+def _training_load(
+    scene: Scene, task: PatchTask, rng: np.random.Generator
+) -> tuple[Array, Array, float]:
+    draw = extreme_load if rng.random() < EXTREME else random_load
+    return draw(scene, task, rng)
+
+
 def _limit(
     scene: Scene, task: PatchTask, rng: np.random.Generator, border: bool
 ) -> tuple[Array, Array, float]:
@@ -442,8 +449,7 @@ def _training_forces(
     gradients = _point_gradients(patches)
     law = patches.weights[0], patches.mu[0], patches.lam[0]
     for _ in range(LOADS):
-        draw = extreme_load if rng.random() < EXTREME else random_load
-        if not trainer.solve(*draw(scene, task, rng)):
+        if not trainer.solve(*_training_load(scene, task, rng)):
             continue
         wide, load = trainer.wide, trainer.load_size
         compliance = trainer.narrow_compliance / np.linalg.norm(wide)
@@ -485,8 +491,7 @@ def _fit_defect(
     rows, states = [], []
     features = np.zeros(FEATURES)
     for _ in range(DEFECT_LOADS):
-        draw = extreme_load if rng.random() < EXTREME else random_load
-        x, direction, pressure = draw(scene, task, rng)
+        x, direction, pressure = _training_load(scene, task, rng)
         if reduced.solve(x, direction, pressure):
             load_features(frame, task.centre, x, direction * pressure / task.pressure, features)
             rows.append(features[:PATH_FEATURES].copy())

@@ -19,6 +19,7 @@ from online.store import Model
 from shared.answer import describe
 from shared.atlas import Atlas, Solution
 from shared.errors import QueryError
+from shared.history import Moment
 
 ABSURD = 10.0
 """Multiple of the largest trained pressure from which on there is no answer at all."""
@@ -69,14 +70,7 @@ def answer(
             {"le": solution.pressure_limit},
         )
 
-    fields = {}
-    if request.region != "none":
-        displacement = atlas.displacement(solution)
-        if "displacement" in request.outputs:
-            nodes = atlas.surface_nodes if request.region == "surface" else slice(None)
-            fields["displacement"] = displacement[nodes]
-        if "von_mises" in request.outputs:
-            fields["von_mises"] = atlas.von_mises(solution, request.region, displacement)
+    fields = recover(atlas, solution, request)
     recovered = perf_counter()
 
     head = describe(atlas.name, solution)
@@ -108,6 +102,21 @@ def check_size(atlas: Atlas, request: SolveRequest | HistoryRequest, limit: int)
             f"{numbers} numbers are too many for JSON; accept application/octet-stream instead",
             {"max_numbers": limit},
         )
+
+
+def recover(
+    atlas: Atlas, answer: Solution | Moment, request: SolveRequest | HistoryRequest
+) -> wire.Arrays:
+    """Fields that a request wants of an answer."""
+    fields = {}
+    if request.region != "none":
+        displacement = atlas.displacement(answer)
+        if "displacement" in request.outputs:
+            nodes = atlas.surface_nodes if request.region == "surface" else slice(None)
+            fields["displacement"] = displacement[nodes]
+        if "von_mises" in request.outputs:
+            fields["von_mises"] = atlas.von_mises(answer, request.region, displacement)
+    return fields
 
 
 def _check_finite(solution: Solution, fields: wire.Arrays) -> None:

@@ -5,13 +5,12 @@ Like ``online.answer``, nothing here awaits; the number of steps bounds how long
 
 import math
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 from starlette.responses import Response
 
 from online import wire
-from online.answer import ABSURD, check_size
+from online.answer import ABSURD, check_size, recover
 from online.errors import Refusal
 from online.metrics import Metrics
 from online.negotiation import JSON
@@ -96,16 +95,9 @@ def _step(
     return moment, history
 
 
-def _fields(atlas: Atlas, moment: Moment, request: HistoryRequest) -> dict[str, Any]:
+def _fields(atlas: Atlas, moment: Moment, request: HistoryRequest) -> wire.Arrays:
     """Fields at the end of the history."""
-    fields: dict[str, Any] = {}
-    if request.region != "none":
-        displacement = atlas.displacement(moment)
-        if "displacement" in request.outputs:
-            nodes = atlas.surface_nodes if request.region == "surface" else slice(None)
-            fields["displacement"] = displacement[nodes]
-        if "von_mises" in request.outputs:
-            fields["von_mises"] = atlas.von_mises(moment, request.region, displacement)
-        if not all(np.isfinite(field).all() for field in fields.values()):
-            raise Refusal("no_equilibrium", "steps", "The answer to these loads is not finite")
+    fields = recover(atlas, moment, request)
+    if not all(np.isfinite(field).all() for field in fields.values()):
+        raise Refusal("no_equilibrium", "steps", "The answer to these loads is not finite")
     return fields

@@ -313,7 +313,7 @@ class WideSystem(NamedTuple):
     change: Array  # (r,)
 
 
-def _is(kind: type[NamedTuple], system: object) -> bool:
+def is_system(kind: type[NamedTuple], system: object) -> bool:
     """Whether ``system`` is a named tuple of this kind to the compiler, bound or not."""
     if isinstance(system, types.StructRef):  # bound
         return tuple(system.field_dict) == kind._fields
@@ -321,7 +321,7 @@ def _is(kind: type[NamedTuple], system: object) -> bool:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _added_energy(weights, mu, lam, J, trace, linear):
+def added_energy(weights, mu, lam, J, trace, linear):
     """Energy that the tissue law adds to linear elasticity's, after ``nonlinear_stress``."""
     energy = 0.0
     for c in range(len(weights)):
@@ -331,7 +331,7 @@ def _added_energy(weights, mu, lam, J, trace, linear):
 
 @overload(equilibrium.potential, jit_options={"error_model": "numpy"})
 def _potential(system, u, residual):
-    if not _is(LocalSystem, system):
+    if not is_system(LocalSystem, system):
         return None
 
     def potential(system, u, residual):
@@ -342,7 +342,7 @@ def _potential(system, u, residual):
         smallest = J.min()
         if not smallest > 0.0:
             return tissue.INVERTED, smallest
-        energy = _added_energy(weights, mu, lam, J, trace, linear)
+        energy = added_energy(weights, mu, lam, J, trace, linear)
         project(system.gradients, system.P, residual)
         for i in range(len(u)):
             residual[i] += u[i] - system.load[i]
@@ -354,7 +354,7 @@ def _potential(system, u, residual):
 
 @overload(equilibrium.factorise, jit_options={"error_model": "numpy"})
 def _factorise(system, u, shift):
-    if not _is(LocalSystem, system):
+    if not is_system(LocalSystem, system):
         return None
 
     def factorise(system, u, shift):
@@ -371,7 +371,7 @@ def _factorise(system, u, shift):
 
 @overload(equilibrium.correct, jit_options={"error_model": "numpy"})
 def _correct(system, residual, step):
-    if not _is(LocalSystem, system):
+    if not is_system(LocalSystem, system):
         return None
 
     def correct(system, residual, step):
@@ -421,7 +421,7 @@ def _cholesky(K, shift, L):
 
 @overload(equilibrium.potential, jit_options={"error_model": "numpy"})
 def _wide_potential(system, u, residual):
-    if not _is(WideSystem, system):
+    if not is_system(WideSystem, system):
         return None
 
     def potential(system, u, residual):
@@ -435,7 +435,7 @@ def _wide_potential(system, u, residual):
         smallest = J.min()
         if not smallest > 0.0:
             return tissue.INVERTED, smallest
-        energy = _added_energy(weights, mu, lam, J, trace, linear)
+        energy = added_energy(weights, mu, lam, J, trace, linear)
         project(system.gradients, system.P, residual)
         for i in range(len(u)):
             system.latest[i] = u[i]
@@ -448,7 +448,7 @@ def _wide_potential(system, u, residual):
 
 @overload(equilibrium.factorise, jit_options={"error_model": "numpy"})
 def _wide_factorise(system, u, shift):
-    if not _is(WideSystem, system):
+    if not is_system(WideSystem, system):
         return None
     # the secants are always those of the last steps
     return lambda system, u, shift: True
@@ -456,11 +456,13 @@ def _wide_factorise(system, u, shift):
 
 @overload(equilibrium.correct, jit_options={"error_model": "numpy"})
 def _wide_correct(system, residual, step):
-    if not _is(WideSystem, system):
+    if not is_system(WideSystem, system):
         return None
 
     def correct(system, residual, step):
-        _learn(system.secants, system.origin, system.latest, residual, system.load, system.change)
+        learn_secant(
+            system.secants, system.origin, system.latest, residual, system.load, system.change
+        )
         for i in range(len(step)):
             step[i] = -np.dot(system.secants[i], residual)
 
@@ -468,7 +470,7 @@ def _wide_correct(system, residual, step):
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def _learn(inverse, origin, state, residual, load, product):
+def learn_secant(inverse, origin, state, residual, load, product):
     """Update the inverse tangent with the secant to a new state (BFGS), which is the next origin.
 
     Nocedal & Wright, Numerical Optimization, eq. 6.17.  The origin may stem from another query:
@@ -728,7 +730,7 @@ def _fade(excess):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _wide_load(patches, k, x, normal, direction, pressure, radius, scratch):
+def load_patch(patches, k, x, normal, direction, pressure, radius, scratch):
     """Load of patch k in its wide space into ``scratch.wide_load``; returns force over pressure."""
     first, last = patches.node_from[k], patches.node_from[k + 1]
     a, b = patches.face_from[k], patches.face_from[k + 1]
@@ -915,7 +917,7 @@ def _solve_patch(patches, k, slot, warm, x, direction, pressure, limit, memory, 
     else:
         status, more, smallest = _solve_narrow(patches, k, size, wide, scratch)
         iterations += more
-        _forget_secants(memory.secants[slot], memory.origin[slot])
+        forget_secants(memory.secants[slot], memory.origin[slot])
     memory.patch[slot] = k if status == equilibrium.CONVERGED else -2 - k
     length = departure = 0.0
     for i in range(len(wide)):
@@ -929,7 +931,7 @@ def _solve_patch(patches, k, slot, warm, x, direction, pressure, limit, memory, 
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _forget_secants(inverse, origin):
+def forget_secants(inverse, origin):
     """Start anew with the rest stiffness; the next state is the first origin."""
     origin[:] = np.nan
     inverse[:] = 0.0
@@ -1036,7 +1038,7 @@ def _answer(solver, x, normal, direction, pressure, limit, radius):
         warm = k >= 0
         if not warm:
             k = -2 - k
-        area = _wide_load(patches, k, x, normal, direction, pressure, radius, scratch)
+        area = load_patch(patches, k, x, normal, direction, pressure, radius, scratch)
         scalars[AREA] = area
         _solve_patch(
             patches, k, slot, warm, x, direction, pressure, limit, memory, scratch, scalars
@@ -1048,6 +1050,25 @@ def _answer(solver, x, normal, direction, pressure, limit, radius):
                 for j in range(len(wide)):
                     moved += unit[len(wide) * i + j] * wide[j]
                 outcome.displacement[i] += share / area * moved
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def aim(terms, solver, position, direction):
+    """Contact point nearest to ``position``, normal, load range and unit direction there.
+
+    They go to the outcome; returns the distance (mm), the tilt (degrees) and the largest trained
+    pressure (kPa).
+    """
+    outcome = solver.outcome
+    x, normal, towards = outcome.point, outcome.normal, outcome.direction
+    distance = locate(terms.ground, position, solver.scratch.surface, x, normal, outcome.range)
+    length = math.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
+    cosine = 0.0
+    for i in range(3):
+        towards[i] = direction[i] / length if length > 0.0 else -normal[i]
+        cosine -= towards[i] * normal[i]
+    tilt = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
+    return distance, tilt, pressure_limit(outcome.range, normal, towards)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -1071,15 +1092,7 @@ def query(terms, solver, position, direction, pressure, radius):
     """
     outcome = solver.outcome
     x, normal, towards, scalars = outcome.point, outcome.normal, outcome.direction, outcome.scalars
-    surface = solver.scratch.surface
-    distance = locate(terms.ground, position, surface, x, normal, outcome.range)
-    length = math.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
-    cosine = 0.0
-    for i in range(3):
-        towards[i] = direction[i] / length if length > 0.0 else -normal[i]
-        cosine -= towards[i] * normal[i]
-    tilt = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
-    limit = pressure_limit(outcome.range, normal, towards)
+    distance, tilt, limit = aim(terms, solver, position, direction)
     if distance <= terms.reach and tilt < 90.0:
         _answer(solver, x, normal, towards, pressure, limit, radius)
         _estimate(terms, solver, pressure / limit, tilt / max(terms.max_tilt, 1.0), pressure)

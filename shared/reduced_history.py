@@ -32,7 +32,6 @@ from numba.extending import overload
 from numpy.typing import NDArray
 
 from shared import equilibrium, tissue, viscosity
-from shared.endoscope import pressure_limit
 from shared.reduced import (
     DISTANCE,
     LANES,
@@ -40,18 +39,18 @@ from shared.reduced import (
     ROUND_OFF,
     TILE,
     TILT,
-    _added_energy,
-    _forget_secants,
-    _is,
-    _learn,
-    _wide_load,
     activate,
+    added_energy,
+    aim,
     descend,
+    forget_secants,
+    is_system,
+    learn_secant,
+    load_patch,
     nonlinear_stress,
     project,
     superpose,
 )
-from shared.surface import locate
 
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
@@ -333,7 +332,7 @@ class PastSystem(NamedTuple):
 
 @overload(equilibrium.potential, jit_options={"error_model": "numpy"})
 def _potential(system, u, residual):
-    if not _is(PastSystem, system):
+    if not is_system(PastSystem, system):
         return None
 
     def potential(system, u, residual):
@@ -347,7 +346,7 @@ def _potential(system, u, residual):
         smallest = J.min()
         if not smallest > 0.0:
             return tissue.INVERTED, smallest
-        energy = _added_energy(weights, mu, lam, J, trace, linear)
+        energy = added_energy(weights, mu, lam, J, trace, linear)
         # trace has served; its room is that of the energies
         add_past_stress(system.H, weights, mu, J, system.B, system.S, system.loss, trace, system.P)
         energy += np.dot(weights, trace)
@@ -366,7 +365,7 @@ def _potential(system, u, residual):
 
 @overload(equilibrium.factorise, jit_options={"error_model": "numpy"})
 def _factorise(system, u, shift):
-    if not _is(PastSystem, system):
+    if not is_system(PastSystem, system):
         return None
     # the secants are always those of the last steps
     return lambda system, u, shift: True
@@ -374,11 +373,13 @@ def _factorise(system, u, shift):
 
 @overload(equilibrium.correct, jit_options={"error_model": "numpy"})
 def _correct(system, residual, step):
-    if not _is(PastSystem, system):
+    if not is_system(PastSystem, system):
         return None
 
     def correct(system, residual, step):
-        _learn(system.secants, system.origin, system.latest, residual, system.load, system.change)
+        learn_secant(
+            system.secants, system.origin, system.latest, residual, system.load, system.change
+        )
         for i in range(len(step)):
             step[i] = -np.dot(system.secants[i], residual)
 
@@ -439,7 +440,7 @@ def step_patch(patches, k, deviatoric, time, load, memory, scratch):
             # at once tissue answers about as it does at rest
             start[i] = wide[i] + (load[i] - memory.load[i] if attempt == 0 else 0.0)
         if attempt == 1:
-            _forget_secants(memory.secants, scratch.origin)
+            forget_secants(memory.secants, scratch.origin)
         energy, smallest = equilibrium.potential(system, start, work[0])
         status, more, energy, smallest = descend(
             system, start, work, energy, smallest, target, np.inf, most, True, ROUND_OFF
@@ -448,7 +449,7 @@ def step_patch(patches, k, deviatoric, time, load, memory, scratch):
         if status == equilibrium.CONVERGED:
             break
     if status != equilibrium.CONVERGED:
-        _forget_secants(memory.secants, scratch.origin)
+        forget_secants(memory.secants, scratch.origin)
         return status, iterations, smallest
     # the last evaluation was of the answer
     drive_points(scratch.H, scratch.B)
@@ -553,18 +554,10 @@ def place(terms, solver, position, direction):
     and three of the scalars of the outcome, and which patches (``-2 - k``) into the memory.
     """
     outcome = solver.outcome
-    x, normal, towards, scalars = outcome.point, outcome.normal, outcome.direction, outcome.scalars
-    distance = locate(terms.ground, position, solver.scratch.surface, x, normal, outcome.range)
-    length = math.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
-    cosine = 0.0
-    for i in range(3):
-        towards[i] = direction[i] / length if length > 0.0 else -normal[i]
-        cosine -= towards[i] * normal[i]
-    scalars[DISTANCE] = distance
-    scalars[TILT] = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
-    scalars[LIMIT] = pressure_limit(outcome.range, normal, towards)
+    scalars = outcome.scalars
+    scalars[DISTANCE], scalars[TILT], scalars[LIMIT] = aim(terms, solver, position, direction)
     solver.memory.patch[:] = -1
-    activate(solver.patches, x, solver.memory, solver.scratch.distance, outcome.weight)
+    activate(solver.patches, outcome.point, solver.memory, solver.scratch.distance, outcome.weight)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -574,7 +567,7 @@ def step_at(solver, k, pressure, radius, deviatoric, time, memory, scratch, move
     Returns status, iterations, smallest det F and force over pressure (mm^2).
     """
     outcome, own = solver.outcome, solver.scratch
-    area = _wide_load(
+    area = load_patch(
         solver.patches, k, outcome.point, outcome.normal, outcome.direction, pressure, radius, own
     )
     status, iterations, smallest = step_patch(

@@ -62,11 +62,7 @@ def nodal_von_mises(mesh, u, out):
             for q in range(8):
                 value += extrapolation[corner, q] * at_points[q]
             out[connectivity[e, corner]] += max(value, 0.0)
-    for node in range(len(mesh.elements_at)):
-        if mesh.elements_at[node] > 0.0:
-            out[node] /= mesh.elements_at[node]
-    for k in range(len(mesh.midsides)):
-        out[mesh.midsides[k, 0]] = 0.5 * (out[mesh.midsides[k, 1]] + out[mesh.midsides[k, 2]])
+    _average(mesh, out)
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc", "nsz"})
@@ -136,6 +132,12 @@ def nodal_von_mises_after(mesh, u, B, out):
             for q in range(8):
                 value += mesh.extrapolation[corner, q] * at_points[q]
             out[mesh.connectivity[e, corner]] += max(value, 0.0)
+    _average(mesh, out)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc", "nsz"})
+def _average(mesh, out):
+    """Turn sums over elements at nodes into means, and set nodes on edges between theirs."""
     for node in range(len(mesh.elements_at)):
         if mesh.elements_at[node] > 0.0:
             out[node] /= mesh.elements_at[node]

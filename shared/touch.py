@@ -39,13 +39,13 @@ from shared.reduced import (
     ROUND_OFF,
     STATE,
     TILE,
-    _added_energy,
     _cholesky,
-    _is,
     _lower_products,
     activate,
+    added_energy,
     back_substitute,
     increments,
+    is_system,
     linearise,
     nonlinear_stress,
     project,
@@ -291,7 +291,7 @@ def _contact(system, q, wanted):
 
 @overload(equilibrium.potential, jit_options={"error_model": "numpy"})
 def _potential(system, u, residual):
-    if not _is(TipSystem, system):
+    if not is_system(TipSystem, system):
         return None
 
     def potential(system, u, residual):
@@ -305,7 +305,7 @@ def _potential(system, u, residual):
         project(system.gradients, system.P, residual)
         count, energy, _ = _contact(system, u, STIFFNESS)
         system.latest[:] = u
-        energy += _added_energy(weights, mu, lam, J, trace, linear)
+        energy += added_energy(weights, mu, lam, J, trace, linear)
         for j in range(len(u)):
             residual[j] += u[j]
             energy += 0.5 * u[j] * u[j]
@@ -323,7 +323,7 @@ def _potential(system, u, residual):
 
 @overload(equilibrium.factorise, jit_options={"error_model": "numpy"})
 def _factorise(system, u, shift):
-    if not _is(TipSystem, system):
+    if not is_system(TipSystem, system):
         return None
 
     def factorise(system, u, shift):
@@ -407,7 +407,7 @@ def _add_face(system, c):
 
 @overload(equilibrium.correct, jit_options={"error_model": "numpy"})
 def _correct(system, residual, step):
-    if not _is(TipSystem, system):
+    if not is_system(TipSystem, system):
         return None
 
     def correct(system, residual, step):

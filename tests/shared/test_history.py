@@ -11,7 +11,7 @@ from shared.artifact import read_artifact
 from shared.atlas import Atlas, State, assemble_patches
 from shared.errors import QueryError
 from shared.history import History, Remains
-from shared.reduced import _wide_load
+from shared.reduced import load_patch
 from shared.reduced_history import (
     ACCURATE,
     KNOTS,
@@ -64,7 +64,7 @@ class OnePatch:
     def step(self, share, dt):
         """Press; return the load (r,) and the status."""
         radius = 2.0
-        _wide_load(
+        load_patch(
             self.patches, 0, self.x, -DOWN, DOWN, share * self.limit, radius, self.state.scratch
         )
         load = self.state.scratch.wide_load.copy()
