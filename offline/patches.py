@@ -50,6 +50,12 @@ most, random loads are rare."""
 OFF_EQUILIBRIUM = 0.03
 """Size of the random departure from equilibrium, relative to each mode's part in the states."""
 
+STATES = 24
+"""Random loads at each footprint, half of them at the largest tilt, that modes are made for."""
+
+FAINT = 0.1
+"""Weight of the Ritz vectors themselves beside their states."""
+
 RESIDUAL_LOADS = 64
 
 RESIDUAL_DAMPING = 0.15
@@ -282,7 +288,7 @@ def train_patch(
     weights = model.weights.ravel()
     frame = np.array([task.normal, *tangents(task.normal)])
     ritz = region.ritz.astype(np.float64)
-    leading = local_modes(np.hstack(list(ritz)), task.size.modes)
+    leading = local_modes(_expected(scene, ritz, task, rng), task.size.modes)
     # stored in half precision, so trained in it
     everywhere = PatchResult(
         frame=frame,
@@ -348,6 +354,25 @@ def local_trainer(
     )
 
 
+def _expected(scene: Scene, ritz: Array, task: PatchTask, rng: np.random.Generator) -> Array:
+    """What modes are to span (M, k): states under random loads, and faintly all Ritz vectors.
+
+    The states are those of third order in the load, from Ritz vectors (f, M, 19 or more).
+    """
+    parts = [FAINT * vectors for vectors in ritz]
+    tilt = scene.endoscope.max_tilt
+    for place, vectors in zip(task.footprints, ritz, strict=True):
+        directions = [
+            cone(place.normal, tilt, STATES // 2, rng, border) for border in (False, True)
+        ]
+        loads = place.pressure * np.sqrt(rng.random((STATES, 1))) * np.vstack(directions)
+        for first in range(0, vectors.shape[1], RITZ_VECTORS):  # the relaxed tissue's, too
+            own = vectors[:, first : first + RITZ_VECTORS]
+            one, two, three = place.path_derivatives(own, loads)
+            parts.append((one + two / 2 + three / 6).T / np.sqrt(STATES))
+    return np.hstack(parts)
+
+
 def _fit_path(ritz: Array, task: PatchTask, frame: Array) -> Array:
     """Second and third path derivative (PATH_FEATURES, r) from Ritz vectors (k, r, 19)."""
     rng = np.random.default_rng(task.seed)
@@ -358,7 +383,7 @@ def _fit_path(ritz: Array, task: PatchTask, frame: Array) -> Array:
         for load in loads:
             load_features(frame, task.centre, place.point, load / task.pressure, features)
             rows.append(features[:PATH_FEATURES].copy())
-        two, three = place.path_derivatives(vectors, loads)
+        _, two, three = place.path_derivatives(vectors, loads)
         second.append(two)
         third.append(three)
     A = np.array(rows)

@@ -38,6 +38,9 @@ def _lattice(order: int) -> Array:
     return np.array(points, dtype=float) / order
 
 
+FILL = 1e-13
+"""Energy of what fills up modes, relative to that of the vectors: just above round-off."""
+
 TANGENTIAL = 0.6
 """Weight of tangential against normal load in the Ritz vectors: about sin 30 degrees and some."""
 
@@ -65,8 +68,8 @@ class Footprint:
         frame[1:] *= TANGENTIAL
         return self.pressure * frame
 
-    def path_derivatives(self, vectors: Array, loads: Array) -> tuple[Array, Array]:
-        """Second and third derivative (n, k) along the paths to ``loads`` (n, 3) kPa.
+    def path_derivatives(self, vectors: Array, loads: Array) -> tuple[Array, Array, Array]:
+        """First, second and third derivative (n, k) along the paths to ``loads`` (n, 3) kPa.
 
         ``vectors`` (k, 19) are coefficients of its ``ritz_vectors``: forms in the load, given by
         their values on lattices.
@@ -74,7 +77,8 @@ class Footprint:
         t = _solve(self.loads.T, loads.T).T
         second = _solve(_monomials(_lattice(2), 2).T, _monomials(t, 2).T)
         third = _solve(_monomials(_lattice(3), 3).T, _monomials(t, 3).T)
-        return 2 * (vectors[:, 3:9] @ second).T, 6 * (vectors[:, 9:] @ third).T
+        first = vectors[:, :3] @ t.T
+        return first.T, 2 * (vectors[:, 3:9] @ second).T, 6 * (vectors[:, 9:] @ third).T
 
 
 def ritz_vectors(model: FullModel, loads: Array) -> Array:
@@ -171,6 +175,8 @@ def local_modes(coefficients: Array, size: int) -> Array:
 
     Where the vectors run out, the leading modes of the basis fill up.
     """
-    fill = 1e-9 * np.linalg.norm(coefficients) * np.eye(len(coefficients))[:, :size]
-    U, _, _ = np.linalg.svd(np.hstack([coefficients, fill]), full_matrices=False)
-    return np.ascontiguousarray(U[:, :size])
+    gram = coefficients @ coefficients.T
+    filled = np.arange(size)
+    gram[filled, filled] += FILL * np.trace(gram)
+    Q = np.linalg.eigh(gram)[1]
+    return np.ascontiguousarray(Q[:, : -size - 1 : -1])

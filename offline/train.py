@@ -3,7 +3,8 @@
 1. The largest pressure at points all over the accessible surface (full model).
 2. Regions: nonlinear Ritz vectors of many footprints and a common basis for them.
 3. Patches: modes, cubature and first guess of every local model.
-4. Full solutions of random loads, which calibrate the error estimate, and others, which validate.
+4. The reduced model, pressed everywhere, lowers the range where the tissue gives way.
+5. Full solutions of random loads, which calibrate the error estimate, and others, which validate.
 
 Every finished task is on disk before it counts; see ``offline.checkpoint``.
 """
@@ -32,6 +33,7 @@ from tqdm import tqdm
 from offline.checkpoint import Checkpoint, content_key
 from offline.choose import LADDER, Trial, TrialResult, choose
 from offline.choose_mesh import with_mesh
+from offline.giving_way import lowered_limits
 from offline.mesh import mesh_quality
 from offline.patches import PatchResult, PatchTask, RegionResult
 from offline.refinement import MOST_DOFS, mesh_error_document
@@ -184,6 +186,7 @@ class Pipeline:
             tqdm.write(f"size: {size}\n{choice.why}", file=sys.stderr)
         layout = self.layout(size)
         models = self.local_models(layout, limits)
+        limits = self._lowered(models, limits)
         estimator, documents, rows = self._validate(models, limits)
         tip_estimator = Estimator(np.zeros((3, TIP_ERROR_FEATURES)))
         tip_rows: list[TouchComparison] = []
@@ -207,7 +210,7 @@ class Pipeline:
     def untested_atlas(self, limits: Array, layout: Layout) -> Atlas:
         """An atlas without error estimate: stages 2 and 3 only."""
         models = self.local_models(layout, limits)
-        return self._atlas(models, limits, Estimator(np.zeros((2, ERROR_FEATURES))), {})
+        return self._untested(models, limits)
 
     # --- stages --------------------------------------------------------------------------------
 
@@ -360,12 +363,26 @@ class Pipeline:
             models = replace(models, viscous=viscous_models(self.workshop.model, models))
         return models
 
+    def _lowered(self, models: LocalModels, limits: Array) -> Array:
+        """Load range that ends before the tissue gives way."""
+        started = time.perf_counter()
+        rng = np.random.default_rng([self.scene.seed, 7])
+        lowered = lowered_limits(self._untested(models, limits), rng)
+        share = lowered[:, 0] / limits[:, 0]
+        tqdm.write(
+            f"load range lowered on {np.mean(share < 1):.1%} of the surface, where the tissue "
+            f"gives way: to {share.min():.0%} of what it was",
+            file=sys.stderr,
+        )
+        self.seconds["giving way"] = round(time.perf_counter() - started, 2)
+        return lowered
+
     def _validate_tip(
         self, models: LocalModels, limits: Array
     ) -> tuple[Estimator, list[TouchComparison]]:
         """Validate under the tip, and calibrate its error estimate, as ``_validate`` does."""
         rng = np.random.default_rng([self.scene.seed, 6])
-        atlas = self._atlas(models, limits, Estimator(np.zeros((2, ERROR_FEATURES))), {})
+        atlas = self._untested(models, limits)
         positions = random_positions(self.surface, limits, self.scene, TIP_SAMPLES, rng)
         answers = [atlas.touch(x) for x in positions]
         tasks = {
@@ -394,7 +411,7 @@ class Pipeline:
         rng = np.random.default_rng([self.scene.seed, 3])
         count = self.scene.training.samples
         loads = random_loads(self.workshop.surface, limits, self.scene, count, rng)
-        atlas = self._atlas(models, limits, Estimator(np.zeros((2, ERROR_FEATURES))), {})
+        atlas = self._untested(models, limits)
         rows: list[Comparison] = []
         for start in range(0, count, BATCH):
             batch = {f"sample-{start + i}": load for i, load in enumerate(loads[start:][:BATCH])}
@@ -483,12 +500,11 @@ class Pipeline:
             "content_key": content_key(self.scene),
         }
 
-    def _atlas(
-        self, models: LocalModels, limits: Array, estimator: Estimator, documents: dict[str, Any]
-    ) -> Atlas:
+    def _untested(self, models: LocalModels, limits: Array) -> Atlas:
+        """An atlas without error estimates."""
         return Atlas(
-            self.scene.name, self.scene, documents, self.workshop.body, self.surface, limits,
-            models, estimator, Estimator(np.zeros((3, TIP_ERROR_FEATURES))),
+            self.scene.name, self.scene, {}, self.workshop.body, self.surface, limits, models,
+            Estimator(np.zeros((2, ERROR_FEATURES))), Estimator(np.zeros((3, TIP_ERROR_FEATURES))),
         )  # fmt: skip
 
     def _write(

@@ -59,8 +59,9 @@ def test_ritz_vectors_give_the_derivatives_along_any_load(workshop, rng):
     loads = (nodal[:, None, None] * footprint.loads.T).reshape(-1, 3)[free]
     found = ritz_vectors(workshop.model, loads)
     load = PRESSURE * (-normal + 0.3 * rng.standard_normal(3))
-    second, third = footprint.path_derivatives(found, load[None])
+    first, second, third = footprint.path_derivatives(found, load[None])
     exact = series(workshop, nodal[:, None] * load)
+    assert np.linalg.norm(first[0] - exact[1]) <= 1e-9 * np.linalg.norm(exact[1])
     assert np.linalg.norm(second[0] / 2 - exact[2]) <= 3e-3 * np.linalg.norm(exact[2])
     assert np.linalg.norm(third[0] / 6 - exact[3]) <= 1e-2 * np.linalg.norm(exact[3])
 
