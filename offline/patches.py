@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from offline.cubature import compress, damped_fit, nonlinear_forces, nonnegative, point_forces
 from offline.full_model import FullModel
 from offline.sampling import cone, tangents
-from offline.spaces import RITZ_VECTORS, Footprint, local_modes
+from offline.spaces import RITZ_VECTORS, Footprint, local_modes, whole_numbers
 from offline.tips import TipResult, compile_tip_query, train_tip
 from shared import equilibrium
 from shared.atlas import Body, LocalModels, State, assemble_patches
@@ -142,7 +142,8 @@ class PatchResult:
     """A trained patch; shapes as in ``shared.atlas.LocalModels``."""
 
     frame: Array
-    modes: NDArray[np.float16]
+    whole: NDArray[np.int16]
+    mix: NDArray[np.float32]
     points: NDArray[np.int32]
     weights: Array
     path: NDArray[np.float16]
@@ -245,7 +246,8 @@ def compile_query(scene: Scene, body: Body, surface: Surface) -> None:
         centres=surface.vertices[:1],
         frames=np.eye(3)[None],
         pressures=np.ones(1),
-        modes=np.zeros((1, LANES, NARROW), np.float32),
+        whole=np.zeros((1, LANES, NARROW), np.int16),
+        mix=np.zeros((1, NARROW, NARROW), np.float32),
         point_from=np.array([0, 1]),
         points=np.zeros(1, np.int32),
         weights=np.ones(1),
@@ -289,10 +291,12 @@ def train_patch(
     frame = np.array([task.normal, *tangents(task.normal)])
     ritz = region.ritz.astype(np.float64)
     leading = local_modes(_expected(scene, ritz, task, rng), task.size.modes)
-    # stored in half precision, so trained in it
+    whole, mix = whole_numbers(region.orthonormal @ leading, region.orthonormal)
+    # stored in these and in half precision, so trained in it
     everywhere = PatchResult(
         frame=frame,
-        modes=(region.orthonormal @ leading).astype(np.float16),
+        whole=whole,
+        mix=mix,
         points=np.arange(len(weights), dtype=np.int32),
         weights=weights,
         path=_fit_path(leading.T @ ritz[:, :, :RITZ_VECTORS], task, frame).astype(np.float16),
@@ -339,7 +343,8 @@ def local_trainer(
             centres=task.centre[None],
             frames=result.frame[None],
             pressures=np.array([task.pressure]),
-            modes=result.modes[None].astype(np.float32),
+            whole=result.whole[None],
+            mix=result.mix[None],
             point_from=np.array([0, len(result.points)]),
             points=result.points,
             weights=result.weights,
@@ -449,6 +454,27 @@ def _training_load(
     return draw(scene, task, rng)
 
 
+def _answered(
+    trainer: LocalTrainer,
+    scene: Scene,
+    task: PatchTask,
+    frame: Array,
+    draw: Callable[[Scene, PatchTask, np.random.Generator], tuple[Array, Array, float]],
+    count: int,
+    rng: np.random.Generator,
+) -> Iterator[Array]:
+    """Features (FEATURES,) of drawn loads, each while the trainer's last answer is to that load.
+
+    Loads that it does not solve are left out.
+    """
+    features = np.zeros(FEATURES)
+    for _ in range(count):
+        x, direction, pressure = draw(scene, task, rng)
+        if trainer.solve(x, direction, pressure):
+            load_features(frame, task.centre, x, direction * pressure / task.pressure, features)
+            yield features
+
+
 def _limit(
     scene: Scene, task: PatchTask, rng: np.random.Generator, border: bool
 ) -> tuple[Array, Array, float]:
@@ -514,13 +540,9 @@ def _fit_defect(
 ) -> Array:
     """Force (PATH_FEATURES, r) that the cubature misses in equilibrium, relative to the answer."""
     rows, states = [], []
-    features = np.zeros(FEATURES)
-    for _ in range(DEFECT_LOADS):
-        x, direction, pressure = _training_load(scene, task, rng)
-        if reduced.solve(x, direction, pressure):
-            load_features(frame, task.centre, x, direction * pressure / task.pressure, features)
-            rows.append(features[:PATH_FEATURES].copy())
-            states.append(reduced.wide)
+    for features in _answered(reduced, scene, task, frame, _training_load, DEFECT_LOADS, rng):
+        rows.append(features[:PATH_FEATURES].copy())
+        states.append(reduced.wide)
     missed = galerkin.internal_forces(np.array(states)) - reduced.internal_forces(np.array(states))
     scale = 1.0 / np.linalg.norm(states, axis=1, keepdims=True)
     kept = np.isfinite(missed).all(axis=1)
@@ -532,11 +554,7 @@ def _fit_guess(
 ) -> Array:
     """Coefficients (features, m) of what equilibria add to the linear response."""
     rows, targets = [], []
-    features = np.zeros(FEATURES)
-    for _ in range(GUESS_LOADS):
-        x, direction, pressure = random_load(scene, task, rng)
-        if trainer.solve(x, direction, pressure):
-            load_features(frame, task.centre, x, direction * pressure / task.pressure, features)
-            rows.append(features.copy())
-            targets.append(trainer.beyond_linear)
+    for features in _answered(trainer, scene, task, frame, random_load, GUESS_LOADS, rng):
+        rows.append(features.copy())
+        targets.append(trainer.beyond_linear)
     return damped_fit(np.array(rows), np.array(targets))

@@ -170,6 +170,22 @@ def energy_pod(model: FullModel, vectors: Array, size: int) -> tuple[Array, Arra
     return np.linalg.solve(L, modes.T).T, energies
 
 
+def whole_numbers(
+    modes: Array, orthonormal: NDArray[np.float32]
+) -> tuple[NDArray[np.int16], NDArray[np.float32]]:
+    """Modes (M, r) in the basis of a region as whole numbers, and the mix (r, r) they want.
+
+    The columns of ``whole @ mix`` are orthonormal, as reduced models take for granted: a mode that
+    is off by some ten-thousandths bends soft ones, which move far at little energy, by ten times
+    that.  ``orthonormal`` (M, M) holds orthonormal modes, as columns in the basis.
+    """
+    largest = np.maximum(np.abs(modes).max(axis=0), np.finfo(np.float32).tiny)
+    whole = np.rint(modes * (np.iinfo(np.int16).max / largest)).astype(np.int16)
+    R = np.linalg.qr(np.linalg.solve(orthonormal.astype(float), whole), mode="r")
+    R *= np.sign(np.diag(R))[:, None]
+    return whole, np.linalg.inv(R).astype(np.float32)
+
+
 def local_modes(coefficients: Array, size: int) -> Array:
     """Leading directions (M, size) of vectors given by coefficients (M, k) in an orthonormal basis.
 

@@ -63,7 +63,7 @@ GUESSED = 240
 class TipResult:
     """A trained local model of the tip; shapes as in ``shared.touch.LocalTips``."""
 
-    modes: NDArray[np.float16]
+    modes: NDArray[np.float32]
     points: NDArray[np.int32]
     weights: Array
     guess: NDArray[np.float16]
@@ -174,7 +174,7 @@ def train_tip(
         raise NoEquilibrium("endoscope.tip: no equilibrium found under it; is the load too large?")
     V = _modes(pressed)
     states = [state.within(V) for state in pressed]
-    modes = (space @ V).astype(np.float16)
+    modes = (space @ V).astype(np.float32)
     gradients = trainer.gradients @ V.astype(np.float32)
     law = trainer.models.points
     forces = _training_forces(gradients, (law.weights[0], law.mu[0], law.lam[0]), states, rng)[

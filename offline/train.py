@@ -347,7 +347,8 @@ class Pipeline:
             centres=layout.centres,
             frames=np.stack([r.frame for r in results]),
             pressures=self._range_at(layout.centres, limits)[:, 0],
-            modes=np.stack([r.modes for r in results]).astype(np.float32),
+            whole=np.stack([r.whole for r in results]),
+            mix=np.stack([r.mix for r in results]),
             point_from=np.concatenate([[0], np.cumsum([len(r.points) for r in results])]),
             points=np.concatenate([r.points for r in results]),
             weights=np.concatenate([r.weights for r in results]),
@@ -540,9 +541,8 @@ class Pipeline:
             "patch_centres": Dataset(models.centres, "mm", "centres of local models"),
             "patch_frames": Dataset(models.frames, one, "rows: normal and two tangents"),
             "patch_pressures": Dataset(models.pressures, "kPa", "load scale of local models"),
-            "patch_modes": Dataset(
-                models.modes.astype(np.float16), one, "modes in the basis of the region"
-            ),
+            "patch_modes": Dataset(models.whole, "patch_mix", "modes in the basis of the region"),
+            "patch_mix": Dataset(models.mix, one, "makes orthonormal modes of them", compress=True),
             "patch_path": Dataset(
                 models.path.astype(np.float16), one, "derivatives along a load path, polynomials"
             ),
@@ -568,7 +568,7 @@ class Pipeline:
             tips = models.tips
             datasets |= {
                 "tip_modes": Dataset(
-                    tips.modes.astype(np.float16), one, "modes under the tip, as patch_modes"
+                    tips.modes, one, "modes under the tip, orthonormal, in the basis of the region"
                 ),
                 "tip_from": Dataset(tips.point_from, one, "first point of each, under the tip"),
                 "tip_points": Dataset(tips.points, one, "quadrature point, by element"),
@@ -584,7 +584,7 @@ class Pipeline:
             viscous = models.viscous
             datasets |= {
                 "viscous_deviatoric": Dataset(
-                    viscous.deviatoric.astype(np.float16), one, "deviatoric stiffness in the modes"
+                    viscous.deviatoric, one, "deviatoric stiffness in the modes"
                 ),
                 "viscous_pairs": Dataset(viscous.pairs, one, "local models whose spaces meet"),
                 "viscous_overlap": Dataset(

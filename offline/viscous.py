@@ -19,7 +19,7 @@ NEIGHBOURS = 2.0
 def viscous_models(model: FullModel, models: LocalModels) -> ViscousModels:
     """Deviatoric stiffness of every patch, and the overlap of neighbours' wide spaces.
 
-    Stored in half precision: products of orthonormal modes are at most one.
+    The overlap is stored in half precision: products of orthonormal modes are at most one.
     """
     share = sum(g for g, _ in model.prony)
     stiff = model.rest_stiffness
@@ -29,7 +29,7 @@ def viscous_models(model: FullModel, models: LocalModels) -> ViscousModels:
     pairs = tree.query_pairs(NEIGHBOURS * models.extent, output_type="ndarray")
     pairs = np.sort(pairs, axis=1)[np.lexsort((pairs.max(axis=1), pairs.min(axis=1)))]
     count, _, r = models.modes.shape
-    D = np.empty((count, r, r), np.float16)
+    D = np.empty((count, r, r), np.float32)
     overlap = np.empty((len(pairs), r, r), np.float16)
     regions = models.region[pairs]
     for number in range(len(models.basis)):
@@ -43,7 +43,7 @@ def viscous_models(model: FullModel, models: LocalModels) -> ViscousModels:
             for i in np.flatnonzero((regions == (number, other)).all(axis=1)):
                 k, n = pairs[i]
                 overlap[i] = models.modes[k].T @ cross @ models.modes[n]
-    return ViscousModels(D.astype(np.float32), pairs.astype(np.int32), overlap.astype(np.float32))
+    return ViscousModels(D, pairs.astype(np.int32), overlap.astype(np.float32))
 
 
 def _basis(model: FullModel, models: LocalModels, region: int) -> Array:

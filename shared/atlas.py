@@ -146,8 +146,9 @@ class LocalModels:
         Rows: outward normal and two tangents.
     pressures : ndarray, shape (p,), kPa
         Load scale.
-    modes : ndarray, shape (p, M, r), float32
-        Wide modes of each patch in the basis of its region.
+    whole, mix : ndarray, shape (p, M, r), int16, and (p, r, r), float32
+        Wide modes of each patch in the basis of its region are ``whole @ mix``: whole numbers, and
+        the upper triangular matrix that makes orthonormal modes of them.
     point_from : ndarray, shape (p + 1,), int64
         Cubature points of patch k are rows ``point_from[k] : point_from[k + 1]``.
     points : ndarray, shape (c,), int32
@@ -176,7 +177,8 @@ class LocalModels:
     centres: Array
     frames: Array
     pressures: Array
-    modes: Field
+    whole: NDArray[np.int16]
+    mix: Field
     point_from: NDArray[np.int64]
     points: NDArray[np.int32]
     weights: Array
@@ -188,6 +190,11 @@ class LocalModels:
     blend: float
     tips: LocalTips | None
     viscous: ViscousModels | None = None
+
+    @cached_property
+    def modes(self) -> Field:
+        """Wide modes (p, M, r) of each patch in the basis of its region."""
+        return self.whole.astype(np.float32) @ self.mix
 
 
 def assemble_patches(body: Body, models: LocalModels, radius: float) -> Patches:
@@ -605,7 +612,8 @@ class Atlas:
                 centres=arrays["patch_centres"],
                 frames=arrays["patch_frames"],
                 pressures=arrays["patch_pressures"],
-                modes=arrays["patch_modes"].astype(np.float32),
+                whole=arrays["patch_modes"],
+                mix=arrays["patch_mix"],
                 point_from=arrays["cubature_from"],
                 points=arrays["cubature_points"],
                 weights=arrays["cubature_weights"],
@@ -617,7 +625,7 @@ class Atlas:
                 blend=float(arrays["patch_blend"]),
                 tips=_local_tips(arrays) if scene.endoscope.tip else None,
                 viscous=ViscousModels(
-                    arrays["viscous_deviatoric"].astype(np.float32),
+                    arrays["viscous_deviatoric"],
                     arrays["viscous_pairs"],
                     arrays["viscous_overlap"].astype(np.float32),
                 )
@@ -969,7 +977,7 @@ class Atlas:
 
 def _local_tips(arrays: dict[str, NDArray[Any]]) -> LocalTips:
     return LocalTips(
-        modes=arrays["tip_modes"].astype(np.float32),
+        modes=arrays["tip_modes"],
         point_from=arrays["tip_from"],
         points=arrays["tip_points"],
         weights=arrays["tip_weights"],

@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix
 
 from offline.methods.calibration import stiffening
-from offline.methods.method import Answer, Case
-from offline.methods.relaxation import TOLERANCE, Ints, Stencil, relax
+from offline.methods.relaxation import TOLERANCE, Ints, Relaxed, Stencil
 from offline.methods.tetrahedra import Divisions, Tetrahedra, edges_of, gradients
 from offline.workshop import Workshop
 from shared.tissue import lame
@@ -44,7 +43,7 @@ SWEEPS, STALL = 2000, 1e-4
 """Most sweeps of the identification; it ends at this change, relative to the stiffest spring."""
 
 
-class MassSpring:
+class MassSpring(Relaxed):
     """Mass-spring system in a scene's body.
 
     Parameters
@@ -67,26 +66,11 @@ class MassSpring:
         young: float | None = None,
         tolerance: float = TOLERANCE,
     ) -> None:
-        self.mesh = Tetrahedra.of(workshop, divisions)
-        self.tolerance = tolerance
-        tissue = workshop.scene.tissue.young
-        springs = Springs.identified(self.mesh, tissue if young is None else young)
+        mesh, tissue = Tetrahedra.of(workshop, divisions), workshop.scene.tissue.young
+        springs = Springs.identified(mesh, tissue if young is None else young)
         if young is None:
-            springs = springs.stiffened(stiffening(workshop, self.mesh, springs))
-        self.body = springs
-        self.unknowns = 3 * self.mesh.free
-        self.label = f"{len(springs.ends)} springs"
-        self._load = np.zeros((3, len(self.mesh.nodes)))
-
-    def solve(self, case: Case) -> Answer:
-        """Relax from rest."""
-        self.mesh.load(case, self._load)
-        rest = relax(self.body, self._load, self.tolerance)
-        return Answer(rest.displacement, rest.converged, rest.converged, rest.iterations)
-
-    def displacement(self, answer: Answer) -> Array:
-        """Nodal displacement (n, 3) mm."""
-        return self.mesh.displacement(answer.state)
+            springs = springs.stiffened(stiffening(workshop, mesh, springs))
+        super().__init__(mesh, springs, f"{len(springs.ends)} springs", tolerance)
 
 
 class Springs:

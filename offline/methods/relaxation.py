@@ -21,6 +21,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from offline.methods.method import Answer, Case
+from offline.methods.tetrahedra import Tetrahedra
+
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 Ints = NDArray[np.int64]
@@ -81,6 +84,34 @@ class Elastic(Protocol):
     def linearise(self, displacement: Array) -> None:
         """Bring the stencil's tangent up to a displacement (3, m) mm."""
         ...
+
+
+class Relaxed:
+    """A method whose answer is a body of tetrahedra's corners, relaxed from rest.
+
+    Parameters
+    ----------
+    mesh : Tetrahedra
+    body : Elastic
+    label : str
+    tolerance : float
+        Residual of an answer relative to its load.
+    """
+
+    def __init__(self, mesh: Tetrahedra, body: Elastic, label: str, tolerance: float) -> None:
+        self.mesh, self.body, self.label, self.tolerance = mesh, body, label, tolerance
+        self.unknowns = 3 * mesh.free
+        self._load = np.zeros((3, len(mesh.nodes)))
+
+    def solve(self, case: Case) -> Answer:
+        """Relax from rest."""
+        self.mesh.load(case, self._load)
+        rest = relax(self.body, self._load, self.tolerance)
+        return Answer(rest.displacement, rest.converged, rest.converged, rest.iterations)
+
+    def displacement(self, answer: Answer) -> Array:
+        """Nodal displacement (n, 3) mm."""
+        return self.mesh.displacement(answer.state)
 
 
 class Stencil:

@@ -26,8 +26,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from offline.methods.calibration import stiffening
-from offline.methods.method import Answer, Case
-from offline.methods.relaxation import TOLERANCE, Elastic, Ints, Stencil, relax
+from offline.methods.relaxation import TOLERANCE, Ints, Relaxed, Stencil
 from offline.methods.tetrahedra import Divisions, Tetrahedra, gradients
 from offline.workshop import Workshop
 from shared.tissue import lame
@@ -42,7 +41,7 @@ LINEAR_FORCING, FORCING = 1e-4, 0.1
 """See ``offline.methods.relaxation.Elastic``; single precision reaches no less than the first."""
 
 
-class TensorMass:
+class TensorMass(Relaxed):
     """Tensor-mass model of a scene's body.
 
     Parameters
@@ -70,26 +69,13 @@ class TensorMass:
         young: float | None = None,
         tolerance: float = TOLERANCE,
     ) -> None:
-        self.mesh = Tetrahedra.of(workshop, divisions)
-        self.tolerance = tolerance
+        mesh = Tetrahedra.of(workshop, divisions)
         if young is None:
-            trial = LinearTetrahedra(self.mesh, workshop.scene.tissue.young, poisson)
-            young = workshop.scene.tissue.young * stiffening(workshop, self.mesh, trial)
+            trial = LinearTetrahedra(mesh, workshop.scene.tissue.young, poisson)
+            young = workshop.scene.tissue.young * stiffening(workshop, mesh, trial)
         kind = LinearTetrahedra if law == "linear" else NonlinearTetrahedra
-        self.body: Elastic = kind(self.mesh, young, poisson)
-        self.unknowns = 3 * self.mesh.free
-        self.label = f"{law}, {len(self.mesh.elements)} tetrahedra"
-        self._load = np.zeros((3, len(self.mesh.nodes)))
-
-    def solve(self, case: Case) -> Answer:
-        """Relax from rest."""
-        self.mesh.load(case, self._load)
-        rest = relax(self.body, self._load, self.tolerance)
-        return Answer(rest.displacement, rest.converged, rest.converged, rest.iterations)
-
-    def displacement(self, answer: Answer) -> Array:
-        """Nodal displacement (n, 3) mm."""
-        return self.mesh.displacement(answer.state)
+        label = f"{law}, {len(mesh.elements)} tetrahedra"
+        super().__init__(mesh, kind(mesh, young, poisson), label, tolerance)
 
 
 class LinearTetrahedra:

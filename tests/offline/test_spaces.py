@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from offline.scenes import find_scene
-from offline.spaces import RITZ_VECTORS, Footprint, energy_pod, local_modes, ritz_vectors
+from offline.spaces import (
+    RITZ_VECTORS,
+    Footprint,
+    energy_pod,
+    local_modes,
+    ritz_vectors,
+    whole_numbers,
+)
 from offline.workshop import Workshop
 
 PRESSURE = 2.0
@@ -89,3 +96,13 @@ def test_local_modes_lead_with_the_vectors_and_fill_up_with_the_basis(rng):
     np.testing.assert_allclose(modes.T @ modes, np.eye(8), atol=1e-10)
     leading = modes[:, :3]
     np.testing.assert_allclose(leading @ (leading.T @ vectors), vectors, atol=1e-10)
+
+
+def test_modes_in_whole_numbers_stay_orthonormal(rng):
+    orthonormal = (np.eye(40) + np.triu(0.1 * rng.standard_normal((40, 40)))).astype(np.float32)
+    own = np.linalg.qr(rng.standard_normal((40, 12)) * np.geomspace(1.0, 1e-3, 40)[:, None])[0]
+    whole, mix = whole_numbers(orthonormal @ own, orthonormal)
+    back = np.linalg.solve(orthonormal.astype(float), whole.astype(float) @ mix)
+    np.testing.assert_allclose(back.T @ back, np.eye(12), atol=2e-6)
+    np.testing.assert_allclose(back, own, atol=3e-4)  # the same modes, in the same order
+    np.testing.assert_array_equal(mix, np.triu(mix))
