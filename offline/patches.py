@@ -61,7 +61,9 @@ RESIDUAL_LOADS = 64
 RESIDUAL_DAMPING = 0.15
 """Of the fit of their logs: they scatter about any smooth function."""
 
-DEFECT_LOADS = 240
+DEFECT_LOADS, DEFECT_DAMPING = 240, 0.1
+"""Equilibria that the defect is fitted to, and the damping of the fit: undamped it goes astray at
+the ends of the range, where it is largest."""
 
 GUESS_LOADS = 500
 
@@ -546,7 +548,7 @@ def _fit_defect(
     missed = galerkin.internal_forces(np.array(states)) - reduced.internal_forces(np.array(states))
     scale = 1.0 / np.linalg.norm(states, axis=1, keepdims=True)
     kept = np.isfinite(missed).all(axis=1)
-    return damped_fit((scale * rows)[kept], (scale * missed)[kept])
+    return damped_fit((scale * rows)[kept], (scale * missed)[kept], DEFECT_DAMPING)
 
 
 def _fit_guess(

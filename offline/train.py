@@ -82,7 +82,7 @@ RITZ_SPACING = 0.455
 RITZ_REACH = 0.8
 """How far from its centre a local model learns from footprints, in units of the patch spacing."""
 
-BATCH, LEAST = 60, 180
+BATCH, LEAST = 60, 300
 """Full solutions between two looks at whether they suffice, and the least that calibrate."""
 
 CONTACTS_PER_PATCH = 400
@@ -367,7 +367,7 @@ class Pipeline:
     def _lowered(self, models: LocalModels, limits: Array) -> Array:
         """Load range that ends before the tissue gives way."""
         started = time.perf_counter()
-        rng = np.random.default_rng([self.scene.seed, 7])
+        rng = np.random.default_rng([self.scene.seed, 8])
         lowered = lowered_limits(self._untested(models, limits), rng)
         share = lowered[:, 0] / limits[:, 0]
         tqdm.write(
