@@ -24,6 +24,9 @@ class Memory:
     def forget(self) -> None:
         self.last = None
 
+    def go_on(self) -> None:
+        pass
+
 
 class FakeAtlas:
     """A block of 10 x 10 x 5 mm, clamped below, pressed from above.
