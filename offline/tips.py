@@ -21,7 +21,7 @@ from offline.overlaps import neighbours, overlaps
 from offline.sampling import farthest
 from shared import equilibrium
 from shared.atlas import Body, LocalModels, assemble_tips
-from shared.reduced import LANES
+from shared.reduced import LANES, RESIDUAL_FEATURES
 from shared.surface import Surface
 from shared.touch import (
     MAX_ITERATIONS,
@@ -198,7 +198,7 @@ def train_tip(
 
 
 def local_tips(model: FullModel, models: LocalModels, results: Sequence[TipResult]) -> LocalTips:
-    """Local models of the tip for all patches, those of footprints being known."""
+    """Local models of the tip for all patches but for ``LocalTips.residuals``."""
     modes = np.stack([r.modes for r in results]).astype(np.float32)
     pairs = neighbours(models, NEIGHBOURS * models.extent)
     return LocalTips(
@@ -209,6 +209,7 @@ def local_tips(model: FullModel, models: LocalModels, results: Sequence[TipResul
         guess=np.stack([r.guess for r in results]).astype(np.float32),
         pairs=pairs,
         overlaps=overlaps(model, models, modes, pairs),
+        residuals=np.zeros((len(modes), RESIDUAL_FEATURES)),
     )
 
 
@@ -231,6 +232,7 @@ def _untrained(
         guess=np.zeros((1, TIP_FEATURES, modes.shape[1]), np.float32),
         pairs=np.zeros((0, 2), np.int32),
         overlaps=np.zeros((0, modes.shape[1], modes.shape[1]), np.float32),
+        residuals=np.zeros((1, RESIDUAL_FEATURES)),
     )
 
 

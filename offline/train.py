@@ -50,6 +50,7 @@ from offline.touches import (
     TouchComparison,
     calibrate_touches,
     compare_touch,
+    fit_residuals,
     random_positions,
     summarise_touches,
 )
@@ -188,6 +189,10 @@ class Pipeline:
         tip_estimator = Estimator(np.zeros((3, TIP_ERROR_FEATURES)))
         tip_rows: list[TouchComparison] = []
         if models.tips is not None:
+            atlas = self._atlas(models, limits, Estimator(np.zeros((2, ERROR_FEATURES))), {})
+            rng = np.random.default_rng([self.scene.seed, 7])
+            residuals = fit_residuals(self.workshop, atlas, rng)
+            models = replace(models, tips=replace(models.tips, residuals=residuals))
             tip_estimator, tip_rows = self._validate_tip(models, limits)
             documents["validation_tip"] = summarise_touches(tip_rows)
         if 3 * len(self.workshop.mesh.nodes) <= MOST_DOFS:
@@ -566,6 +571,9 @@ class Pipeline:
                 "tip_pairs": Dataset(tips.pairs, one, "local models next to one another"),
                 "tip_overlaps": Dataset(
                     tips.overlaps.astype(np.float16), one, "products of their modes, in energy"
+                ),
+                "tip_residuals": Dataset(
+                    tips.residuals, one, "log of the residual in the full model, polynomials"
                 ),
                 "tip_error_coefficients": Dataset(
                     tip_estimator.coefficients, one, "as error_coefficients; third row: force"

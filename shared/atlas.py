@@ -293,6 +293,7 @@ def assemble_tips(
             [local.reshape(len(f), -1) for f, (_, local) in zip(near, own, strict=True)]
         ).astype(np.int32),
         **_neighbours(count, tips),
+        residuals=tips.residuals,
     )
 
 
@@ -994,6 +995,7 @@ def _local_tips(arrays: dict[str, NDArray[Any]]) -> LocalTips:
         guess=arrays["tip_guess"].astype(np.float32),
         pairs=arrays["tip_pairs"],
         overlaps=arrays["tip_overlaps"].astype(np.float32),
+        residuals=arrays["tip_residuals"],
     )
 
 

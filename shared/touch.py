@@ -37,6 +37,7 @@ from shared.reduced import (
     FAST,
     LANES,
     MAX_ACTIVE,
+    RESIDUAL_FEATURES,
     ROUND_OFF,
     STATE,
     TILE,
@@ -50,6 +51,7 @@ from shared.reduced import (
     linearise,
     nonlinear_stress,
     project,
+    residual_features,
     superpose,
 )
 from shared.surface import UPRIGHT, Ground, locate
@@ -110,6 +112,10 @@ class LocalTips:
         Patches next to one another, the smaller number first.
     overlaps : ndarray, shape (n, m, m), float32
         Products of their modes in the energy of the rest state.
+    residuals : ndarray, shape (p, RESIDUAL_FEATURES)
+        Log of the residual that answers leave in the full model, relative to them in the energy
+        norm at rest, by ``shared.reduced.residual_features``: the direction is the inward normal,
+        the load the depth.
     """
 
     modes: Field
@@ -119,6 +125,7 @@ class LocalTips:
     guess: Field
     pairs: NDArray[np.int32]
     overlaps: Field
+    residuals: Array
 
 
 class Points(NamedTuple):
@@ -150,6 +157,7 @@ class TipModels(NamedTuple):
     neighbour_from: Ints  # (p + 1,)
     neighbours: NDArray[np.int32]  # (o,) models whose answers can be taken over
     overlaps: Field  # (o, m, m) from their modes to the model's
+    residuals: Array  # (p, RESIDUAL_FEATURES) log of the residual, see ``LocalTips``
 
 
 TIP_DEGREE = 3
@@ -208,10 +216,12 @@ class TipScratch(NamedTuple):
     distance: Array  # (p,)
     fade: Array  # (MAX_ACTIVE, 3) 1/mm, gradients of the weights
     features: Array  # (TIP_FEATURES,)
+    residual_features: Array  # (RESIDUAL_FEATURES,)
+    inward: Array  # (3,)
     ground: Array  # (clusters + 6,)
 
 
-TIP_ERROR_FEATURES = 9
+TIP_ERROR_FEATURES = 10
 
 
 class TipOutcome(NamedTuple):
@@ -733,7 +743,8 @@ def _conclude(solver, x):
     """Where the force acts, and the estimated errors: ``log error = c . features``.
 
     The features: 1, the depth over its limit and its log, smallest det F, the normal (where on the
-    body), and the logs of force over depth (mN/mm) and of the energy over that of a linear spring.
+    body), and the logs of force over depth (mN/mm), of the energy over that of a linear spring, and
+    of the residual that such answers leave in the full model.
     """
     outcome = solver.outcome
     scalars, features, force = outcome.scalars, outcome.features, outcome.force
@@ -749,8 +760,24 @@ def _conclude(solver, x):
     features[4:7] = outcome.upward
     features[7] = math.log(max(pushed / depth, 1e-6))
     features[8] = math.log(max(2.0 * scalars[ENERGY] / max(pushed * depth, 1e-9), 1e-3))
+    features[9] = _residual(solver.models, x, share, solver.scratch, outcome)
     for i in range(3):
         outcome.errors[i] = math.exp(np.dot(solver.coefficients[i], features))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _residual(models, x, share, scratch, outcome):
+    """Log of the residual in the full model at a share of the largest depth, as trained."""
+    log, inward, features = 0.0, scratch.inward, scratch.residual_features
+    for i in range(3):
+        inward[i] = -outcome.upward[i]
+    for slot in range(MAX_ACTIVE):
+        if outcome.weight[slot] > 0.0:
+            k = outcome.patch[slot] if outcome.patch[slot] >= 0 else -2 - outcome.patch[slot]
+            frame, centre = models.frames[k], models.centres[:, k]
+            residual_features(frame, centre, x, inward, share, features)
+            log += outcome.weight[slot] * np.dot(models.residuals[k], features)
+    return log
 
 
 _WEIGHT = slice(0, MAX_ACTIVE)
@@ -810,6 +837,8 @@ class TipState:
             distance=np.zeros(count),
             fade=np.zeros((MAX_ACTIVE, 3)),
             features=np.zeros(TIP_FEATURES),
+            residual_features=np.zeros(RESIDUAL_FEATURES),
+            inward=np.zeros(3),
             ground=np.zeros(len(ground.radii) + 6),
         )
         # one array, so that an answer is kept by one copy
