@@ -75,6 +75,9 @@ TOLERANCE = 0.003
 """Residual before the last correction relative to the response, both in the energy norm of the rest
 state.  Newton's method squares it (to 1e-5, say), which need not be evaluated."""
 
+LEAST_SHARE = 0.1
+"""Weight of a model below which its residual may not be larger still: that counts by weight."""
+
 LAG = 0.015
 """Change of the response, relative to it, up to which the tissue's part of the tangent serves
 again.  The contact's never does: it is far stiffer and changes as fast as the tip moves."""
@@ -454,10 +457,11 @@ def _response(tip, depth):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _settle(system, q, work, depth, most):
+def _settle(system, q, work, depth, tolerance, most):
     """Equilibrium near q, in place: (status, iterations, energy, smallest det F).
 
-    The response sets the tolerance and is not known before; the depth says what it may be.
+    The tolerance is relative to the response, which is not known before; the depth says what it may
+    be.
     """
     energy, smallest = equilibrium.potential(system, q, work[0])
     status, iterations = equilibrium.CONVERGED, 0
@@ -465,7 +469,7 @@ def _settle(system, q, work, depth, most):
     size = max(math.sqrt(np.dot(q, q)), _response(system.tip, depth), least)
     while True:
         status, more, energy, smallest = descend(
-            system, q, work, energy, smallest, TOLERANCE * size, 0.0, most, False, ROUND_OFF
+            system, q, work, energy, smallest, tolerance * size, 0.0, most, False, ROUND_OFF
         )
         iterations += more
         found = math.sqrt(np.dot(q, q))
@@ -569,7 +573,9 @@ def _settle_on_the_way(system, q, work, depth, normal):
     for _ in range(RAMP):
         if status == equilibrium.CONVERGED:
             at -= away / RAMP
-            status, more, energy, smallest = _settle(system, q, work, depth, MAX_ITERATIONS)
+            status, more, energy, smallest = _settle(
+                system, q, work, depth, TOLERANCE, MAX_ITERATIONS
+            )
             iterations += more
     return status, iterations, energy, smallest
 
@@ -587,7 +593,10 @@ def _solve(models, k, slot, x, normal, depth, most, memory, scratch, outcome):
     scratch.position[:] = x
     scratch.latest[:] = np.inf
     system = _system(models, k, slot, memory, scratch)
-    status, iterations, energy, smallest = _settle(system, q, scratch.newton, depth, most)
+    tolerance = TOLERANCE / max(outcome.weight[slot], LEAST_SHARE)
+    status, iterations, energy, smallest = _settle(
+        system, q, scratch.newton, depth, tolerance, most
+    )
     if status != equilibrium.CONVERGED and depth > 0.0 and most == MAX_ITERATIONS:
         status, more, energy, smallest = _settle_on_the_way(
             system, q, scratch.newton, depth, normal
