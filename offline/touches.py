@@ -112,7 +112,7 @@ def fit_residuals(workshop: Workshop, atlas: Atlas, rng: np.random.Generator) ->
     positions = random_positions(atlas.surface, atlas.limits, atlas.scene, count, rng)
     for position in tqdm(positions, "residuals under the tip"):
         answer = atlas.touch(position)
-        residual = _residual(workshop, atlas, answer) if answer.converged else np.inf
+        residual = residual_left(workshop, atlas, answer) if answer.converged else np.inf
         if 0.0 < residual < np.inf:
             inward, share = -answer.features[4:7], answer.depth / answer.depth_limit
             for k, _, _ in answer.patches:
@@ -130,7 +130,7 @@ def fit_residuals(workshop: Workshop, atlas: Atlas, rng: np.random.Generator) ->
     return fitted
 
 
-def _residual(workshop: Workshop, atlas: Atlas, answer: Touch) -> float:
+def residual_left(workshop: Workshop, atlas: Atlas, answer: Touch) -> float:
     """What an answer leaves in the full model, relative to it in the energy norm at rest."""
     model, contact = workshop.model, workshop.contact
     u = atlas.displacement(answer).astype(float).ravel()
