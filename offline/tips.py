@@ -8,6 +8,7 @@ over its range, and of how that changes with the position, come the few modes th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offline.cubature import compress, damped_fit, nonnegative, point_forces
-from offline.full_model import NoEquilibrium
+from offline.full_model import FullModel, NoEquilibrium
+from offline.overlaps import neighbours, overlaps
 from offline.sampling import farthest
 from shared import equilibrium
 from shared.atlas import Body, LocalModels, assemble_tips
-from shared.reduced import LANES
+from shared.reduced import LANES, RESIDUAL_FEATURES
 from shared.surface import Surface
 from shared.touch import (
     MAX_ITERATIONS,
@@ -57,6 +59,9 @@ EQUATIONS = 250
 
 GUESSED = 240
 """Answers that the first guess is fitted to."""
+
+NEIGHBOURS = 1.6
+"""Distance of centres, in extents of a patch, up to which one takes over the other's answer."""
 
 
 @dataclass(frozen=True)
@@ -192,6 +197,22 @@ def train_tip(
     )
 
 
+def local_tips(model: FullModel, models: LocalModels, results: Sequence[TipResult]) -> LocalTips:
+    """Local models of the tip for all patches but for ``LocalTips.residuals``."""
+    modes = np.stack([r.modes for r in results]).astype(np.float32)
+    pairs = neighbours(models, NEIGHBOURS * models.extent)
+    return LocalTips(
+        modes=modes,
+        point_from=np.concatenate([[0], np.cumsum([len(r.points) for r in results])]),
+        points=np.concatenate([r.points for r in results]),
+        weights=np.concatenate([r.weights for r in results]),
+        guess=np.stack([r.guess for r in results]).astype(np.float32),
+        pairs=pairs,
+        overlaps=overlaps(model, models, modes, pairs),
+        residuals=np.zeros((len(modes), RESIDUAL_FEATURES)),
+    )
+
+
 def compile_tip_query(body: Body, surface: Surface, models: LocalModels) -> None:
     """Compile what ``train_tip`` runs, on a model of nothing."""
     modes = np.zeros((models.basis.shape[1], 4))
@@ -209,6 +230,9 @@ def _untrained(
         points=points.astype(np.int32),
         weights=weights,
         guess=np.zeros((1, TIP_FEATURES, modes.shape[1]), np.float32),
+        pairs=np.zeros((0, 2), np.int32),
+        overlaps=np.zeros((0, modes.shape[1], modes.shape[1]), np.float32),
+        residuals=np.zeros((1, RESIDUAL_FEATURES)),
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from offline.cubature import damped_fit
 from offline.norms import relative, statistics
 from offline.sampling import random_points_and_rim
 from offline.validate import UNSEEN, calibrate, coverage, write_rows
@@ -20,6 +21,7 @@ from shared.artifact import read_artifact
 from shared.atlas import Atlas, Estimator
 from shared.endoscope import TIP_DEPTH
 from shared.errors import PalpateError
+from shared.reduced import RESIDUAL_FEATURES, residual_features
 from shared.scene import Scene
 from shared.surface import Surface
 from shared.touch import Touch
@@ -28,8 +30,14 @@ Array = NDArray[np.float64]
 
 QUANTITIES = ("displacement", "von_mises", "force")
 
-COVERAGE, DAMPING = 0.97, 3.0
+COVERAGE, DAMPING = 0.97, 1.0
 """Of the error estimate: fewer errors are known than of loads, and they scatter more."""
+
+RESIDUAL_TOUCHES = 40
+"""Answers for each patch that tell the residual in the full model."""
+
+RESIDUAL_DAMPING = 0.15
+"""Of the fit of their logs: they scatter about any smooth function."""
 
 OTHER_EQUILIBRIUM = 0.1
 """Displacement error beyond which the models rest in different equilibria: a free edge can slip off
@@ -88,6 +96,48 @@ class TouchComparison:
 def calibrate_touches(rows: Sequence[TouchComparison]) -> Estimator:
     """Fit the error estimate of the tip to known errors."""
     return calibrate(rows, QUANTITIES, COVERAGE, DAMPING)
+
+
+def fit_residuals(workshop: Workshop, atlas: Atlas, rng: np.random.Generator) -> Array:
+    """What answers under the tip leave in the full model, patch by patch: ``LocalTips.residuals``.
+
+    Answers at random positions count for all patches that share in them.
+    """
+    models = atlas.tips
+    assert models is not None, "or there would be no answers"
+    patches = models.centres.shape[1]
+    rows: list[list[Array]] = [[] for _ in range(patches)]
+    logs: list[list[float]] = [[] for _ in range(patches)]
+    count = RESIDUAL_TOUCHES * patches
+    positions = random_positions(atlas.surface, atlas.limits, atlas.scene, count, rng)
+    for position in tqdm(positions, "residuals under the tip"):
+        answer = atlas.touch(position)
+        residual = residual_left(workshop, atlas, answer) if answer.converged else np.inf
+        if 0.0 < residual < np.inf:
+            inward, share = -answer.features[4:7], answer.depth / answer.depth_limit
+            for k, _, _ in answer.patches:
+                row, centre = np.empty(RESIDUAL_FEATURES), models.centres[:, k]
+                residual_features(models.frames[k], centre, position, inward, share, row)
+                rows[k].append(row)
+                logs[k].append(float(np.log(residual)))
+    usual = float(np.mean(np.concatenate(logs)))
+    fitted = np.zeros((patches, RESIDUAL_FEATURES))
+    for k, (A, log) in enumerate(zip(rows, logs, strict=True)):
+        fitted[k, 0] = np.mean(log) if log else usual
+        if log:
+            rest = np.array(log)[:, None] - fitted[k, 0]
+            fitted[k] += damped_fit(np.array(A), rest, RESIDUAL_DAMPING)[:, 0]
+    return fitted
+
+
+def residual_left(workshop: Workshop, atlas: Atlas, answer: Touch) -> float:
+    """What an answer leaves in the full model, relative to it in the energy norm at rest."""
+    model, contact = workshop.model, workshop.contact
+    u = atlas.displacement(answer).astype(float).ravel()
+    contact.position[:] = answer.position
+    load = np.zeros_like(u)
+    contact.potential(u, load)
+    return float(model.relative_residuals(u[None, model.free], -load[None, model.free])[0])
 
 
 def random_positions(

@@ -47,11 +47,12 @@ from offline.sampling import (
 )
 from offline.scenes import default_artifact, find_scene
 from offline.spaces import Footprint
-from offline.tips import TipResult
+from offline.tips import local_tips
 from offline.touches import (
     TouchComparison,
     calibrate_touches,
     compare_touch,
+    fit_residuals,
     random_positions,
     summarise_touches,
 )
@@ -71,7 +72,7 @@ from shared.atlas import Atlas, Estimator, LocalModels
 from shared.endoscope import TIP_DEPTH
 from shared.reduced import ERROR_FEATURES, NARROW
 from shared.scene import Scene, Size, Tolerance
-from shared.touch import TIP_ERROR_FEATURES, LocalTips
+from shared.touch import TIP_ERROR_FEATURES
 
 Array = NDArray[np.float64]
 
@@ -191,6 +192,10 @@ class Pipeline:
         tip_estimator = Estimator(np.zeros((3, TIP_ERROR_FEATURES)))
         tip_rows: list[TouchComparison] = []
         if models.tips is not None:
+            atlas = self._untested(models, limits)
+            rng = np.random.default_rng([self.scene.seed, 7])
+            residuals = fit_residuals(self.workshop, atlas, rng)
+            models = replace(models, tips=replace(models.tips, residuals=residuals))
             tip_estimator, tip_rows = self._validate_tip(models, limits)
             documents["validation_tip"] = summarise_touches(tip_rows)
         if 3 * len(self.workshop.mesh.nodes) <= MOST_DOFS:
@@ -358,8 +363,11 @@ class Pipeline:
             residuals=np.stack([r.residual for r in results]),
             extent=layout.extent,
             blend=self.scene.training.blend,
-            tips=_gather([r.tip for r in results]),
+            tips=None,
         )
+        if self.scene.endoscope.tip:
+            tips = [result.tip for result in results if result.tip is not None]
+            models = replace(models, tips=local_tips(self.workshop.model, models, tips))
         if self.scene.tissue.prony:
             models = replace(models, viscous=viscous_models(self.workshop.model, models))
         return models
@@ -576,6 +584,13 @@ class Pipeline:
                 "tip_guess": Dataset(
                     tips.guess.astype(np.float16), one, "answer as polynomials of place and depth"
                 ),
+                "tip_pairs": Dataset(tips.pairs, one, "local models next to one another"),
+                "tip_overlaps": Dataset(
+                    tips.overlaps.astype(np.float16), one, "products of their modes, in energy"
+                ),
+                "tip_residuals": Dataset(
+                    tips.residuals, one, "log of the residual in the full model, polynomials"
+                ),
                 "tip_error_coefficients": Dataset(
                     tip_estimator.coefficients, one, "as error_coefficients; third row: force"
                 ),
@@ -604,17 +619,3 @@ def _accurate(rows: Sequence[Comparison], tolerance: Tolerance) -> bool:
         for row in rows
     )
     return bool(betaincinv(missed + 1, len(rows) - missed, 0.95) <= 0.05)
-
-
-def _gather(results: Sequence[TipResult | None]) -> LocalTips | None:
-    """Local models of the tip, if they were trained."""
-    trained = [result for result in results if result is not None]
-    if not trained:
-        return None
-    return LocalTips(
-        modes=np.stack([r.modes for r in trained]).astype(np.float32),
-        point_from=np.concatenate([[0], np.cumsum([len(r.points) for r in trained])]),
-        points=np.concatenate([r.points for r in trained]),
-        weights=np.concatenate([r.weights for r in trained]),
-        guess=np.stack([r.guess for r in trained]).astype(np.float32),
-    )

@@ -3,7 +3,8 @@
 A position is first tried as it is, from the warm start of the last. If no equilibrium is found
 there, the way to it from the last good position is walked in ever smaller strides, for as long as
 there is time. What is answered is then the farthest good position, with a flag, and never a state
-that is no equilibrium.
+that is no equilibrium. Where tissue snaps there is no such way: the search for where it comes to
+rest goes on from position to position.
 """
 
 import math
@@ -29,8 +30,11 @@ In Hertz's theory the force goes with the depth d as d^1.5; linearised at d, it 
 measured on the turbinate: up to 5 % for 95 % of steps of this length in any direction.
 """
 
-MOST_ITERATIONS = 10
+MOST_ITERATIONS = 8
 """Of one solve: a step that takes more is walked in shorter strides, within the time there is."""
+
+PATIENCE = 6
+"""Positions over which the search for an equilibrium goes on before it starts from rest."""
 
 SHORTEST = 1.0 / 64.0
 """Stride, as a part of the way, that is not halved any more."""
@@ -76,11 +80,13 @@ class Follower:
         self._atlas = atlas
         self._state = atlas.new_state()
         self._good: Touch | None = None
+        self._lost = 0
 
     def restart(self) -> None:
         """Forget where the tip has been: answers are then those of a new follower."""
         self._state.forget()
         self._good = None
+        self._lost = 0
 
     def follow(self, position: Sequence[float], budget: float) -> Step:
         """Answer a position; no new solve is begun after `budget` seconds."""
@@ -101,7 +107,7 @@ class Follower:
         try:
             if not self._solve(target):
                 reason = "no equilibrium was found there"
-                share, steps = self._walk(target, may_go_on)
+                share, steps = self._catch_up(target, may_go_on)
         except QueryError as error:
             reason, share = error.message, 0.0
         touch = self._good or _nothing(target)
@@ -113,6 +119,21 @@ class Follower:
         else:
             reason = ""
         return Step(touch, flags, steps, _valid_radius(touch), perf_counter() - start, reason)
+
+    def _catch_up(self, target: Array, may_go_on: Callable[[int], bool]) -> tuple[float, int]:
+        """Get nearer to a target that was missed: share of the way, steps tried.
+
+        Where there is no way the tissue snaps: equilibria end, and the next is far off.
+        """
+        share, steps = (0.0, 1) if self._lost else self._walk(target, may_go_on)
+        if share > 0.0:
+            return share, steps
+        self._lost += 1
+        if self._lost % PATIENCE:
+            self._state.go_on()
+        else:
+            self._state.forget()
+        return share, steps
 
     def _walk(self, target: Array, may_go_on: Callable[[int], bool]) -> tuple[float, int]:
         """Go towards the target from the last good position: share of the way, steps tried."""
@@ -142,6 +163,7 @@ class Follower:
         if not (touch.converged and _is_finite(touch)):
             return False
         self._good = touch
+        self._lost = 0
         return True
 
 

@@ -299,7 +299,21 @@ def assemble_tips(
         corners=np.vstack(
             [local.reshape(len(f), -1) for f, (_, local) in zip(near, own, strict=True)]
         ).astype(np.int32),
+        **_neighbours(count, tips),
+        residuals=tips.residuals,
     )
+
+
+def _neighbours(count: int, tips: LocalTips) -> dict[str, NDArray[Any]]:
+    """From pairs of models to the neighbours of each."""
+    own, other = np.vstack([tips.pairs, tips.pairs[:, ::-1]]).T
+    overlaps = np.concatenate([tips.overlaps, tips.overlaps.swapaxes(1, 2)])
+    order = np.argsort(own, kind="stable")
+    return {
+        "neighbour_from": np.searchsorted(own[order], np.arange(count + 1)).astype(np.int64),
+        "neighbours": other[order].astype(np.int32),
+        "overlaps": np.ascontiguousarray(overlaps[order]),
+    }
 
 
 def _no_points(count: int, tips: LocalTips) -> Points:
@@ -423,6 +437,11 @@ class State:
         self.memory.patch[:] = -1
         if self.tip is not None:
             self.tip.forget()
+
+    def go_on(self) -> None:
+        """Start under the tip where the last search ended, which found no equilibrium."""
+        if self.tip is not None:
+            self.tip.go_on()
 
 
 class Solution(NamedTuple):
@@ -982,6 +1001,9 @@ def _local_tips(arrays: dict[str, NDArray[Any]]) -> LocalTips:
         points=arrays["tip_points"],
         weights=arrays["tip_weights"],
         guess=arrays["tip_guess"].astype(np.float32),
+        pairs=arrays["tip_pairs"],
+        overlaps=arrays["tip_overlaps"].astype(np.float32),
+        residuals=arrays["tip_residuals"],
     )
 
 

@@ -11,7 +11,8 @@ the query.  Force and tangent of an equilibrium are
 
     F = -dPhi/dx,      dF/dx = B^T K^-1 B - d2Phi/dx2,      B = -d2Phi/dq dx,
 
-K the tangent there.  K^-1 B dx is also where the search for the next equilibrium starts.
+K the tangent there.  K^-1 B dx is also where the search for the next equilibrium starts.  A model
+that joins in takes over the answer of a neighbour, projected in the energy of the rest state.
 
 Local models are blended by the distance of the tip's centre from where it lies when a tip presses
 the middle of the model, half as deep as may be.
@@ -36,6 +37,7 @@ from shared.reduced import (
     FAST,
     LANES,
     MAX_ACTIVE,
+    RESIDUAL_FEATURES,
     ROUND_OFF,
     STATE,
     TILE,
@@ -49,6 +51,7 @@ from shared.reduced import (
     linearise,
     nonlinear_stress,
     project,
+    residual_features,
     superpose,
 )
 from shared.surface import UPRIGHT, Ground, locate
@@ -72,12 +75,16 @@ TOLERANCE = 0.003
 """Residual before the last correction relative to the response, both in the energy norm of the rest
 state.  Newton's method squares it (to 1e-5, say), which need not be evaluated."""
 
+LEAST_SHARE = 0.1
+"""Weight of a model below which its residual may not be larger still: that counts by weight."""
+
 LAG = 0.015
 """Change of the response, relative to it, up to which the tissue's part of the tangent serves
 again.  The contact's never does: it is far stiffer and changes as fast as the tip moves."""
 
-LEAST = 1e-6
-"""Response in that norm (square root of mN mm) that counts as none."""
+SLIGHT = 0.05
+"""Depth in radii of the tip below which an answer need not be nearer to equilibrium, in that norm,
+than one so deep: where contact begins Newton's method is slow, and the force next to nothing."""
 
 MAX_ITERATIONS = 40
 
@@ -104,6 +111,14 @@ class LocalTips:
     weights : ndarray, shape (c,), mm^3
     guess : ndarray, shape (p, TIP_FEATURES, m), float32
         Answer as a polynomial in place and depth.
+    pairs : ndarray, shape (n, 2), int32
+        Patches next to one another, the smaller number first.
+    overlaps : ndarray, shape (n, m, m), float32
+        Products of their modes in the energy of the rest state.
+    residuals : ndarray, shape (p, RESIDUAL_FEATURES)
+        Log of the residual that answers leave in the full model, relative to them in the energy
+        norm at rest, by ``shared.reduced.residual_features``: the direction is the inward normal,
+        the load the depth.
     """
 
     modes: Field
@@ -111,6 +126,9 @@ class LocalTips:
     points: NDArray[np.int32]
     weights: Array
     guess: Field
+    pairs: NDArray[np.int32]
+    overlaps: Field
+    residuals: Array
 
 
 class Points(NamedTuple):
@@ -139,6 +157,10 @@ class TipModels(NamedTuple):
     face_from: Ints  # (p + 1,)
     faces: NDArray[np.int32]  # (t,) of the surface, near the model
     corners: NDArray[np.int32]  # (t, k) their nodes, counted from the model's first
+    neighbour_from: Ints  # (p + 1,)
+    neighbours: NDArray[np.int32]  # (o,) models whose answers can be taken over
+    overlaps: Field  # (o, m, m) from their modes to the model's
+    residuals: Array  # (p, RESIDUAL_FEATURES) log of the residual, see ``LocalTips``
 
 
 TIP_DEGREE = 3
@@ -163,7 +185,7 @@ def tip_features(frame, centre, x, depth, out):
 
 
 class TipMemory(NamedTuple):
-    """Last answers of the models in use; patch < 0 is an empty slot, see ``reduced.activate``."""
+    """The models of the last equilibrium, to start the next from; patch < 0 is an empty slot."""
 
     patch: Ints  # (MAX_ACTIVE,)
     q: Array  # (MAX_ACTIVE, m)
@@ -171,7 +193,7 @@ class TipMemory(NamedTuple):
     formed: Array  # (MAX_ACTIVE, m) state at which that was formed
     factor: Array  # (MAX_ACTIVE, m, m) of the tangent at the answer
     coupling: Array  # (MAX_ACTIVE, 3, m) B there
-    position: Array  # (MAX_ACTIVE, 3) mm
+    position: Array  # (3,) mm
 
 
 class TipScratch(NamedTuple):
@@ -187,6 +209,9 @@ class TipScratch(NamedTuple):
     latest: Array  # (m,)
     tangent: Array  # (m, m)
     newton: Array  # (4, m)
+    position: Array  # (3,) mm
+    factor: Array  # (MAX_ACTIVE, m, m)
+    coupling: Array  # (MAX_ACTIVE, 3, m)
     moved: Array  # (n, 3) mm, of the surface's nodes; only those near are written
     own: Array  # (3 k, m) modes at the nodes of a face
     folded: Array  # (3 k, m) a face's stiffness times these
@@ -194,15 +219,19 @@ class TipScratch(NamedTuple):
     distance: Array  # (p,)
     fade: Array  # (MAX_ACTIVE, 3) 1/mm, gradients of the weights
     features: Array  # (TIP_FEATURES,)
+    residual_features: Array  # (RESIDUAL_FEATURES,)
+    inward: Array  # (3,)
     ground: Array  # (clusters + 6,)
 
 
-TIP_ERROR_FEATURES = 9
+TIP_ERROR_FEATURES = 10
 
 
 class TipOutcome(NamedTuple):
     """What a query writes."""
 
+    patch: Ints  # (MAX_ACTIVE,) models that answer, see ``reduced.activate``
+    q: Array  # (MAX_ACTIVE, m) their answers
     weight: Array  # (MAX_ACTIVE,)
     foot: Array  # (3,) mm, on the surface, nearest to the tip's centre
     upward: Array  # (3,) outward normal there
@@ -356,7 +385,7 @@ def _far(u, other):
     for j in range(len(u)):
         size += u[j] * u[j]
         distance += (u[j] - other[j]) ** 2
-    return distance / max(size, LEAST * LEAST)
+    return distance / max(size, 1e-12)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -422,28 +451,36 @@ descend = njit(equilibrium.descend, error_model="numpy", nogil=True, cache=True)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _settle(system, q, work, least, most):
-    """Equilibrium near q, in place: (status, iterations, energy, smallest det F).
-
-    The response sets the tolerance and is not known before; ``least`` is what it may be.
-    """
-    energy, smallest = equilibrium.potential(system, q, work[0])
-    status, iterations = equilibrium.CONVERGED, 0
-    size = max(math.sqrt(np.dot(q, q)), least, LEAST)
-    while True:
-        status, more, energy, smallest = descend(
-            system, q, work, energy, smallest, TOLERANCE * size, 0.0, most, False, ROUND_OFF
-        )
-        iterations += more
-        found = math.sqrt(np.dot(q, q))
-        if status != equilibrium.CONVERGED or size <= 2.0 * found or size <= LEAST:
-            return status, iterations, energy, smallest
-        size = max(found, LEAST)
+def _response(tip, depth):
+    """About a tenth of the least response to a tip so deep, in the energy norm."""
+    return 0.1 * depth * tip.radius * math.sqrt(tip.stiffness / HARDNESS)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _system(models, k, slot, x, memory, scratch):
-    """Local model k under the tip at x, by reference."""
+def _settle(system, q, work, depth, tolerance, most):
+    """Equilibrium near q, in place: (status, iterations, energy, smallest det F).
+
+    The tolerance is relative to the response, which is not known before; the depth says what it may
+    be.
+    """
+    energy, smallest = equilibrium.potential(system, q, work[0])
+    status, iterations = equilibrium.CONVERGED, 0
+    least = _response(system.tip, SLIGHT * system.tip.radius)
+    size = max(math.sqrt(np.dot(q, q)), _response(system.tip, depth), least)
+    while True:
+        status, more, energy, smallest = descend(
+            system, q, work, energy, smallest, tolerance * size, 0.0, most, False, ROUND_OFF
+        )
+        iterations += more
+        found = math.sqrt(np.dot(q, q))
+        if status != equilibrium.CONVERGED or size <= 2.0 * found or size <= least:
+            return status, iterations, energy, smallest
+        size = max(found, least)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _system(models, k, slot, memory, scratch):
+    """Local model k under the tip at ``scratch.position``, by reference."""
     nodes = slice(models.node_from[k], models.node_from[k + 1])
     faces = slice(models.face_from[k], models.face_from[k + 1])
     return bind_compiled(
@@ -467,14 +504,14 @@ def _system(models, k, slot, x, memory, scratch):
             memory.formed[slot],
             scratch.latest,
             scratch.tangent,
-            memory.factor[slot],
+            scratch.factor[slot],
             models.tip,
             models.surface,
             models.nodes[nodes],
             models.modes[nodes],
             models.faces[faces],
             models.corners[faces],
-            x,
+            scratch.position,
             scratch.newton[1],
             scratch.moved,
             scratch.own,
@@ -495,17 +532,38 @@ def _guess(models, k, x, depth, features, q):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _predict(memory, slot, x, q, step):
+def _predict(memory, slot, x, q):
     """Follow the last answer's derivatives to the position x."""
+    q[:] = 0.0
     for i in range(3):
-        step[:] = memory.coupling[slot, i]
-        back_substitute(memory.factor[slot], step)
-        for j in range(len(q)):
-            q[j] += step[j] * (x[i] - memory.position[slot, i])
+        q += (x[i] - memory.position[i]) * memory.coupling[slot, i]
+    back_substitute(memory.factor[slot], q)
+    q += memory.q[slot]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _settle_on_the_way(system, q, work, least, depth, normal):
+def _take_over(models, k, x, memory, scratch, q):
+    """Project the answer of the nearest neighbour that has one, as it is at x; False without."""
+    source, at, least = -1, -1, np.inf
+    for i in range(models.neighbour_from[k], models.neighbour_from[k + 1]):
+        n = models.neighbours[i]
+        for slot in range(MAX_ACTIVE):
+            if memory.patch[slot] == n and scratch.distance[n] < least:
+                source, at, least = slot, i, scratch.distance[n]
+    if source < 0:
+        return False
+    followed = scratch.newton[0]
+    _predict(memory, source, x, followed)
+    for i in range(len(q)):
+        row, total = models.overlaps[at, i], 0.0
+        for j in range(len(q)):
+            total += row[j] * followed[j]
+        q[i] = total
+    return True
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _settle_on_the_way(system, q, work, depth, normal):
     """As ``_settle``, from rest along the way in, for where a jump fails."""
     at = system.x
     away = depth * normal
@@ -515,36 +573,39 @@ def _settle_on_the_way(system, q, work, least, depth, normal):
     for _ in range(RAMP):
         if status == equilibrium.CONVERGED:
             at -= away / RAMP
-            status, more, energy, smallest = _settle(system, q, work, least, MAX_ITERATIONS)
+            status, more, energy, smallest = _settle(
+                system, q, work, depth, TOLERANCE, MAX_ITERATIONS
+            )
             iterations += more
     return status, iterations, energy, smallest
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _solve(models, k, slot, warm, x, normal, depth, most, memory, scratch, outcome):
-    """Equilibrium of model k, its force and tangent into memory's slot and the outcome."""
-    q, at = memory.q[slot], memory.position[slot]
-    if warm:
-        _predict(memory, slot, x, q, scratch.newton[1])
+def _solve(models, k, slot, x, normal, depth, most, memory, scratch, outcome):
+    """Equilibrium of model k, its force and tangent, into the outcome's slot."""
+    q = outcome.q[slot]
+    if memory.patch[slot] == k:
+        _predict(memory, slot, x, q)
     else:
-        _guess(models, k, x, depth, scratch.features, q)
         memory.formed[slot] = np.inf
-    at[:] = x
+        if not _take_over(models, k, x, memory, scratch, q):
+            _guess(models, k, x, depth, scratch.features, q)
+    scratch.position[:] = x
     scratch.latest[:] = np.inf
-    tip = models.tip
-    least = 0.1 * depth * tip.radius * math.sqrt(tip.stiffness / HARDNESS)
-    system = _system(models, k, slot, at, memory, scratch)
-    status, iterations, energy, smallest = _settle(system, q, scratch.newton, least, most)
+    system = _system(models, k, slot, memory, scratch)
+    tolerance = TOLERANCE / max(outcome.weight[slot], LEAST_SHARE)
+    status, iterations, energy, smallest = _settle(
+        system, q, scratch.newton, depth, tolerance, most
+    )
     if status != equilibrium.CONVERGED and depth > 0.0 and most == MAX_ITERATIONS:
         status, more, energy, smallest = _settle_on_the_way(
-            system, q, scratch.newton, least, depth, normal
+            system, q, scratch.newton, depth, normal
         )
         iterations += more
-        at[:] = x
     if status == equilibrium.CONVERGED and not equilibrium.factorise(system, q, 0.0):
         status = equilibrium.STALLED  # a saddle
     if status == equilibrium.CONVERGED:
-        coupling, force = memory.coupling[slot], outcome.forces[slot]
+        coupling, force = scratch.coupling[slot], outcome.forces[slot]
         _react(system, coupling, force, outcome.tangents[slot])
         residual, step = scratch.newton[0], scratch.newton[1]
         equilibrium.correct(system, residual, step)
@@ -555,7 +616,7 @@ def _solve(models, k, slot, warm, x, normal, depth, most, memory, scratch, outco
     else:
         outcome.forces[slot] = 0.0
         outcome.tangents[slot] = 0.0
-    memory.patch[slot] = k if status == equilibrium.CONVERGED else -2 - k
+    outcome.patch[slot] = k if status == equilibrium.CONVERGED else -2 - k
     scalars, touching = outcome.scalars, scratch.touching
     scalars[STATUS] = max(scalars[STATUS], float(status))
     scalars[ITERATIONS] = max(scalars[ITERATIONS], float(iterations))
@@ -563,6 +624,23 @@ def _solve(models, k, slot, warm, x, normal, depth, most, memory, scratch, outco
     scalars[ENERGY] += outcome.weight[slot] * energy
     scalars[PENETRATION] = max(scalars[PENETRATION], touching.deepest[0])
     scalars[TOUCHED] += touching.touched[0]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _remember(memory, scratch, outcome, x):
+    """Start the next search from these answers; from those before where one is no equilibrium."""
+    found = outcome.scalars[STATUS] == equilibrium.CONVERGED
+    for slot in range(MAX_ACTIVE):
+        if outcome.weight[slot] > 0.0:
+            if found:
+                memory.q[slot] = outcome.q[slot]
+                memory.factor[slot] = scratch.factor[slot]
+                memory.coupling[slot] = scratch.coupling[slot]
+            elif outcome.patch[slot] != memory.patch[slot]:
+                memory.formed[slot] = np.inf  # of another model, or far off
+    if found:
+        memory.patch[:] = outcome.patch
+        memory.position[:] = x
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -590,9 +668,9 @@ def _react(system, coupling, force, tangent):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _weight_gradients(models, memory, x, weight, scratch):
+def _weight_gradients(models, outcome, x, scratch):
     """Gradients of the weights in the tip's position, into ``scratch.fade``."""
-    fade, centres = scratch.fade, models.centres
+    fade, centres, weight = scratch.fade, models.centres, outcome.weight
     fade[:] = 0.0
     nearest = 0
     for k in range(len(scratch.distance)):
@@ -602,7 +680,7 @@ def _weight_gradients(models, memory, x, weight, scratch):
     whole = 0.0
     for slot in range(MAX_ACTIVE):
         if weight[slot] > 0.0:
-            k = memory.patch[slot]
+            k = outcome.patch[slot]
             k = k if k >= 0 else -2 - k
             own = math.sqrt(scratch.distance[k])
             excess = (own - least) / models.blend
@@ -648,14 +726,14 @@ def query(solver, x, most):
     scalars[DEPTH], scalars[DISTANCE], scalars[BESIDE] = depth, distance, 1.0 if beside else 0.0
     if depth > radius or depth < -SKIN * radius:
         return
-    activate(models, x, memory, scratch.distance, outcome.weight)
-    _weight_gradients(models, memory, x, outcome.weight, scratch)
+    outcome.patch[:] = memory.patch
+    activate(models, x, outcome, scratch.distance, outcome.weight)
+    _weight_gradients(models, outcome, x, scratch)
     for slot in range(MAX_ACTIVE):
         if outcome.weight[slot] > 0.0:
-            k = memory.patch[slot]
-            warm = k >= 0
-            k = k if warm else -2 - k
-            _solve(models, k, slot, warm, x, upward, depth, most, memory, scratch, outcome)
+            k = outcome.patch[slot]
+            k = k if k >= 0 else -2 - k
+            _solve(models, k, slot, x, upward, depth, most, memory, scratch, outcome)
             share = outcome.weight[slot]
             for i in range(3):
                 outcome.force[i] += share * outcome.forces[slot, i]
@@ -664,6 +742,7 @@ def query(solver, x, most):
                         share * outcome.tangents[slot, i, j]
                         + outcome.forces[slot, i] * scratch.fade[slot, j]
                     )
+    _remember(memory, scratch, outcome, x)
     if scalars[TOUCHED] > 0.0:
         _conclude(solver, x)
 
@@ -673,7 +752,8 @@ def _conclude(solver, x):
     """Where the force acts, and the estimated errors: ``log error = c . features``.
 
     The features: 1, the depth over its limit and its log, smallest det F, the normal (where on the
-    body), and the logs of force over depth (mN/mm) and of the energy over that of a linear spring.
+    body), and the logs of force over depth (mN/mm), of the energy over that of a linear spring, and
+    of the residual that such answers leave in the full model.
     """
     outcome = solver.outcome
     scalars, features, force = outcome.scalars, outcome.features, outcome.force
@@ -689,8 +769,24 @@ def _conclude(solver, x):
     features[4:7] = outcome.upward
     features[7] = math.log(max(pushed / depth, 1e-6))
     features[8] = math.log(max(2.0 * scalars[ENERGY] / max(pushed * depth, 1e-9), 1e-3))
+    features[9] = _residual(solver.models, x, share, solver.scratch, outcome)
     for i in range(3):
         outcome.errors[i] = math.exp(np.dot(solver.coefficients[i], features))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _residual(models, x, share, scratch, outcome):
+    """Log of the residual in the full model at a share of the largest depth, as trained."""
+    log, inward, features = 0.0, scratch.inward, scratch.residual_features
+    for i in range(3):
+        inward[i] = -outcome.upward[i]
+    for slot in range(MAX_ACTIVE):
+        if outcome.weight[slot] > 0.0:
+            k = outcome.patch[slot] if outcome.patch[slot] >= 0 else -2 - outcome.patch[slot]
+            frame, centre = models.frames[k], models.centres[:, k]
+            residual_features(frame, centre, x, inward, share, features)
+            log += outcome.weight[slot] * np.dot(models.residuals[k], features)
+    return log
 
 
 _WEIGHT = slice(0, MAX_ACTIVE)
@@ -727,7 +823,7 @@ class TipState:
             formed=np.zeros((MAX_ACTIVE, m)),
             factor=np.zeros((MAX_ACTIVE, m, m)),
             coupling=np.zeros((MAX_ACTIVE, 3, m)),
-            position=np.zeros((MAX_ACTIVE, 3)),
+            position=np.zeros(3),
         )
         self.scratch = scratch = TipScratch(
             H=np.zeros(entries, np.float32),
@@ -740,6 +836,9 @@ class TipState:
             latest=np.zeros(m),
             tangent=np.zeros((m, m)),
             newton=np.zeros((4, m)),
+            position=np.zeros(3),
+            factor=np.zeros((MAX_ACTIVE, m, m)),
+            coupling=np.zeros((MAX_ACTIVE, 3, m)),
             moved=np.zeros(models.surface.nodes.shape),
             own=np.zeros((3 * models.corners.shape[1], m)),
             folded=np.zeros((3 * models.corners.shape[1], m)),
@@ -747,11 +846,15 @@ class TipState:
             distance=np.zeros(count),
             fade=np.zeros((MAX_ACTIVE, 3)),
             features=np.zeros(TIP_FEATURES),
+            residual_features=np.zeros(RESIDUAL_FEATURES),
+            inward=np.zeros(3),
             ground=np.zeros(len(ground.radii) + 6),
         )
         # one array, so that an answer is kept by one copy
         self.record = record = np.zeros(_SCALARS.stop)
-        self.outcome = TipOutcome(
+        self.outcome = outcome = TipOutcome(
+            patch=np.full(MAX_ACTIVE, -1, np.int64),
+            q=np.zeros((MAX_ACTIVE, m)),
             weight=record[_WEIGHT],
             foot=np.zeros(3),
             upward=np.zeros(3),
@@ -767,13 +870,23 @@ class TipState:
             scalars=record[_SCALARS],
         )
         solver = TipSolver(
-            models, ground, np.ascontiguousarray(coefficients), self.memory, scratch, self.outcome
+            models, ground, np.ascontiguousarray(coefficients), self.memory, scratch, outcome
         )
         self.bound = bind(solver)
 
     def forget(self) -> None:
-        """Make the next answer independent of the last."""
+        """Make the next answer independent of those before."""
         self.memory.patch[:] = -1
+
+    def go_on(self) -> None:
+        """Start the next search where the last one ended, which found no equilibrium."""
+        memory, outcome = self.memory, self.outcome
+        numbers = np.where(outcome.patch >= 0, outcome.patch, -2 - outcome.patch)
+        memory.patch[:] = np.where(outcome.weight > 0.0, numbers, -1)
+        memory.q[:] = outcome.q
+        memory.formed[:] = np.inf
+        memory.factor[:] = np.eye(memory.q.shape[1])
+        memory.coupling[:] = 0.0  # the answer to another position is unknown
 
 
 class Touch(NamedTuple):
@@ -853,7 +966,7 @@ def answer(state: TipState, position: Array, started: float, most: int = MAX_ITE
         If the tip's centre lies below the surface.
     """
     query(state.bound, position, most)
-    record, memory, radius = state.record.copy(), state.memory, state.radius
+    record, outcome, radius = state.record.copy(), state.outcome, state.radius
     weights, scalars = record[_WEIGHT].tolist(), record[_SCALARS].tolist()
     errors, limit = record[_ERRORS].tolist(), record[_LIMIT].item()
     depth = scalars[DEPTH]
@@ -872,8 +985,8 @@ def answer(state: TipState, position: Array, started: float, most: int = MAX_ITE
     if contact:
         for slot, weight in enumerate(weights):
             if weight > 0:
-                k = int(memory.patch[slot])
-                patches.append((k if k >= 0 else -2 - k, weight, memory.q[slot].copy()))
+                k = int(outcome.patch[slot])
+                patches.append((k if k >= 0 else -2 - k, weight, outcome.q[slot].copy()))
     return Touch(
         position=position,
         contact=contact,

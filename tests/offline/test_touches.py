@@ -7,8 +7,12 @@ from offline.touches import (
     QUANTITIES,
     TouchComparison,
     calibrate_touches,
+    random_positions,
+    residual_left,
     validate_touches,
 )
+from offline.workshop import Workshop
+from shared.artifact import read_artifact
 from shared.atlas import Atlas
 
 
@@ -32,6 +36,17 @@ def test_the_artifact_says_how_near(artifact):
     assert report["force"]["p95"] < 0.03
 
 
+def test_patches_know_what_their_answers_leave_in_the_full_model(artifact):
+    atlas, workshop = Atlas.load(artifact), Workshop.of_artifact(read_artifact(artifact))
+    rng = np.random.default_rng(5)
+    positions = random_positions(atlas.surface, atlas.limits, atlas.scene, 40, rng)
+    answers = [atlas.touch(position) for position in positions]
+    left = np.log([residual_left(workshop, atlas, answer) for answer in answers])
+    foretold = np.array([answer.features[-1] for answer in answers])
+    assert np.median(np.abs(left - foretold)) < 0.4
+    assert np.corrcoef(left, foretold)[0, 1] > 0.5
+
+
 def row(features, errors):
     return TouchComparison(0, 0, 0, 1, 1, 0, *errors, 0, True, True, 1, features=features)
 
@@ -39,7 +54,7 @@ def row(features, errors):
 def test_the_estimate_covers_what_it_is_fitted_to(rng):
     rows = []
     for _ in range(60):
-        features = np.concatenate([[1.0], rng.standard_normal(8)])
+        features = np.concatenate([[1.0], rng.standard_normal(9)])
         rows.append(row(features, np.exp(rng.standard_normal(3) + features[1] - 8)))
     estimator = calibrate_touches(rows)
     covered = 0

@@ -20,9 +20,14 @@ class Memory:
 
     def __init__(self) -> None:
         self.last: np.ndarray | None = None
+        self.gone_on = 0
 
     def forget(self) -> None:
         self.last = None
+        self.gone_on = 0
+
+    def go_on(self) -> None:
+        self.gone_on += 1
 
 
 class FakeAtlas:
@@ -31,14 +36,15 @@ class FakeAtlas:
     Above `collapse` (kPa) it has no equilibrium; `poison` makes its answers NaN.
 
     A tip meets a bed of springs of `stiffness` (mN/mm). Deeper than `deepest` (mm) there is no
-    equilibrium, and none is found more than `stride` (mm) from the last contact. Without `tips`
-    there is no answer to a tip at all.
+    equilibrium, but for a search that has gone on `snap` times; none is found more than `stride`
+    (mm) from the last contact. Without `tips` there is no answer to a tip at all.
     """
 
     pressure_max = 8.0
     stiffness = 20.0
     deepest = 1.5
     stride = np.inf
+    snap = 0
     tips: object | None = "a bed of springs"
 
     def __init__(
@@ -129,7 +135,8 @@ class FakeAtlas:
             raise QueryError("position", "the tip's centre lies below the surface")
         last = state.last
         leap = last is not None and float(np.linalg.norm(position - last)) > self.stride
-        converged = depth <= self.deepest and not leap
+        snapped = 0 < self.snap <= state.gone_on
+        converged = (depth <= self.deepest or snapped) and not leap
         if converged:
             state.last = position
         contact = depth > 0.0

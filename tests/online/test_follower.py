@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from online.follower import Follower
+from online.follower import PATIENCE, Follower
 from online.frames import Flag
 
 from .fake_atlas import FakeAtlas
@@ -62,6 +62,28 @@ def test_where_equilibria_end_the_tool_stops(atlas):
     step = follower.follow((5.0, 5.0, 5.0), budget=10.0)
     assert step.flags == TOUCHING & ~Flag.IN_RANGE | Flag.CLAMPED
     assert atlas.deepest - 1.5 / 32 <= step.touch.depth <= atlas.deepest
+
+
+def test_where_tissue_snaps_the_search_goes_on_from_position_to_position(atlas):
+    atlas.snap = 3
+    follower = Follower(atlas)
+    good = follower.follow((5.0, 5.0, 7.0 - atlas.deepest), budget=0.0)
+    steps = [follower.follow((5.0, 5.0, z), budget=10.0) for z in (5.4, 5.3, 5.2, 5.1)]
+    for step in steps[:3]:
+        assert step.flags & Flag.FALLBACK
+        assert step.touch is good.touch
+    assert [step.steps for step in steps[1:]] == [1, 1, 1]
+    assert not steps[3].flags & (Flag.FALLBACK | Flag.CLAMPED)
+    assert steps[3].touch.position[2] == 5.1
+
+
+def test_a_search_that_finds_nothing_starts_anew(atlas):
+    atlas.stride = 0.3
+    follower = Follower(atlas)
+    follower.follow((5.0, 5.0, 7.0 - atlas.deepest), budget=0.0)
+    for _ in range(PATIENCE):
+        assert follower.follow((5.0, 5.0, 5.2), budget=0.0).flags & Flag.FALLBACK
+    assert follower.follow((8.0, 5.0, 6.5), budget=0.0).flags == TOUCHING
 
 
 def test_a_position_that_makes_no_sense_falls_back_at_once(atlas):

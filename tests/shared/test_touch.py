@@ -124,6 +124,41 @@ def test_where_it_came_from_does_not_matter(atlas):
     np.testing.assert_allclose(warm.force, cold.force, atol=1e-3 * np.linalg.norm(cold.force))
 
 
+def test_a_model_that_joins_in_starts_from_its_neighbours_answer(atlas):
+    state, joined, cold, numbers = atlas.new_state(), [], [], set()
+    for a in np.arange(0.2, 0.8, 0.005):
+        x = above(atlas, 0.7, (a, 0.4))
+        answer = atlas.touch(x, state)
+        new = {k for k, _, _ in answer.patches} - numbers
+        if numbers and new:
+            joined.append(answer.iterations)
+            cold.append(atlas.touch(x).iterations)
+        numbers = {k for k, _, _ in answer.patches}
+    assert len(joined) >= 3
+    assert np.mean(joined) < 0.6 * np.mean(cold)
+
+
+def test_what_is_no_equilibrium_is_not_gone_on_from(atlas):
+    state = atlas.new_state()
+    before = atlas.touch(above(atlas, 0.6), state)
+    assert not atlas.touch(above(atlas, 0.7), state, most=0).converged
+    again = atlas.touch(above(atlas, 0.6), state, most=0)
+    assert again.converged
+    np.testing.assert_allclose(again.force, before.force, rtol=1e-4, atol=1e-3)
+
+
+def test_a_search_can_go_on_at_the_next_position(atlas):
+    """Iteration by iteration, while the tip goes on."""
+    state, depths = atlas.new_state(), iter(np.arange(0.7, 0.8, 0.005))
+    answer = atlas.touch(above(atlas, next(depths)), state, most=3)
+    assert not answer.converged
+    while not answer.converged:
+        state.go_on()
+        answer = atlas.touch(above(atlas, next(depths)), state, most=3)
+    cold = atlas.touch(answer.position)
+    np.testing.assert_allclose(answer.force, cold.force, atol=1e-3 * np.linalg.norm(cold.force))
+
+
 def test_what_is_outside_the_range_is_flagged(atlas):
     inside = atlas.touch(above(atlas, 0.3))
     assert inside.in_range
