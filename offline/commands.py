@@ -162,13 +162,13 @@ def validate(
     whole range. Errors are relative L2 norms, as fractions; of histories, over all moments too.
     """
     from offline.histories import validate_histories
+    from offline.tip_histories import validate_courses
     from offline.touches import validate_touches
     from offline.validate import validate
 
     if histories is not None:
-        if tip:
-            raise click.UsageError("--tip and --histories exclude each other")
-        _show(validate_histories(artifact, histories, seed, csv), as_json)
+        follow = validate_courses if tip else validate_histories
+        _show(follow(artifact, histories, seed, csv), as_json)
         return
     _show((validate_touches if tip else validate)(artifact, queries, seed, csv), as_json)
 

@@ -307,7 +307,7 @@ def train_patch(
     tip = None
     if scene.endoscope.tip:
         tip = train_tip(
-            body, surface, weights, reduced.models, region.orthonormal,
+            model, body, surface, weights, reduced.models, region.orthonormal,
             task.contacts, task.normals, task.ranges[:, TIP_DEPTH], rng,
         )  # fmt: skip
     return replace(result, guess=guess.astype(np.float16), residual=residual, tip=tip)

@@ -69,6 +69,7 @@ from shared.atlas import Atlas, Estimator, LocalModels
 from shared.endoscope import TIP_DEPTH
 from shared.reduced import ERROR_FEATURES, NARROW
 from shared.scene import Scene, Size, Tolerance
+from shared.tip_history import HISTORY_FEATURES
 from shared.touch import TIP_ERROR_FEATURES, LocalTips
 
 Array = NDArray[np.float64]
@@ -197,7 +198,8 @@ class Pipeline:
             documents["training"]["choice"] = choice.document
         if mesh_choice is not None:
             documents["training"]["mesh_choice"] = mesh_choice
-        self._write(path, models, limits, estimator, tip_estimator, documents)
+        history_estimator = Estimator(np.zeros((3, HISTORY_FEATURES)))
+        self._write(path, models, limits, estimator, tip_estimator, history_estimator, documents)
         report = path.parent / path.stem / "report"
         report.mkdir(parents=True, exist_ok=True)
         write_rows(report / "validation.csv", rows)
@@ -357,7 +359,11 @@ class Pipeline:
             tips=_gather([r.tip for r in results]),
         )
         if self.scene.tissue.prony:
-            models = replace(models, viscous=viscous_models(self.workshop.model, models))
+            model = self.workshop.model
+            models = replace(models, viscous=viscous_models(model, models, models.modes))
+            if models.tips is not None:
+                tips = viscous_models(model, models, models.tips.modes)
+                models = replace(models, viscous_tips=tips)
         return models
 
     def _validate_tip(
@@ -489,6 +495,7 @@ class Pipeline:
         return Atlas(
             self.scene.name, self.scene, documents, self.workshop.body, self.surface, limits,
             models, estimator, Estimator(np.zeros((3, TIP_ERROR_FEATURES))),
+            Estimator(np.zeros((3, HISTORY_FEATURES))),
         )  # fmt: skip
 
     def _write(
@@ -498,6 +505,7 @@ class Pipeline:
         limits: Array,
         estimator: Estimator,
         tip_estimator: Estimator,
+        history_estimator: Estimator,
         documents: dict[str, Any],
     ) -> None:
         mesh, surface = self.workshop.mesh, self.surface
@@ -573,6 +581,19 @@ class Pipeline:
                 "viscous_pairs": Dataset(viscous.pairs, one, "local models whose spaces meet"),
                 "viscous_overlap": Dataset(
                     viscous.overlap.astype(np.float16), one, "products of their modes, in energy"
+                ),
+            }
+        if models.viscous_tips is not None:
+            viscous = models.viscous_tips
+            datasets |= {
+                "tip_viscous_deviatoric": Dataset(
+                    viscous.deviatoric.astype(np.float16), one, "the same in the modes of the tip"
+                ),
+                "tip_viscous_overlap": Dataset(
+                    viscous.overlap.astype(np.float16), one, "products of these, by viscous_pairs"
+                ),
+                "history_error_coefficients": Dataset(
+                    history_estimator.coefficients, one, "as tip_error_coefficients, of histories"
                 ),
             }
         documents["provenance"]["wall_seconds"] = round(sum(self.seconds.values()), 1)

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from shared import equilibrium, tissue
 from shared.bound import bind, bind_compiled
 from shared.errors import QueryError
+from shared.history import Local
 from shared.reduced import (
     FAST,
     LANES,
@@ -800,7 +801,7 @@ class Touch(NamedTuple):
     penetration : float, mm
         How far at most the tip overlaps the deformed surface.
     energy : float, mN mm
-        Stored in tissue and contact.
+        Stored in tissue and contact; of tissue that remembers, the potential of its last step.
     converged : bool
     iterations : int
     in_range : bool
@@ -817,6 +818,10 @@ class Touch(NamedTuple):
         Active patches: number, weight, answer (m,) in the patch's modes under
         the tip; see ``Atlas.displacement``.
     solve_seconds : float
+    time : float, s
+        Since rest, of tissue that remembers.
+    active : tuple of (int, float, Local)
+        Of such tissue, the active patches with all that they remember.
     """
 
     position: Array
@@ -840,6 +845,8 @@ class Touch(NamedTuple):
     features: Array
     patches: tuple[tuple[int, float, Array], ...]
     solve_seconds: float
+    time: float = 0.0
+    active: tuple[tuple[int, float, Local], ...] = ()
 
 
 def answer(state: TipState, position: Array, started: float, most: int = MAX_ITERATIONS) -> Touch:

@@ -26,7 +26,7 @@ def block():
 
 def place(depth, aside=0.0):
     """Centre of the tip, and the way it has come."""
-    return TOP + [aside, 0.0, RADIUS - depth], np.array([0.0, 0.0, -max(depth, 0.0)])
+    return TOP + np.array([aside, 0.0, RADIUS - depth]), np.array([0.0, 0.0, -max(depth, 0.0)])
 
 
 def follow(block, course, history=None):
