@@ -144,7 +144,7 @@ class CourseComparison:
 
 
 def compare_course(
-    workshop: Workshop, atlas: Atlas, course: Course, full: tuple[Array, Array, Array]
+    workshop: Workshop, atlas: Atlas, course: Course, full: Sequence[NDArray[Any]]
 ) -> CourseComparison:
     """Answer a history with the reduced model and compare with full solutions (t, ...)."""
     answers = play_course(atlas, course)

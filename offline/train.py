@@ -45,6 +45,13 @@ from offline.sampling import (
 )
 from offline.scenes import default_artifact, find_scene
 from offline.spaces import Footprint
+from offline.tip_histories import (
+    CourseComparison,
+    calibrate_courses,
+    compare_course,
+    random_courses,
+    summarise_courses,
+)
 from offline.tips import TipResult
 from offline.touches import (
     TouchComparison,
@@ -90,6 +97,9 @@ TRIAL_PATCHES = 8
 
 TIP_SAMPLES = 120
 """Full solutions under the tip that validate and calibrate."""
+
+MOST_COURSES = 48
+"""Full histories under the tip that validate and calibrate, a quarter of ``samples`` at most."""
 
 REFINED_LOADS = 4
 
@@ -199,6 +209,9 @@ class Pipeline:
         if mesh_choice is not None:
             documents["training"]["mesh_choice"] = mesh_choice
         history_estimator = Estimator(np.zeros((3, HISTORY_FEATURES)))
+        if models.viscous_tips is not None:
+            history_estimator, courses = self._validate_courses(models, limits)
+            documents["validation_tip_histories"] = summarise_courses(courses)
         self._write(path, models, limits, estimator, tip_estimator, history_estimator, documents)
         report = path.parent / path.stem / "report"
         report.mkdir(parents=True, exist_ok=True)
@@ -389,6 +402,31 @@ class Pipeline:
             for row in half:
                 row.estimate(estimator)
         return calibrate_touches(rows), rows
+
+    def _validate_courses(
+        self, models: LocalModels, limits: Array
+    ) -> tuple[Estimator, list[CourseComparison]]:
+        """Validate over histories of the tip, and calibrate their error estimate."""
+        rng = np.random.default_rng([self.scene.seed, 7])
+        atlas = self._atlas(models, limits, Estimator(np.zeros((2, ERROR_FEATURES))), {})
+        count = min(MOST_COURSES, self.scene.training.samples // 4)
+        courses = random_courses(self.surface, limits, self.scene, count, rng)
+        tasks = {f"course-{i}": (Workshop.follow_tip, *course) for i, course in enumerate(courses)}
+        found = self._stage(
+            "full histories under the tip",
+            tasks,
+            lambda f: dict(zip("usf", ([],) * 3 if f is None else f, strict=True)),
+        )
+        rows = [
+            compare_course(self.workshop, atlas, course, tuple(found[name][part] for part in "usf"))
+            for name, course in zip(tasks, courses, strict=True)
+            if found[name]["u"].size
+        ]
+        for half, other in ((rows[::2], rows[1::2]), (rows[1::2], rows[::2])):
+            estimator = calibrate_courses(other)
+            for moment in (moment for row in half for moment in row.moments):
+                moment.estimate(estimator)
+        return calibrate_courses(rows), rows
 
     def _validate(
         self, models: LocalModels, limits: Array

@@ -57,7 +57,15 @@ from shared.surface import UPRIGHT, Ground, Surface, boundary_triangles
 from shared.tip import Tip, TipSurface, tip_of, tip_surface
 from shared.tip_history import HISTORY_FEATURES, TipHistory, TipStepper
 from shared.tissue import lame
-from shared.touch import TIP_ERROR_FEATURES, LocalTips, Points, TipModels, TipState, Touch
+from shared.touch import (
+    MAX_ITERATIONS,
+    TIP_ERROR_FEATURES,
+    LocalTips,
+    Points,
+    TipModels,
+    TipState,
+    Touch,
+)
 from shared.viscosity import Weights, step_weights
 
 Array = NDArray[np.float64]
@@ -906,7 +914,11 @@ class Atlas:
         return touch.answer(self._tip_state(state), at, started, most)
 
     def touch_step(
-        self, history: TipHistory, dt: float, position: ArrayLike
+        self,
+        history: TipHistory,
+        dt: float,
+        position: ArrayLike,
+        most: int = MAX_ITERATIONS,
     ) -> tuple[Touch, TipHistory]:
         """Answer a position of the rigid tip on visco-elastic tissue.
 
@@ -918,6 +930,8 @@ class Atlas:
             Since the end of the history; may be 0, for a sudden change. The tip moved evenly.
         position : array_like, shape (3,), mm
             Centre of the tip, outside the body.
+        most : int
+            As in ``touch``.
 
         Returns
         -------
@@ -936,7 +950,7 @@ class Atlas:
         at = _vector("position", position)
         return tip_history.step(
             self._tip_state(self._state), self._tip_stepper, history, dt, self._step_weights(dt),
-            at, self.history_estimator.coefficients, started,
+            at, self.history_estimator.coefficients, started, most,
         )  # fmt: skip
 
     def _tip_state(self, state: State) -> TipState:

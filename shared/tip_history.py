@@ -23,6 +23,7 @@ from shared.touch import (
     DEPTH,
     ENERGY,
     ITERATIONS,
+    MAX_ITERATIONS,
     PENETRATION,
     SKIN,
     SMALLEST_J,
@@ -99,6 +100,7 @@ class TipStepper(Carrier):
         active: Sequence[tuple[int, int]],
         position: Array,
         weights: Weights,
+        most: int,
     ) -> dict[int, Local] | None:
         """Step patches (slot and number) where ``place_tip`` has found; None without an answer."""
         found: dict[int, Local] = {}
@@ -106,7 +108,7 @@ class TipStepper(Carrier):
             local = history.locals.get(k) or self.follow(history, k)
             memory = TipMemory(*[part.copy() for part in local.memory])
             status = step_tip(
-                self._solver, slot, position, self._models.deviatoric[k], weights,
+                self._solver, slot, position, self._models.deviatoric[k], weights, most,
                 memory, self._bound,
             )  # fmt: skip
             if status != equilibrium.CONVERGED:
@@ -136,6 +138,7 @@ def step(
     position: Array,
     coefficients: Array,
     started: float,
+    most: int = MAX_ITERATIONS,
 ) -> tuple[Touch, TipHistory]:
     """Answer a finite position of the tip ``dt`` (s) after the end of a history.
 
@@ -154,6 +157,8 @@ def step(
         Of the error estimate: displacement, von Mises stress, force.
     started : float, s
         When the clock began to run.
+    most : int
+        Iterations in one local model; see ``shared.touch.query``.
 
     Returns
     -------
@@ -183,7 +188,7 @@ def step(
     if not (off and history.main < 0):
         numbers = state.memory.patch.tolist()
         active = [(slot, -2 - numbers[slot]) for slot, share in enumerate(shares) if share > 0.0]
-    found = stepper.press(history, active, position, weights)
+    found = stepper.press(history, active, position, weights, most)
     converged = found is not None
     pushed = stepper.conclude(position)
     after = TipHistory(

@@ -494,7 +494,7 @@ def place_tip(solver, x, at):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def step_tip(solver, slot, x, deviatoric, time, memory, own):
+def step_tip(solver, slot, x, deviatoric, time, most, memory, own):
     """Equilibrium of the local model in a slot with the tip at ``x`` at the end of a time step.
 
     Parameters
@@ -506,6 +506,8 @@ def step_tip(solver, slot, x, deviatoric, time, memory, own):
     deviatoric : ndarray, shape (m, m)
     time : Weights
         Of the step.
+    most : int
+        Iterations; the way in is tried only with ``MAX_ITERATIONS``, as in ``shared.touch.query``.
     memory : TipMemory
         Of the model; goes to the end of the step if that has an answer.
     own : TipScratch
@@ -536,8 +538,8 @@ def step_tip(solver, slot, x, deviatoric, time, memory, own):
             own.state, own.softer, own.pull,
         )
     )  # fmt: skip
-    status, iterations, energy, smallest = _settle(system, q, scratch.newton, least, MAX_ITERATIONS)
-    if status != equilibrium.CONVERGED and depth > 0.0:
+    status, iterations, energy, smallest = _settle(system, q, scratch.newton, least, most)
+    if status != equilibrium.CONVERGED and depth > 0.0 and most == MAX_ITERATIONS:
         memory.formed[:] = np.inf
         status, more, energy, smallest = _settle_on_the_way(
             system, q, scratch.newton, least, depth, normal
