@@ -100,6 +100,11 @@ class Moment:
         """Whether it counts for the error estimate: both models rest in the same equilibrium."""
         return self.converged and self.displacement <= OTHER_EQUILIBRIUM
 
+    @property
+    def covered(self) -> bool:
+        """Whether all three errors are within their estimates."""
+        return all(getattr(self, n) <= getattr(self, f"estimated_{n}") for n in QUANTITIES)
+
     def estimate(self, estimator: Estimator) -> None:
         """Fill in the estimated errors."""
         self.estimated_displacement, self.estimated_von_mises, self.estimated_force = estimator(

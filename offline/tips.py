@@ -45,11 +45,11 @@ Past = tuple[NDArray[np.float32], NDArray[np.float32]]
 TIP_MODES, TIP_POINTS = 32, 80
 """Modes and cubature points under the tip."""
 
-HISTORY_MODES, HISTORY_POINTS = 48, 112
-"""The same of tissue that remembers."""
-
 NODAL = 36
 """Directions that responses to forces at nodes add to the modes of the patch."""
+
+HISTORY_MODES, HISTORY_POINTS, HISTORY_NODAL = 64, 128, 64
+"""The same of tissue that remembers."""
 
 NODES = 0.6
 """Distance beyond the patch's extent within which nodes count, in radii of the tip."""
@@ -256,7 +256,12 @@ def train_tip(
     depths : ndarray, shape (c,), mm
         Largest depths there.
     """
-    space = _generous(body, models, orthonormal)
+    count, most, nodal = (
+        (HISTORY_MODES, HISTORY_POINTS, HISTORY_NODAL)
+        if model.prony
+        else (TIP_MODES, TIP_POINTS, NODAL)
+    )
+    space = _generous(body, models, orthonormal, nodal)
     trainer = TipTrainer(
         body,
         surface,
@@ -264,9 +269,7 @@ def train_tip(
         _untrained(space, np.arange(len(weights)), weights),
         _untrained(space, models.points, models.weights),
     )
-    count, most = TIP_MODES, TIP_POINTS
     if model.prony:
-        count, most = HISTORY_MODES, HISTORY_POINTS
         clock = TipClock(trainer, model.prony, deviatoric_of(model, models, space))
         pressed = _press_in_time(clock, contacts, normals, depths, rng)
     else:
@@ -313,8 +316,10 @@ def _untrained(
     )
 
 
-def _generous(body: Body, models: LocalModels, orthonormal: NDArray[np.float32]) -> Array:
-    """Modes of a patch (M, r + NODAL) with its responses to forces at nodes of its surface.
+def _generous(
+    body: Body, models: LocalModels, orthonormal: NDArray[np.float32], nodal: int
+) -> Array:
+    """Modes of a patch (M, r + nodal) with its responses to forces at nodes of its surface.
 
     In the energy of the rest state, the response to a force at a node has the components of the
     orthonormal modes there.
@@ -327,7 +332,7 @@ def _generous(body: Body, models: LocalModels, orthonormal: NDArray[np.float32])
     leading = np.linalg.solve(orthonormal.astype(float), models.modes[0].astype(float))
     rest = responses / np.linalg.norm(responses, axis=0)
     rest -= leading @ np.linalg.lstsq(leading, rest)[0]
-    count = min(NODAL, rest.shape[1]) // 4 * 4  # compiled loops take modes four at a time
+    count = min(nodal, rest.shape[1]) // 4 * 4  # compiled loops take modes four at a time
     U = np.linalg.svd(rest, full_matrices=False)[0][:, :count]
     Q = np.linalg.qr(np.hstack([leading, U]))[0]
     return (orthonormal @ Q).astype(np.float32)

@@ -190,6 +190,9 @@ def step(
         active = [(slot, -2 - numbers[slot]) for slot, share in enumerate(shares) if share > 0.0]
     found = stepper.press(history, active, position, weights, most)
     converged = found is not None
+    if not converged:  # not even in part
+        outcome.force[:] = 0.0
+        outcome.tangent[:] = 0.0
     pushed = stepper.conclude(position)
     after = TipHistory(
         time=history.time + dt,
