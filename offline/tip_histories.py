@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 OFF = 0.05
 """Millimetres between the surface at rest and a tip that does not press."""
 
-COVERAGE, DAMPING = 0.97, 3.0
+COVERAGE, DAMPING = 0.97, 30.0
 """Of the error estimate: moments of one history err alike, so that few errors are known."""
 
 
@@ -74,13 +74,13 @@ def play_course(atlas: Atlas, course: Course) -> list[Touch]:
 
 @dataclass
 class Moment:
-    """One moment of a history answered by both models.
+    """A history until one of its moments, answered by both models.
 
     Attributes
     ----------
     displacement, von_mises, force : float
-        Errors over all nodes, over all nodes outside the clamped layer, and of the force, relative
-        to the largest norms in the history so far.
+        Largest errors until then over all nodes, over all nodes outside the clamped layer, and of
+        the force, relative to the largest norms until then.
     converged : bool
     features : ndarray
     estimated_displacement, estimated_von_mises, estimated_force : float
@@ -189,10 +189,11 @@ def compare_course(
 
 
 def _moments(a: Array, b: Array) -> Array:
-    """Errors (t,) of fields a (t, ...), over the largest norm of b until then."""
-    away, size = (np.linalg.norm(x.reshape(len(x), -1), axis=1) for x in (a - b, b))
-    largest = np.maximum.accumulate(size)
-    return np.asarray(away / np.maximum(largest, 1e-9 * max(float(largest[-1]), 1e-300)))
+    """Largest errors (t,) of fields a (t, ...) until each moment, over the largest norm of b."""
+    away, size = (
+        np.maximum.accumulate(np.linalg.norm(x.reshape(len(x), -1), axis=1)) for x in (a - b, b)
+    )
+    return np.asarray(away / np.maximum(size, 1e-9 * max(float(size[-1]), 1e-300)))
 
 
 def calibrate_courses(rows: Sequence[CourseComparison]) -> Estimator:

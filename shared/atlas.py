@@ -936,7 +936,8 @@ class Atlas:
         Returns
         -------
         touch : Touch
-            Estimated errors are relative to the largest displacement, stress and force so far.
+            Its estimated errors are the largest until now of displacement, stress and force,
+            relative to the largest of these until now.
         history : TipHistory
             To go on from; the old one if the answer did not converge.
 

@@ -28,7 +28,6 @@ from shared.touch import (
     SKIN,
     SMALLEST_J,
     TOUCHED,
-    TipOutcome,
     TipState,
     Touch,
 )
@@ -47,7 +46,7 @@ from shared.viscosity import Weights
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
 
-HISTORY_FEATURES = 10
+HISTORY_FEATURES = 9
 """Of the error estimate; see ``_features``."""
 
 
@@ -65,11 +64,14 @@ class TipHistory(History):
         Largest so far.
     travel : float, mm
         Of the tip over the surface.
+    smallest : float
+        Smallest det F so far.
     """
 
     share: float = 0.0
     force: float = 0.0
     travel: float = 0.0
+    smallest: float = 1.0
 
 
 class TipStepper(Carrier):
@@ -163,7 +165,8 @@ def step(
     Returns
     -------
     touch : Touch
-        Its estimated errors are relative to the largest displacement, stress and force so far.
+        Its estimated errors are the largest until now of displacement, stress and force, relative
+        to the largest of these until now.
     history : TipHistory
         To go on from; the old one if the answer did not converge.
 
@@ -202,8 +205,9 @@ def step(
         share=max(history.share, depth / limit),
         force=max(history.force, pushed),
         travel=history.travel + (0.0 if off else math.dist(position, last)),
+        smallest=min(history.smallest, scalars.item(SMALLEST_J)),
     )
-    features = _features(outcome, after, max(depth, 0.0) / limit, pushed)
+    features = _features(outcome.upward, after)
     errors = np.exp(coefficients @ features).tolist()
     contact = scalars.item(TOUCHED) > 0
     out_of_range: tuple[str, ...] = ()
@@ -240,15 +244,14 @@ def step(
     return touch, after if converged else history
 
 
-def _features(outcome: TipOutcome, history: TipHistory, share: float, pushed: float) -> Array:
+def _features(upward: Array, history: TipHistory) -> Array:
     """What the error estimate is made of: ``log error = c . features``.
 
-    1; the largest share of the limit so far and its log; the share now; smallest det F; the normal
-    (where on the body); the way over the surface; the force over the largest so far.
+    1; the largest share of the limit so far and its log; smallest det F so far; the normal (where
+    on the body); the way over the surface; the log of the largest force over the largest share.
     """
-    peak = max(history.share, 1e-6)
+    share = max(history.share, 1e-6)
     return np.array([
-        1.0, peak, math.log(peak), share, outcome.scalars.item(SMALLEST_J),
-        *outcome.upward.tolist(), math.log1p(history.travel),
-        pushed / history.force if history.force > 0.0 else 0.0,
+        1.0, share, math.log(share), history.smallest, *upward.tolist(),
+        math.log1p(history.travel), math.log(max(history.force / share, 1e-6)),
     ])  # fmt: skip
