@@ -254,7 +254,7 @@ def compile_query(scene: Scene, body: Body, surface: Surface) -> None:
     trainer = LocalTrainer(scene, body, surface, models)
     trainer.solve(surface.vertices[0], surface.normals[0], 0.0)
     if scene.endoscope.tip:
-        compile_tip_query(body, surface, models)
+        compile_tip_query(body, surface, models, scene.tissue.prony)
 
 
 def train_patch(

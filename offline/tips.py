@@ -296,11 +296,19 @@ def train_tip(
     )
 
 
-def compile_tip_query(body: Body, surface: Surface, models: LocalModels) -> None:
+def compile_tip_query(
+    body: Body,
+    surface: Surface,
+    models: LocalModels,
+    prony: Sequence[tuple[float, float]],
+) -> None:
     """Compile what ``train_tip`` runs, on a model of nothing."""
     modes = np.zeros((models.basis.shape[1], 4))
     trainer = TipTrainer(body, surface, models, _untrained(modes, models.points, models.weights))
-    trainer.solve(surface.vertices[0] + 2 * body.tip.radius * surface.normals[0])
+    over = surface.vertices[0] + 0.9 * body.tip.radius * surface.normals[0]
+    trainer.solve(over)
+    if prony:
+        TipClock(trainer, prony, np.zeros((4, 4))).step(0.0, over, 0.0)
 
 
 def _untrained(
