@@ -63,7 +63,7 @@ def test_study_of_time_steps(visco_artifact, monkeypatch):
     monkeypatch.setattr(steps, "_cases", lambda: iter(short))
     monkeypatch.setattr(steps, "PERIOD", 5)
     monkeypatch.setattr(steps, "PERIODS", 4)
-    found = steps.steps(visco_artifact, many=40)
+    found = steps.steps(visco_artifact, many=20)
     for case in short:
         row = found[case.name]
         assert (row["steps"], row["unconverged"], row["flagged"], row["finite"]) == (
