@@ -158,17 +158,17 @@ def validate(
 ) -> None:
     """Compare the artifact F with the full model.
 
-    Both solve new random loads, positions of the tip, or histories of loads, over the artifact's
+    Both solve new random loads, positions of the tip, or histories of either, over the artifact's
     whole range. Errors are relative L2 norms, as fractions; of histories, over all moments too.
     """
     from offline.histories import validate_histories
+    from offline.tip_histories import validate_courses
     from offline.touches import validate_touches
     from offline.validate import validate
 
     if histories is not None:
-        if tip:
-            raise click.UsageError("--tip and --histories exclude each other")
-        _show(validate_histories(artifact, histories, seed, csv), as_json)
+        follow = validate_courses if tip else validate_histories
+        _show(follow(artifact, histories, seed, csv), as_json)
         return
     _show((validate_touches if tip else validate)(artifact, queries, seed, csv), as_json)
 
@@ -389,6 +389,27 @@ def relaxation(artifact: Path, position: tuple[float, float, float] | None, as_j
 
     at = None if position is None else np.array(position)
     _show(relaxation(artifact, at), as_json)
+
+
+@study.command()
+@artifact_argument
+@click.option(
+    "--many",
+    type=click.IntRange(min=50),
+    default=100_000,
+    show_default=True,
+    help="Steps of the longest case.",
+)
+@json_option
+def steps(artifact: Path, many: int, as_json: bool) -> None:
+    """Stress the visco-elastic artifact F with time steps, under its rigid tip.
+
+    Very small and large steps, long holds, sudden reversals and more, against the full model, go to
+    NAME/report/steps.csv and .png beside the artifact.
+    """
+    from offline.studies.steps import steps
+
+    _show(steps(artifact, many - many % 50), as_json)
 
 
 def _show(report: Mapping[str, object], as_json: bool) -> None:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import qr_delete, solve, solve_triangular
 
 from shared.reduced import LANES, nonlinear_stress
+from shared.reduced_history import add_past_stress
 
 Array = NDArray[np.float64]
 
@@ -123,7 +124,12 @@ def _append(Q: Array, R: Array, column: Array) -> tuple[Array, Array]:
 
 
 def point_forces(
-    gradients: NDArray[np.float32], weights: Array, mu: Array, lam: Array, state: Array
+    gradients: NDArray[np.float32],
+    weights: Array,
+    mu: Array,
+    lam: Array,
+    state: Array,
+    past: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None,
 ) -> NDArray[np.float32] | None:
     """Nonlinear force of every point (c, r) at a state (r,) of a local model; None if inverted.
 
@@ -134,6 +140,8 @@ def point_forces(
     weights : ndarray, shape (c,), mm^3
     mu, lam : ndarray, shape (c,), kPa
     state : ndarray, shape (r,)
+    past : (ndarray, ndarray), shape (6 c,), optional
+        Of tissue that remembers: ``B`` and ``S`` of ``shared.reduced_history.predict_points``.
     """
     H = np.dot(gradients, state.astype(np.float32)).reshape(-1, LANES, 9)
     rows = np.ascontiguousarray(H.transpose(0, 2, 1)).reshape(-1)
@@ -141,6 +149,8 @@ def point_forces(
     nonlinear_stress(rows, weights, mu, lam, J, trace, linear, P)
     if not J.min() > 0.0:
         return None
+    if past is not None:
+        add_past_stress(rows, weights, mu, J, *past, 0.0, trace, P)
     points = P.reshape(-1, 9, LANES).transpose(0, 2, 1).reshape(-1, 1, 9)
     return (points @ gradients)[:, 0]
 

@@ -6,7 +6,8 @@ It gives ``shared.equilibrium`` its potential, tangent and correction on the fre
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -141,8 +142,8 @@ class FullModel:
     young, poisson : float
         kPa and 1; of tissue that had no time to relax.
     prony : tuple of (float, float)
-        Share of the isochoric stress that is lost with each time constant (s). Only ``step`` knows
-        of time: ``solve`` and ``touch`` answer instantly.
+        Share of the isochoric stress that is lost with each time constant (s). Only ``step``
+        and ``touch_step`` know of time: ``solve`` and ``touch`` answer instantly.
     """
 
     mesh: Mesh
@@ -407,19 +408,55 @@ class FullModel:
         ------
         NoEquilibrium
         """
+        if start is None:
+            start = history.displacement
+        with self._remembering(history, dt) as weights:
+            found = self.solve(load, start, least=self._least_residual(history))
+        return found, self._advanced(history, found.displacement, weights)
+
+    def touch_step(
+        self,
+        history: History,
+        contact: TipContact,
+        position: Array,
+        approach: Array,
+        dt: float,
+        start: Array | None = None,
+    ) -> tuple[TipEquilibrium, History]:
+        """Equilibrium under a rigid tip ``dt`` after the end of a history, and the longer history.
+
+        For ``history``, ``dt`` (s) and ``start`` see ``step``, for the tip see ``touch``. Force and
+        tangent are those of the end of the step, the energy is that of its potential.
+
+        Raises
+        ------
+        NoEquilibrium
+        """
+        if start is None:
+            start = history.displacement
+        with self._remembering(history, dt) as weights:
+            found = self.touch(contact, position, approach, start)
+        return found, self._advanced(history, found.displacement, weights)
+
+    @contextmanager
+    def _remembering(self, history: History, dt: float) -> Iterator[viscosity.Weights]:
+        """Solve with what a history exerts ``dt`` after its end; gives the weights of the step."""
         weights = viscosity.step_weights(self.prony, dt)
         self._past = np.zeros((*self.weights.shape, viscosity.COMPONENTS))
         assembly.predict(history.points, weights, self._past)
-        if start is None:
-            start = history.displacement
         try:
-            found = self.solve(load, start, least=self._least_residual(history))
+            yield weights
         finally:
             self._past, self._at_rest = None, False
+
+    def _advanced(
+        self, history: History, displacement: Array, weights: viscosity.Weights
+    ) -> History:
+        """A history that has gone a step further, to a displacement (nodes, 3) mm."""
         points = history.points.copy()
-        u = found.displacement.reshape(-1)
+        u = displacement.reshape(-1)
         assembly.advance(self.connectivity, self.gradients, u, weights, points)
-        return found, History(found.displacement, points)
+        return History(displacement, points)
 
     def _least_residual(self, history: History) -> float:
         """Residual (mN) that counts as equilibrium: small beside what the past exerts, or none."""

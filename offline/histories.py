@@ -21,6 +21,8 @@ from shared.atlas import Atlas
 from shared.endoscope import pressure_limit
 from shared.errors import PalpateError, QueryError
 from shared.history import History, Moment
+from shared.scene import Scene
+from shared.surface import Surface
 
 Array = NDArray[np.float64]
 
@@ -48,11 +50,12 @@ def random_history(atlas: Atlas, rng: np.random.Generator, rim: bool) -> list[Pr
     rim : bool
         Whether to begin on the rim of the surface.
     """
-    surface = atlas.surface
-    start = (
-        surface.vertices[rng.choice(surface.rim())] if rim else random_points(surface, 1, rng)[0]
-    )
-    hand = _Hand(atlas, rng, start)
+    return random_course(Hand(atlas.surface, atlas.limits, atlas.scene, rng, rim))
+
+
+def random_course(hand: Hand) -> list[Press]:
+    """What a hand does, at random."""
+    rng = hand.rng
     steps = list(hand.ramp(0.3 + 0.7 * rng.random()))
     movements = (hand.hold, hand.release, hand.tap, hand.slide, hand.slide)
     for number in rng.integers(len(movements), size=SEGMENTS):
@@ -60,31 +63,48 @@ def random_history(atlas: Atlas, rng: np.random.Generator, rim: bool) -> list[Pr
     return steps
 
 
-class _Hand:
-    """A tool on the surface, with what it does next."""
+class Hand:
+    """A tool on the surface, with what it does next.
 
-    def __init__(self, atlas: Atlas, rng: np.random.Generator, start: Array) -> None:
-        self._atlas, self._rng = atlas, rng
+    Parameters
+    ----------
+    surface : Surface
+        Accessible.
+    limits : ndarray, shape (v, LIMIT_FIELDS)
+    scene : Scene
+    rng : Generator
+    rim : bool
+        Whether to begin on the rim of the surface.
+    """
+
+    def __init__(
+        self, surface: Surface, limits: Array, scene: Scene, rng: np.random.Generator, rim: bool
+    ) -> None:
+        self._surface, self._ranges, self._endoscope = surface, limits, scene.endoscope
+        self.rng = rng
         self._level = 0.0
-        self._go(start)
-        tilt = atlas.scene.endoscope.max_tilt
-        self._lean = cone(self._normal, tilt, 1, rng)[0] + self._normal
+        self._go(
+            surface.vertices[rng.choice(surface.rim())]
+            if rim
+            else random_points(surface, 1, rng)[0]
+        )
+        self._lean = cone(self._normal, scene.endoscope.max_tilt, 1, rng)[0] + self._normal
 
     def _go(self, x: Array) -> None:
-        self._x, self._normal, _, self._limits = self._atlas.surface.locate(x, self._atlas.limits)
+        self._x, self._normal, _, self._limits = self._surface.locate(x, self._ranges)
 
     def _press(self, dt: float) -> Press:
         direction = self._lean - self._normal
         direction /= np.linalg.norm(direction)
         tilt = np.degrees(np.arccos(np.clip(-direction @ self._normal, -1, 1)))
-        if tilt > self._atlas.scene.endoscope.max_tilt:
+        if tilt > self._endoscope.max_tilt:
             direction = -self._normal
         limit = pressure_limit(self._limits, self._normal, direction)
         return Press(dt, self._x.copy(), direction, float(self._level * limit))
 
     def ramp(self, level: float, seconds: float | None = None) -> Iterator[Press]:
         """Press harder or softer, evenly."""
-        seconds = 10 ** self._rng.uniform(-1.3, 0.0) if seconds is None else seconds
+        seconds = 10 ** self.rng.uniform(-1.3, 0.0) if seconds is None else seconds
         count = 5
         for share in np.linspace(self._level, level, count + 1)[1:]:
             self._level = share
@@ -92,7 +112,7 @@ class _Hand:
 
     def hold(self) -> Iterator[Press]:
         """Stay; steps grow as less happens."""
-        seconds = 10 ** self._rng.uniform(-1.0, 0.5)
+        seconds = 10 ** self.rng.uniform(-1.0, 0.5)
         for share in np.diff(np.linspace(0, 1, 7) ** 2):
             yield self._press(seconds * share)
 
@@ -107,12 +127,12 @@ class _Hand:
         """Twice, quickly."""
         for _ in range(2):
             yield from self.ramp(0.0, 0.05)
-            yield from self.ramp(0.3 + 0.7 * self._rng.random(), 0.05)
+            yield from self.ramp(0.3 + 0.7 * self.rng.random(), 0.05)
 
     def slide(self) -> Iterator[Press]:
         """Move over the surface at 3 to 30 mm/s, as far as 8 mm or to where it ends."""
-        speed, length = 10 ** self._rng.uniform(0.5, 1.5), self._rng.uniform(2.0, 8.0)
-        turn = self._rng.uniform(0, 2 * np.pi)
+        speed, length = 10 ** self.rng.uniform(0.5, 1.5), self.rng.uniform(2.0, 8.0)
+        turn = self.rng.uniform(0, 2 * np.pi)
         heading = np.array([np.cos(turn), np.sin(turn)]) @ np.array(tangents(self._normal))
         count = int(np.ceil(length / 0.5))
         for _ in range(count):

@@ -264,7 +264,7 @@ def compile_query(scene: Scene, body: Body, surface: Surface) -> None:
     trainer = LocalTrainer(scene, body, surface, models)
     trainer.solve(surface.vertices[0], surface.normals[0], 0.0)
     if scene.endoscope.tip:
-        compile_tip_query(body, surface, models)
+        compile_tip_query(body, surface, models, scene.tissue.prony)
 
 
 def train_patch(
@@ -319,7 +319,7 @@ def train_patch(
     tip = None
     if scene.endoscope.tip:
         tip = train_tip(
-            body, surface, weights, reduced.models, region.orthonormal,
+            model, body, surface, weights, reduced.models, region.orthonormal,
             task.contacts, task.normals, task.ranges[:, TIP_DEPTH], rng,
         )  # fmt: skip
     return replace(result, guess=guess.astype(np.float16), residual=residual, tip=tip)

@@ -19,10 +19,14 @@ from offline.cubature import compress, damped_fit, nonnegative, point_forces
 from offline.full_model import FullModel, NoEquilibrium
 from offline.overlaps import neighbours, overlaps
 from offline.sampling import farthest
+from offline.viscous import deviatoric_of
 from shared import equilibrium
 from shared.atlas import Body, LocalModels, assemble_tips
+from shared.history import ViscousModels
 from shared.reduced import LANES, RESIDUAL_FEATURES
+from shared.reduced_history import SYMMETRIC, predict_points
 from shared.surface import Surface
+from shared.tip_history import HISTORY_FEATURES, TipHistory, TipStepper, step
 from shared.touch import (
     MAX_ITERATIONS,
     STATUS,
@@ -33,21 +37,32 @@ from shared.touch import (
     query,
     tip_features,
 )
+from shared.touch_history import TipMemory
+from shared.viscosity import step_weights
 
 Array = NDArray[np.float64]
+Past = tuple[NDArray[np.float32], NDArray[np.float32]]
 
-TIP_MODES = 32
-TIP_POINTS = 80
+TIP_MODES, TIP_POINTS = 32, 80
 """Modes and cubature points under the tip."""
 
 NODAL = 36
 """Directions that responses to forces at nodes add to the modes of the patch."""
+
+HISTORY_MODES, HISTORY_POINTS, HISTORY_NODAL = 48, 112, 64
+"""The same of tissue that remembers."""
 
 NODES = 0.6
 """Distance beyond the patch's extent within which nodes count, in radii of the tip."""
 
 PRESSED, DEPTHS = 12, 3
 """Contacts that a patch learns from, and depths at each."""
+
+QUICK = 0.01
+"""Seconds of a fast movement."""
+
+ASIDE = 1.5
+"""Millimetres that the tip slides at most."""
 
 STEP = 0.15
 """Millimetres by which a state's derivatives in the position are followed."""
@@ -115,6 +130,70 @@ class TipTrainer:
         )
 
 
+class TipClock:
+    """A trainer of one model whose tissue remembers.
+
+    Parameters
+    ----------
+    trainer : TipTrainer
+    prony : sequence of (float, float)
+    deviatoric : ndarray, shape (m, m)
+        Of ``shared.history.ViscousModels``.
+    """
+
+    def __init__(
+        self, trainer: TipTrainer, prony: Sequence[tuple[float, float]], deviatoric: Array
+    ) -> None:
+        self.trainer = trainer
+        self._prony = prony
+        law = trainer.models.points
+        self._mu, self._points = law.mu[0], law.weights.shape[1]
+        none = np.zeros((0, 2), np.int32)
+        viscous = ViscousModels(
+            deviatoric[None].astype(np.float32), none, np.zeros((0, *deviatoric.shape), np.float32)
+        )
+        self._stepper = TipStepper(trainer.state.bound, viscous, prony, self._points)
+        self._unknown = np.zeros((3, HISTORY_FEATURES))
+        self.rest()
+
+    def rest(self) -> None:
+        """Go back to where nothing has happened."""
+        self._history = TipHistory()
+        self._most = 0.0, 0.0
+
+    def step(self, dt: float, position: Array, depth: float) -> _State | None:
+        """Go ``dt`` (s) on to a position of the tip; None where there is no equilibrium."""
+        touch, history = step(
+            self.trainer.state, self._stepper, self._history, dt,
+            step_weights(self._prony, dt), position, self._unknown, 0.0,
+        )  # fmt: skip
+        if not touch.converged:
+            return None
+        self._history = history
+        memory: TipMemory = history.locals[0].memory
+        size, pushed = float(np.linalg.norm(memory.wide)), float(np.linalg.norm(touch.force))
+        self._most = max(self._most[0], size), max(self._most[1], pushed)
+        return _State(
+            position=position,
+            depth=depth,
+            q=memory.wide.copy(),
+            factor=np.tril(memory.factor[0]),
+            coupling=memory.coupling[0].T.copy(),
+            force=touch.force,
+            past=self._past(memory),
+            most=self._most,
+        )
+
+    def _past(self, memory: TipMemory) -> Past:
+        """What the points remember now."""
+        now = step_weights(self._prony, 0.0)
+        mean = (now.share @ memory.mean).astype(np.float32)
+        rows = self.trainer.models.points.gradients[0]
+        L, (B, S) = mean @ rows, np.zeros((2, SYMMETRIC * self._points), np.float32)
+        predict_points(L, memory.points, now, self._mu, B, S)
+        return B, S
+
+
 @dataclass(frozen=True)
 class _State:
     """Answer of a local model."""
@@ -125,11 +204,23 @@ class _State:
     factor: Array  # (m, m)
     coupling: Array  # (m, 3)
     force: Array  # (3,)
+    past: Past | None = None  # of tissue that remembers, see ``cubature.point_forces``
+    most: tuple[float, float] | None = None  # largest size and force (mN) of its history
 
     def within(self, V: Array) -> _State:
         """Its part in orthonormal modes V (m, k)."""
         factor = np.asarray(np.linalg.cholesky(V.T @ self.factor @ self.factor.T @ V), float)
         return replace(self, q=V.T @ self.q, factor=factor, coupling=V.T @ self.coupling)
+
+    @property
+    def size(self) -> float:
+        """What its errors count against, in the energy norm."""
+        return float(np.linalg.norm(self.q)) if self.most is None else self.most[0]
+
+    @property
+    def pushed(self) -> float:
+        """What errors of its force count against, mN."""
+        return float(np.linalg.norm(self.force)) if self.most is None else self.most[1]
 
     @property
     def slope(self) -> Array:
@@ -139,6 +230,7 @@ class _State:
 
 
 def train_tip(
+    model: FullModel,
     body: Body,
     surface: Surface,
     weights: Array,
@@ -153,6 +245,8 @@ def train_tip(
 
     Parameters
     ----------
+    model : FullModel
+        Of the tissue.
     body : Body
     surface : Surface
         Accessible.
@@ -166,7 +260,12 @@ def train_tip(
     depths : ndarray, shape (c,), mm
         Largest depths there.
     """
-    space = _generous(body, models, orthonormal)
+    count, most, nodal = (
+        (HISTORY_MODES, HISTORY_POINTS, HISTORY_NODAL)
+        if model.prony
+        else (TIP_MODES, TIP_POINTS, NODAL)
+    )
+    space = _generous(body, models, orthonormal, nodal)
     trainer = TipTrainer(
         body,
         surface,
@@ -174,10 +273,14 @@ def train_tip(
         _untrained(space, np.arange(len(weights)), weights),
         _untrained(space, models.points, models.weights),
     )
-    pressed = _press(trainer, contacts, normals, depths, rng)
+    if model.prony:
+        clock = TipClock(trainer, model.prony, deviatoric_of(model, models, space))
+        pressed = _press_in_time(clock, contacts, normals, depths, rng)
+    else:
+        pressed = _press(trainer, contacts, normals, depths, rng)
     if not pressed:
         raise NoEquilibrium("endoscope.tip: no equilibrium found under it; is the load too large?")
-    V = _modes(pressed)
+    V = _modes(pressed, count)
     states = [state.within(V) for state in pressed]
     modes = (space @ V).astype(np.float32)
     gradients = trainer.gradients @ V.astype(np.float32)
@@ -186,7 +289,7 @@ def train_tip(
         : len(weights)
     ]
     A, b = compress(forces, EQUATIONS, rng)
-    points, chosen = nonnegative(A, b, TIP_POINTS)
+    points, chosen = nonnegative(A, b, most)
     chosen *= weights[points]
     trained = TipTrainer(body, surface, models, _untrained(modes, points, chosen))
     return TipResult(
@@ -199,7 +302,7 @@ def train_tip(
 
 def local_tips(model: FullModel, models: LocalModels, results: Sequence[TipResult]) -> LocalTips:
     """Local models of the tip for all patches but for ``LocalTips.residuals``."""
-    modes = np.stack([r.modes for r in results]).astype(np.float32)
+    modes = np.stack([r.modes for r in results])
     pairs = neighbours(models, NEIGHBOURS * models.extent)
     return LocalTips(
         modes=modes,
@@ -213,11 +316,19 @@ def local_tips(model: FullModel, models: LocalModels, results: Sequence[TipResul
     )
 
 
-def compile_tip_query(body: Body, surface: Surface, models: LocalModels) -> None:
+def compile_tip_query(
+    body: Body,
+    surface: Surface,
+    models: LocalModels,
+    prony: Sequence[tuple[float, float]],
+) -> None:
     """Compile what ``train_tip`` runs, on a model of nothing."""
     modes = np.zeros((models.basis.shape[1], 4))
     trainer = TipTrainer(body, surface, models, _untrained(modes, models.points, models.weights))
-    trainer.solve(surface.vertices[0] + 2 * body.tip.radius * surface.normals[0])
+    over = surface.vertices[0] + 0.9 * body.tip.radius * surface.normals[0]
+    trainer.solve(over)
+    if prony:
+        TipClock(trainer, prony, np.zeros((4, 4))).step(0.0, over, 0.0)
 
 
 def _untrained(
@@ -236,8 +347,10 @@ def _untrained(
     )
 
 
-def _generous(body: Body, models: LocalModels, orthonormal: NDArray[np.float32]) -> Array:
-    """Modes of a patch (M, r + NODAL) with its responses to forces at nodes of its surface.
+def _generous(
+    body: Body, models: LocalModels, orthonormal: NDArray[np.float32], nodal: int
+) -> Array:
+    """Modes of a patch (M, r + nodal) with its responses to forces at nodes of its surface.
 
     In the energy of the rest state, the response to a force at a node has the components of the
     orthonormal modes there.
@@ -250,7 +363,7 @@ def _generous(body: Body, models: LocalModels, orthonormal: NDArray[np.float32])
     leading = np.linalg.solve(orthonormal.astype(float), models.modes[0].astype(float))
     rest = responses / np.linalg.norm(responses, axis=0)
     rest -= leading @ np.linalg.lstsq(leading, rest)[0]
-    count = min(NODAL, rest.shape[1]) // 4 * 4  # compiled loops take modes four at a time
+    count = min(nodal, rest.shape[1]) // 4 * 4  # compiled loops take modes four at a time
     U = np.linalg.svd(rest, full_matrices=False)[0][:, :count]
     Q = np.linalg.qr(np.hstack([leading, U]))[0]
     return (orthonormal @ Q).astype(np.float32)
@@ -276,12 +389,37 @@ def _press(
     return states
 
 
-def _modes(states: list[_State]) -> Array:
-    """Leading directions (r, TIP_MODES) of states and their slopes, each state of size one."""
-    vectors = [
-        np.column_stack([state.q, STEP * state.slope]) / np.linalg.norm(state.q) for state in states
-    ]
-    return np.linalg.svd(np.hstack(vectors), full_matrices=False)[0][:, :TIP_MODES]
+def _press_in_time(
+    clock: TipClock,
+    contacts: Array,
+    normals: Array,
+    depths: Array,
+    rng: np.random.Generator,
+) -> list[_State]:
+    """Push the tip in at contacts far apart, hold it, slide to another contact and lift it."""
+    states: list[_State] = []
+    radius = clock.trainer.state.radius
+    for i in farthest(contacts, min(PRESSED, len(contacts))):
+        clock.rest()
+        course = []
+        for share in (np.arange(DEPTHS) + rng.uniform(0.3, 1.0, DEPTHS)) / DEPTHS:
+            course += [(i, share, QUICK), (i, share, 10 ** rng.uniform(-1.5, 0.5))]
+        near = np.flatnonzero(np.linalg.norm(contacts - contacts[i], axis=1) < ASIDE)
+        course += [(rng.choice(near), rng.uniform(0.3, 0.9), QUICK), (i, 0.0, QUICK)]
+        for place, share, dt in course:
+            depth = float(share * depths[place])
+            position = contacts[place] + (radius - depth) * normals[place]
+            state = clock.step(dt, position, depth)
+            if state is None:
+                break
+            states.append(state)
+    return states
+
+
+def _modes(states: list[_State], count: int) -> Array:
+    """Leading directions (r, count) of states and their slopes, each state of size one."""
+    vectors = [np.column_stack([state.q, STEP * state.slope]) / state.size for state in states]
+    return np.linalg.svd(np.hstack(vectors), full_matrices=False)[0][:, :count]
 
 
 def _training_forces(
@@ -300,13 +438,13 @@ def _training_forces(
     for state in states:
         looks = np.hstack(
             [
-                np.linalg.inv(state.factor).T / np.linalg.norm(state.q),
-                state.slope / np.linalg.norm(state.force),
+                np.linalg.inv(state.factor).T / state.size,
+                state.slope / state.pushed,
             ]
         )
         departure = DEPARTURE * np.abs(state.q) * rng.standard_normal(len(state.q))
         for q in (state.q, state.q + departure):
-            force = point_forces(gradients, *law, q)
+            force = point_forces(gradients, *law, q, state.past)
             if force is not None:
                 columns.append(force @ looks.astype(np.float32))
     return np.hstack(columns)

@@ -47,6 +47,13 @@ from offline.sampling import (
 )
 from offline.scenes import default_artifact, find_scene
 from offline.spaces import Footprint
+from offline.tip_histories import (
+    CourseComparison,
+    calibrate_courses,
+    compare_course,
+    random_courses,
+    summarise_courses,
+)
 from offline.tips import local_tips
 from offline.touches import (
     TouchComparison,
@@ -72,6 +79,7 @@ from shared.atlas import Atlas, Estimator, LocalModels
 from shared.endoscope import TIP_DEPTH
 from shared.reduced import ERROR_FEATURES, NARROW
 from shared.scene import Scene, Size, Tolerance
+from shared.tip_history import HISTORY_FEATURES
 from shared.touch import TIP_ERROR_FEATURES
 
 Array = NDArray[np.float64]
@@ -92,6 +100,9 @@ TRIAL_PATCHES = 8
 
 TIP_SAMPLES = 120
 """Full solutions under the tip that validate and calibrate."""
+
+MOST_COURSES = 48
+"""Full histories under the tip that validate and calibrate, a quarter of ``samples`` at most."""
 
 REFINED_LOADS = 4
 
@@ -205,7 +216,11 @@ class Pipeline:
             documents["training"]["choice"] = choice.document
         if mesh_choice is not None:
             documents["training"]["mesh_choice"] = mesh_choice
-        self._write(path, models, limits, estimator, tip_estimator, documents)
+        history_estimator = Estimator(np.zeros((3, HISTORY_FEATURES)))
+        if models.viscous_tips is not None:
+            history_estimator, courses = self._validate_courses(models, limits)
+            documents["validation_tip_histories"] = summarise_courses(courses)
+        self._write(path, models, limits, estimator, tip_estimator, history_estimator, documents)
         report = path.parent / path.stem / "report"
         report.mkdir(parents=True, exist_ok=True)
         write_rows(report / "validation.csv", rows)
@@ -369,7 +384,11 @@ class Pipeline:
             tips = [result.tip for result in results if result.tip is not None]
             models = replace(models, tips=local_tips(self.workshop.model, models, tips))
         if self.scene.tissue.prony:
-            models = replace(models, viscous=viscous_models(self.workshop.model, models))
+            model = self.workshop.model
+            models = replace(models, viscous=viscous_models(model, models, models.modes))
+            if models.tips is not None:
+                viscous_tips = viscous_models(model, models, models.tips.modes)
+                models = replace(models, viscous_tips=viscous_tips)
         return models
 
     def _lowered(self, models: LocalModels, limits: Array) -> Array:
@@ -409,6 +428,31 @@ class Pipeline:
             for row in half:
                 row.estimate(estimator)
         return calibrate_touches(rows), rows
+
+    def _validate_courses(
+        self, models: LocalModels, limits: Array
+    ) -> tuple[Estimator, list[CourseComparison]]:
+        """Validate over histories of the tip, and calibrate their error estimate."""
+        rng = np.random.default_rng([self.scene.seed, 7])
+        atlas = self._untested(models, limits)
+        count = min(MOST_COURSES, self.scene.training.samples // 4)
+        courses = random_courses(self.surface, limits, self.scene, count, rng)
+        tasks = {f"course-{i}": (Workshop.follow_tip, *course) for i, course in enumerate(courses)}
+        found = self._stage(
+            "full histories under the tip",
+            tasks,
+            lambda f: dict(zip("usf", ([],) * 3 if f is None else f, strict=True)),
+        )
+        rows = [
+            compare_course(self.workshop, atlas, course, tuple(found[name][part] for part in "usf"))
+            for name, course in zip(tasks, courses, strict=True)
+            if found[name]["u"].size
+        ]
+        for half, other in ((rows[::2], rows[1::2]), (rows[1::2], rows[::2])):
+            estimator = calibrate_courses(other)
+            for moment in (moment for row in half for moment in row.moments):
+                moment.estimate(estimator)
+        return calibrate_courses(rows), rows
 
     def _validate(
         self, models: LocalModels, limits: Array
@@ -514,6 +558,7 @@ class Pipeline:
         return Atlas(
             self.scene.name, self.scene, {}, self.workshop.body, self.surface, limits, models,
             Estimator(np.zeros((2, ERROR_FEATURES))), Estimator(np.zeros((3, TIP_ERROR_FEATURES))),
+            Estimator(np.zeros((3, HISTORY_FEATURES))),
         )  # fmt: skip
 
     def _write(
@@ -523,6 +568,7 @@ class Pipeline:
         limits: Array,
         estimator: Estimator,
         tip_estimator: Estimator,
+        history_estimator: Estimator,
         documents: dict[str, Any],
     ) -> None:
         mesh, surface = self.workshop.mesh, self.surface
@@ -604,6 +650,19 @@ class Pipeline:
                 "viscous_pairs": Dataset(viscous.pairs, one, "local models whose spaces meet"),
                 "viscous_overlap": Dataset(
                     viscous.overlap.astype(np.float16), one, "products of their modes, in energy"
+                ),
+            }
+        if models.viscous_tips is not None:
+            viscous = models.viscous_tips
+            datasets |= {
+                "tip_viscous_deviatoric": Dataset(
+                    viscous.deviatoric, one, "the same in the modes of the tip"
+                ),
+                "tip_viscous_overlap": Dataset(
+                    viscous.overlap.astype(np.float16), one, "products of these, by viscous_pairs"
+                ),
+                "history_error_coefficients": Dataset(
+                    history_estimator.coefficients, one, "as tip_error_coefficients, of histories"
                 ),
             }
         documents["provenance"]["wall_seconds"] = round(sum(self.seconds.values()), 1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv as csv_format
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -92,9 +92,9 @@ class Comparison:
 
 
 def write_rows(path: Path, rows: Sequence[Any]) -> None:
-    """Write dataclasses, one row each, but for their ``features``."""
+    """Write dataclasses, one row each, but for what is not shown (``features``)."""
     with path.open("w", newline="") as file:
-        names = [name for name in asdict(rows[0]) if name != "features"]
+        names = [part.name for part in fields(rows[0]) if part.repr]
         writer = csv_format.DictWriter(file, names, lineterminator="\n")
         writer.writeheader()
         for row in rows:

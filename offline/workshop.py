@@ -328,12 +328,9 @@ class Workshop:
 
     def touch(self, position: Array, start: Array | None = None) -> TouchSample:
         """Full solution with the tip at a position (3,) mm, from a first guess (n, 3)."""
-        foot, normal, _ = self.surface.project(position)
-        out = position - foot
-        depth = self.body.tip.radius - float(np.copysign(np.linalg.norm(out), out @ normal))
         try:
             first = None if start is None else start.astype(float)
-            found = self.model.touch(self.contact, position, -max(depth, 0.0) * normal, first)
+            found = self.model.touch(self.contact, position, self._approach(position), first)
         except NoEquilibrium:
             return TouchSample(np.empty(0, np.float32), *[np.empty(0)] * 4)
         return TouchSample(
@@ -343,6 +340,36 @@ class Workshop:
             np.array(found.energy),
             np.array(found.penetration),
         )
+
+    def _approach(self, position: Array) -> Array:
+        """Shortest way (3,) mm of the tip from where it does not touch to a position."""
+        foot, normal, _ = self.surface.project(position)
+        out = position - foot
+        depth = self.body.tip.radius - float(np.copysign(np.linalg.norm(out), out @ normal))
+        return np.asarray(-max(depth, 0.0) * normal)
+
+    def follow_tip(
+        self, positions: Array, times: list[float]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], Array] | None:
+        """Full solutions of a history of the tip's positions (t, 3) mm after time steps (t,) s.
+
+        Returns
+        -------
+        displacements, stresses, forces : ndarray, shapes (t, n, 3) mm, (t, n) kPa, (t, 3) mN
+            None where there is no equilibrium.
+        """
+        history, rows = self.model.at_rest, []
+        try:
+            for x, dt in zip(positions, times, strict=True):
+                found, history = self.model.touch_step(
+                    history, self.contact, x, self._approach(x), dt
+                )
+                stress = self.von_mises_after(history).astype(np.float32)
+                rows.append((found.displacement.astype(np.float32), stress, found.force))
+        except NoEquilibrium:
+            return None
+        u, s, f = (np.array(part) for part in zip(*rows, strict=True))
+        return u, s, f
 
     def follow(
         self, loads: list[Load], times: list[float]

@@ -122,10 +122,9 @@ def _warm(model: Model) -> None:
 
 def _warm_history(model: Model, metrics: Metrics) -> None:
     """From one local model to the next and back: everything that a history may need."""
-    if not model.atlas.scene.tissue.prony:
-        return
     models = model.atlas.models
-    assert models.viscous is not None, "or the tissue would be elastic"
+    if models.viscous is None:
+        return
     here, there = models.centres[models.viscous.pairs[0]].tolist()
     steps = [
         {"time": 0.1 * number, "contact": {"position": position, "pressure": 0.1}}

@@ -23,6 +23,7 @@ STATUS = {
     "unknown_scene": 404,
     "no_tip": 404,
     "no_time": 404,
+    "unknown_snapshot": 404,
     "not_found": 404,
     "method_not_allowed": 405,
     "not_acceptable": 406,

@@ -10,7 +10,7 @@ rest goes on from position to position.
 import math
 from collections.abc import Callable, Sequence
 from time import perf_counter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,24 +88,39 @@ class Follower:
         self._good = None
         self._lost = 0
 
-    def follow(self, position: Sequence[float], budget: float) -> Step:
-        """Answer a position; no new solve is begun after `budget` seconds."""
-        end = perf_counter() + budget
-        return self._follow(position, lambda steps: perf_counter() < end)
+    def follow(self, position: Sequence[float], budget: float, now: float = 0.0) -> Step:
+        """Answer a position at a client's time `now` (s).
 
-    def repeat(self, position: Sequence[float], steps: int) -> Step:
+        No new solve is begun after `budget` seconds.
+        """
+        end = perf_counter() + budget
+        return self._follow(position, lambda steps: perf_counter() < end, now)
+
+    def repeat(self, position: Sequence[float], steps: int, now: float = 0.0) -> Step:
         """Answer a position as a session did that solved `steps` positions on the way.
 
-        With the same atlas and the same positions before it, the answer is the same, bit for bit.
+        With the same atlas and the same positions and times before it, the answer is the same, bit
+        for bit.
         """
-        return self._follow(position, lambda taken: taken < steps)
+        return self._follow(position, lambda taken: taken < steps, now)
 
-    def _follow(self, position: Sequence[float], may_go_on: Callable[[int], bool]) -> Step:
+    def snapshot(self) -> Any:
+        """Keep the state of the tissue, for `restore`."""
+        return self._good
+
+    def restore(self, snapshot: Any) -> None:
+        """Go back to a snapshot of this follower. Elastic tissue has no state but its answer."""
+        self.restart()
+        self._good = snapshot
+
+    def _follow(
+        self, position: Sequence[float], may_go_on: Callable[[int], bool], now: float
+    ) -> Step:
         start = perf_counter()
         target = np.array(position, np.float64)
         share, steps, reason = 1.0, 1, ""
         try:
-            if not self._solve(target):
+            if not self._solve(target, 1.0):
                 reason = "no equilibrium was found there"
                 share, steps = self._catch_up(target, may_go_on)
         except QueryError as error:
@@ -144,30 +159,33 @@ class Follower:
         while share < 1.0 and stride >= SHORTEST and may_go_on(steps):
             steps += 1
             ahead = min(share + stride, 1.0)
-            if self._solves((1.0 - ahead) * start + ahead * target):
+            if self._solves((1.0 - ahead) * start + ahead * target, ahead):
                 share = ahead
             else:
                 stride *= 0.5
         return share, steps
 
-    def _solves(self, position: Array) -> bool:
+    def _solves(self, position: Array, share: float) -> bool:
         """Solve a position that may have no answer at all."""
         try:
-            return self._solve(position)
+            return self._solve(position, share)
         except QueryError:
             return False
 
-    def _solve(self, position: Array) -> bool:
-        """Solve a position; tell whether that led to an equilibrium, which is then the last."""
+    def _solve(self, position: Array, share: float) -> bool:
+        """Solve a position; tell whether that led to an equilibrium, which is then the last.
+
+        It is at a share of the way, which matters to tissue that remembers.
+        """
         touch = self._atlas.touch(position, self._state, MOST_ITERATIONS)
-        if not (touch.converged and _is_finite(touch)):
+        if not (touch.converged and is_finite(touch)):
             return False
         self._good = touch
         self._lost = 0
         return True
 
 
-def _is_finite(touch: Touch) -> bool:
+def is_finite(touch: Touch) -> bool:
     """Whether an answer holds no NaN, and no infinity but in its error estimates."""
     numbers = (
         *touch.force.tolist(),

@@ -59,6 +59,7 @@ class Flag(IntFlag):
     IN_RANGE = 4
     CLAMPED = 8
     FALLBACK = 16
+    STALLED = 32
 
 
 _OUTPUTS_MEAN = {
@@ -75,6 +76,7 @@ _FLAGS_MEAN = {
     Flag.IN_RANGE: "the state is of the kind the model was trained for",
     Flag.CLAMPED: "the step was too long for its time: `position` is short of the one asked for",
     Flag.FALLBACK: "no answer there: everything is the last good answer's",
+    Flag.STALLED: "more time than `longest_step` had passed, or less than none: it was cut to that",
 }
 
 
@@ -93,7 +95,12 @@ REQUEST_FIELDS = (
     Field("version", "uint16", "", "of this layout, 1"),
     Field("outputs", "uint16", "", "what is wanted, bits"),
     Field("seq", "uint32", "", "the client's number of this frame, echoed"),
-    Field("client_time", "float64", "s", "the client's clock, echoed"),
+    Field(
+        "client_time",
+        "float64",
+        "s",
+        "the client's clock, echoed; the time of visco-elastic tissue",
+    ),
     Field("position", "float64", "mm", "centre of the tip", (3,)),
 )
 

@@ -37,6 +37,7 @@ FLAGS = {
     Flag.IN_RANGE: "out_of_range",
     Flag.CLAMPED: "clamped",
     Flag.FALLBACK: "fallback",
+    Flag.STALLED: "stalled",
 }
 FRAMES = ("answered", "superseded", "refused")
 

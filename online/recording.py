@@ -20,7 +20,7 @@ from online.frames import REPLY, REPLY_FIELDS, Field, Request
 from shared.errors import PalpateError
 
 FORMAT = "palpate-session"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 CHUNK = 2000
 """Replies that are kept in memory until they are written."""
@@ -33,6 +33,14 @@ ASKED = (
     Field("asked_outputs", "uint16", "", "what was wanted, bits"),
     Field("received", "float64", "s", "when the reply came, on the client's clock"),
 )
+
+
+class Command(NamedTuple):
+    """A snapshot that was taken or gone back to."""
+
+    replies: int  # that had come before
+    restores: bool
+    number: int
 
 
 class RecordingError(PalpateError):
@@ -59,6 +67,12 @@ class Recorder:
         self._file.attrs["format_version"] = FORMAT_VERSION
         self._file.attrs["scene"] = hello["scene"]
         self._file.attrs["hello"] = json.dumps(hello)
+        self._count = 0
+        commands = self._file.create_dataset("commands", (0, 3), "uint32", maxshape=(None, 3))
+        commands.attrs["units"] = ""
+        commands.attrs["description"] = (
+            "snapshots: replies before, 0 if taken or 1 if gone back to, number"
+        )
         for field in (*ASKED, *REPLY_FIELDS):
             dataset = self._file.create_dataset(
                 field.name,
@@ -95,6 +109,7 @@ class Recorder:
         request = self._requests.pop(int(np.frombuffer(reply, REPLY, 1)[0]["seq"]), None)
         if request is None:
             return
+        self._count += 1
         self._asked.append((request.position, request.outputs, now))
         self._replies.append(reply[: REPLY.itemsize])
         # replies come in order: what was sent earlier was dropped or refused
@@ -102,6 +117,12 @@ class Recorder:
             del self._requests[seq]
         if len(self._replies) >= CHUNK:
             self._write()
+
+    def obeyed(self, restores: bool, number: int) -> None:
+        """Note that a snapshot was taken or gone back to, after the replies received so far."""
+        commands = self._file["commands"]
+        commands.resize(len(commands) + 1, axis=0)
+        commands[-1] = self._count, restores, number
 
     def close(self) -> None:
         """Write what is left and close the file."""
@@ -139,12 +160,15 @@ class Recording(NamedTuple):
     replies : ndarray, shape (n,), of `online.frames.REPLY`
     received : ndarray, shape (n,), s
         On the client's clock.
+    commands : list of Command
+        In order.
     """
 
     scene: str
     requests: list[Request]
     replies: NDArray[Any]
     received: NDArray[np.float64]
+    commands: list[Command]
 
 
 def read_recording(path: Path) -> Recording:
@@ -175,6 +199,9 @@ def read_recording(path: Path) -> Recording:
                 strict=True,
             )
             requests = [Request(*values) for values in asked]
-            return Recording(str(file.attrs["scene"]), requests, replies, file["received"][:])
+            commands = [Command(n, bool(back), k) for n, back, k in file["commands"][:].tolist()]
+            return Recording(
+                str(file.attrs["scene"]), requests, replies, file["received"][:], commands
+            )
     except (OSError, KeyError, ValueError) as error:
         raise RecordingError(f"{path}: cannot be read: {error}") from error

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from online import frames
-from online.follower import Follower
 from online.frames import REPLY
 from online.recording import Recording, RecordingError
 from online.session import recover
+from online.timed_follower import follower_of
 from shared.atlas import Atlas
 
 VOLATILE = ("server_received", "server_sent", "solve_time", "superseded")
@@ -48,10 +48,19 @@ def replay(recording: Recording, atlas: Atlas) -> Replay:
         raise RecordingError(
             f"the recording is of scene {recording.scene!r}, the artifact of {atlas.name!r}"
         )
-    follower = Follower(atlas)
+    follower = follower_of(atlas)
+    snapshots: dict[int, Any] = {}
+    commands = list(recording.commands)
     again = np.zeros_like(recording.replies)
     for i, request in enumerate(recording.requests):
-        step = follower.repeat(request.position, int(recording.replies["steps"][i]))
+        while commands and commands[0].replies <= i:
+            command = commands.pop(0)
+            if command.restores:
+                follower.restore(snapshots[command.number])
+            else:
+                snapshots[command.number] = follower.snapshot()
+        steps = int(recording.replies["steps"][i])
+        step = follower.repeat(request.position, steps, request.client_time)
         extras = recover(atlas, step.touch, request.outputs)
         frame = frames.encode_reply(request, step, extras)
         again[i] = np.frombuffer(frame, REPLY, 1)[0]

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, field_validator
 from pydantic_core import PydanticCustomError
 
-from online.errors import invalid
+from online.errors import Refusal, invalid
 from online.frames import Output, Request
 
 FieldName = Literal["displacement", "von_mises"]
@@ -38,6 +38,9 @@ EXAMPLE: dict[str, JsonValue] = {
 
 MOST_STEPS = 200
 """Of a history: they keep others waiting for some 50 ms."""
+
+MOST_SNAPSHOTS = 8
+"""That a session keeps."""
 
 EXAMPLE_HISTORY: dict[str, JsonValue] = {
     "steps": [
@@ -146,11 +149,20 @@ class SessionRequest(_Strict):
     """A position of the tip, in the JSON mode of a session."""
 
     seq: int = Field(0, ge=0, lt=2**32, description="The client's number of this message, echoed.")
-    client_time: float = Field(0.0, description="The client's clock, s, echoed.")
+    client_time: float = Field(
+        0.0, description="The client's clock, s, echoed; the time of visco-elastic tissue."
+    )
     position: Position = Field(description="Centre of the tip, [x, y, z] mm.")
     outputs: list[Literal["coordinates", "displacement", "von_mises", "stress"]] = Field(
         [], max_length=4, description="What is wanted beyond force and tangent."
     )
+
+
+class SessionCommand(_Strict):
+    """A request to keep the state of a session's tissue, or to go back to one that was kept."""
+
+    snapshot: int | None = Field(None, ge=0, lt=MOST_SNAPSHOTS, description="Number to keep it by.")
+    restore: int | None = Field(None, ge=0, lt=MOST_SNAPSHOTS, description="Number to go back to.")
 
 
 _NAMES = {"": list(SolveRequest.model_fields), "contacts": list(Contact.model_fields)}
@@ -190,6 +202,26 @@ def parse_session_request(text: str) -> Request:
     outputs = sum(Output[name.upper()] for name in set(read.outputs))
     x, y, z = read.position
     return Request(read.seq, read.client_time, (x, y, z), outputs)
+
+
+def is_command(text: str) -> bool:
+    """Whether a text message is a `SessionCommand` rather than a position."""
+    return '"snapshot"' in text or '"restore"' in text
+
+
+def parse_session_command(text: str) -> tuple[bool, int]:
+    """Read a command: whether it restores, and the number; raise `Refusal` for nonsense."""
+    names = list(SessionCommand.model_fields)
+    try:
+        read = SessionCommand.model_validate_json(text)
+    except ValidationError as error:
+        details = error.errors(include_url=False, include_input=False)
+        raise invalid(details, {"": names}) from None
+    if read.snapshot is not None and read.restore is None:
+        return False, read.snapshot
+    if read.restore is not None and read.snapshot is None:
+        return True, read.restore
+    raise Refusal("invalid_value", "snapshot", "One of snapshot and restore is wanted", names)
 
 
 class ContactAnswer(BaseModel):

@@ -23,9 +23,15 @@ from online.errors import Refusal
 from online.follower import Follower, Step
 from online.frames import Extras, Flag, FrameError, Output, Request, VersionError
 from online.metrics import Metrics
-from online.schemas import parse_session_request
+from online.schemas import (
+    MOST_SNAPSHOTS,
+    is_command,
+    parse_session_command,
+    parse_session_request,
+)
 from online.settings import Settings
 from online.store import Model, Store
+from online.timed_follower import LONGEST, follower_of
 from online.websocket import LINGER, MOST_FRAMES, PENDING, READ_AT, STOPPING
 from shared.atlas import Atlas
 from shared.touch import Touch
@@ -83,7 +89,7 @@ class Sessions:
             )
         self._open += 1
         self._metrics.count_session(opened=True)
-        follower = model.followers.pop() if model.followers else Follower(model.atlas)
+        follower = model.followers.pop() if model.followers else follower_of(model.atlas)
         try:
             session = Session(model, follower, self._settings, self._metrics, scope, receive, send)
             await session.run()
@@ -127,6 +133,7 @@ class Session:
         self._pending: Callable[[], bool] = scope["extensions"][PENDING]
         self._read_at: Callable[[], float] = scope["extensions"][READ_AT]
         self._follower = follower
+        self._snapshots: dict[int, Any] = {}
         self._received = perf_counter()
         self._superseded = 0
         self._sending_since = math.inf
@@ -161,10 +168,13 @@ class Session:
                     break
                 self._note()
                 newest = message
-                if not (more and self._pending()):
+                if is_command(message.get("text") or "") or not (more and self._pending()):
                     break
                 message = await self._receive()
-                self._superseded += message["type"] == "websocket.receive"
+                if is_command(message.get("text") or ""):  # it is of the state after the newest
+                    await self._deliver(self._reply(newest))
+                else:
+                    self._superseded += message["type"] == "websocket.receive"
             if newest["type"] == "websocket.receive":
                 await self._deliver(self._reply(newest))
             if message["type"] != "websocket.receive":
@@ -225,6 +235,8 @@ class Session:
 
     def _answer_text(self, text: str) -> str:
         """Answer in JSON: the same fields by name, bits as lists of names, and a reason."""
+        if is_command(text):
+            return self._obey(text)
         start = perf_counter()
         request = parse_session_request(text)
         self._check_size(request.outputs)
@@ -236,10 +248,24 @@ class Session:
         document["reason"] = step.reason
         return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY).decode()
 
+    def _obey(self, text: str) -> str:
+        """Keep the state of the tissue or go back to one that was kept; echo the command."""
+        restores, number = parse_session_command(text)
+        if not restores:
+            self._snapshots[number] = self._follower.snapshot()
+        elif number in self._snapshots:
+            self._follower.restore(self._snapshots[number])
+        else:
+            raise Refusal(
+                "unknown_snapshot", "restore", "None was kept by this number",
+                sorted(self._snapshots),
+            )  # fmt: skip
+        return orjson.dumps({"restore" if restores else "snapshot": number}).decode()
+
     def _solve(self, request: Request, start: float) -> tuple[bytes, Step]:
         """Answer a request whose decoding began at `start`: the reply's frame and its content."""
         decoded = perf_counter()
-        step = self._follower.follow(request.position, BUDGET)
+        step = self._follower.follow(request.position, BUDGET, request.client_time)
         solved = perf_counter()
         extras = recover(self._atlas, step.touch, request.outputs)
         recovered = perf_counter()
@@ -278,6 +304,8 @@ class Session:
             "nodes": len(atlas.surface_nodes),
             "idle_timeout": self._settings.session_idle,
             "max_frames_per_second": MOST_FRAMES,
+            "longest_step": LONGEST if atlas.scene.tissue.prony else None,
+            "snapshots": MOST_SNAPSHOTS,
             "server_time": perf_counter(),
             "layout": frames.layout(),
         }
@@ -291,12 +319,25 @@ def warm(model: Model, metrics: Metrics) -> None:
     x, y, z = model.tip
     request = Request(0, 0.0, (x, y, z), sum(Output))
     for _ in range(SPARE):
-        follower = Follower(model.atlas)
+        follower = follower_of(model.atlas)
+        _wander(follower, model.atlas)
         step = follower.follow(request.position, BUDGET)
         frames.encode_reply(request, step, recover(model.atlas, step.touch, request.outputs))
         metrics.count_frame(0.0, (0.0, 0.0, 0.0, 0.0, 0.0), step.flags, 0)
         follower.restart()
         model.followers.append(follower)
+
+
+def _wander(follower: Follower, atlas: Atlas) -> None:
+    """Go from one local model to the next and back: all that a history may need."""
+    models = atlas.models
+    if models.viscous is None:
+        return
+    over = models.centres + 0.9 * atlas.scene.endoscope.radius * models.frames[:, 0]
+    here, there = models.viscous.pairs[0]
+    for number, k in enumerate((here, there, here)):
+        follower.follow(over[k].tolist(), BUDGET, 0.01 * number)
+    follower.restart()
 
 
 def recover(atlas: Atlas, touch: Touch, outputs: int) -> Extras:

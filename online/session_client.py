@@ -102,6 +102,19 @@ class _Dialogue:
             self._recorder.received(message, perf_counter())
         return frames.decode_reply(message)
 
+    def _confirmed(self, message: str | bytes, command: dict[str, int]) -> bool:
+        """Whether a message confirms a command; raise a complaint, note other replies."""
+        if isinstance(message, bytes):
+            self._understand(message)
+            return False
+        document = json.loads(message)
+        if document != command:
+            raise ServiceError(0, document["error"])
+        if self._recorder is not None:
+            ((name, number),) = command.items()
+            self._recorder.obeyed(name == "restore", number)
+        return True
+
     def _end(self) -> None:
         if self._recorder is not None:
             self._recorder.close()
@@ -237,6 +250,23 @@ class Session(_Dialogue):
             pass
         return reply
 
+    def snapshot(self, number: int = 0) -> None:
+        """Let the service keep the state of the tissue by a number.
+
+        Replies that are still under way are dropped. Raises what `receive` raises.
+        """
+        self._command({"snapshot": number})
+
+    def restore(self, number: int = 0) -> None:
+        """Go back to a state that was kept; see `snapshot`."""
+        self._command({"restore": number})
+
+    def _command(self, command: dict[str, int]) -> None:
+        self._protocol.send_text(json.dumps(command).encode())
+        self._flush()
+        while not self._confirmed(self._message(), command):
+            pass
+
     def _shake_hands(self, token: str | None) -> None:
         request = self._protocol.connect()
         if token is not None:
@@ -351,6 +381,22 @@ class AsyncSession(_Dialogue):
         while (reply := await self.receive()).seq != seq:
             pass
         return reply
+
+    async def snapshot(self, number: int = 0) -> None:
+        """Keep the state of the tissue; see `Session.snapshot`."""
+        await self._command({"snapshot": number})
+
+    async def restore(self, number: int = 0) -> None:
+        """Go back to a state that was kept; see `Session.restore`."""
+        await self._command({"restore": number})
+
+    async def _command(self, command: dict[str, int]) -> None:
+        try:
+            await self._connection.send(json.dumps(command))
+        except ConnectionClosed as error:
+            raise _ending(error) from None
+        while not self._confirmed(await self._message(), command):
+            pass
 
     async def _message(self) -> str | bytes:
         try:

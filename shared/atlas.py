@@ -13,12 +13,12 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from shared import equilibrium, touch
+from shared import equilibrium, tip_history, touch
 from shared.artifact import Artifact, ArtifactError, read_artifact
 from shared.bound import bind
 from shared.endoscope import LIMIT_FIELDS, TIP_DEPTH, SurfaceQuadrature
 from shared.errors import QueryError
-from shared.history import History, Moment, Stepper, ViscousModels
+from shared.history import Carrier, History, Moment, Remembered, Stepper, ViscousModels
 from shared.quadrature import stress_recovery, surface_quadrature, volume_quadrature
 from shared.reduced import (
     DEPARTURE,
@@ -55,8 +55,17 @@ from shared.scene import Scene, SceneError, parse_scene
 from shared.stress import nodal_von_mises, nodal_von_mises_after, remember, remember_linearly
 from shared.surface import UPRIGHT, Ground, Surface, boundary_triangles
 from shared.tip import Tip, TipSurface, tip_of, tip_surface
+from shared.tip_history import HISTORY_FEATURES, TipHistory, TipStepper
 from shared.tissue import lame
-from shared.touch import TIP_ERROR_FEATURES, LocalTips, Points, TipModels, TipState, Touch
+from shared.touch import (
+    MAX_ITERATIONS,
+    TIP_ERROR_FEATURES,
+    LocalTips,
+    Points,
+    TipModels,
+    TipState,
+    Touch,
+)
 from shared.viscosity import Weights, step_weights
 
 Array = NDArray[np.float64]
@@ -167,8 +176,8 @@ class LocalModels:
     blend : float, mm
     tips : LocalTips, optional
         The same patches under the rigid tip.
-    viscous : ViscousModels, optional
-        Of tissue that remembers.
+    viscous, viscous_tips : ViscousModels, optional
+        Of tissue that remembers; of the same patches under the tip.
     """
 
     basis: NDArray[np.int16]
@@ -190,6 +199,7 @@ class LocalModels:
     blend: float
     tips: LocalTips | None
     viscous: ViscousModels | None = None
+    viscous_tips: ViscousModels | None = None
 
     @cached_property
     def modes(self) -> Field:
@@ -543,7 +553,8 @@ class Atlas:
     limits : ndarray, shape (v, LIMIT_FIELDS)
         Load range at the surface's vertices; see ``shared.endoscope.pressure_limit``.
     models : LocalModels
-    estimator : Estimator
+    estimator, tip_estimator, history_estimator : Estimator
+        Of loads, of the tip on elastic tissue, and of the tip on tissue that remembers.
     """
 
     def __init__(
@@ -557,6 +568,7 @@ class Atlas:
         models: LocalModels,
         estimator: Estimator,
         tip_estimator: Estimator,
+        history_estimator: Estimator,
     ) -> None:
         self.name = name
         self.scene = scene
@@ -567,6 +579,7 @@ class Atlas:
         self.models = models
         self.estimator = estimator
         self.tip_estimator = tip_estimator
+        self.history_estimator = history_estimator
         self.patches = assemble_patches(body, models, scene.endoscope.radius)
         terms = Terms(
             ground=surface.ground(limits),
@@ -643,12 +656,9 @@ class Atlas:
                 extent=float(arrays["patch_extent"]),
                 blend=float(arrays["patch_blend"]),
                 tips=_local_tips(arrays) if scene.endoscope.tip else None,
-                viscous=ViscousModels(
-                    arrays["viscous_deviatoric"],
-                    arrays["viscous_pairs"],
-                    arrays["viscous_overlap"].astype(np.float32),
-                )
-                if scene.tissue.prony
+                viscous=_viscous_models(arrays, "viscous") if scene.tissue.prony else None,
+                viscous_tips=_viscous_models(arrays, "tip_viscous")
+                if scene.tissue.prony and scene.endoscope.tip
                 else None,
             ),
             estimator=Estimator(arrays["error_coefficients"]),
@@ -656,6 +666,11 @@ class Atlas:
                 arrays["tip_error_coefficients"]
                 if scene.endoscope.tip
                 else np.zeros((3, TIP_ERROR_FEATURES))
+            ),
+            history_estimator=Estimator(
+                arrays["history_error_coefficients"]
+                if scene.endoscope.tip and scene.tissue.prony
+                else np.zeros((3, HISTORY_FEATURES))
             ),
         )
 
@@ -835,10 +850,7 @@ class Atlas:
             As ``solve``, or if the tissue is elastic, or ``dt`` negative or not finite.
         """
         started = time.perf_counter()
-        if self.models.viscous is None:
-            raise QueryError("time", f"scene {self.name!r} is elastic and knows none")
-        if not 0.0 <= dt < math.inf:
-            raise QueryError("time", f"steps must be >= 0 s and finite, not {dt}")
+        self._check_time(dt)
         if position is None:
             last = history.position
             position, pressure = self.surface.vertices[0] if last is None else last, 0.0
@@ -875,6 +887,13 @@ class Atlas:
             solve_seconds=time.perf_counter() - started,
         )
         return moment, after if moment.converged else history
+
+    def _check_time(self, dt: float) -> None:
+        """Raise ``QueryError`` if tissue knows no time, or none like this."""
+        if self.models.viscous is None:
+            raise QueryError("time", f"scene {self.name!r} is elastic and knows none")
+        if not 0.0 <= dt < math.inf:
+            raise QueryError("time", f"steps must be >= 0 s and finite, not {dt}")
 
     def _step_weights(self, dt: float) -> Weights:
         """Weights of a time step, which is often the last one's."""
@@ -916,14 +935,70 @@ class Atlas:
         """
         started = time.perf_counter()
         at = _vector("position", position)
-        if self.tips is None:
-            raise QueryError("position", f"scene {self.name!r} was trained without a tip")
         if state is None:
             state = self._state
             state.forget()
+        return touch.answer(self._tip_state(state), at, started, most)
+
+    def touch_step(
+        self,
+        history: TipHistory,
+        dt: float,
+        position: ArrayLike,
+        most: int = MAX_ITERATIONS,
+    ) -> tuple[Touch, TipHistory]:
+        """Answer a position of the rigid tip on visco-elastic tissue.
+
+        Parameters
+        ----------
+        history : TipHistory
+            ``TipHistory()`` is rest. It is not changed.
+        dt : float, s
+            Since the end of the history; may be 0, for a sudden change. The tip moved evenly.
+        position : array_like, shape (3,), mm
+            Centre of the tip, outside the body.
+        most : int
+            As in ``touch``.
+
+        Returns
+        -------
+        touch : Touch
+            Its estimated errors are the largest until now of displacement, stress and force,
+            relative to the largest of these until now.
+        history : TipHistory
+            To go on from; the old one if the answer did not converge.
+
+        Raises
+        ------
+        QueryError
+            As ``touch``, or if the tissue is elastic, or ``dt`` negative or not finite.
+        """
+        started = time.perf_counter()
+        self._check_time(dt)
+        at = _vector("position", position)
+        return tip_history.step(
+            self._tip_state(self._state), self._tip_stepper, history, dt, self._step_weights(dt),
+            at, self.history_estimator.coefficients, started, most,
+        )  # fmt: skip
+
+    def _tip_state(self, state: State) -> TipState:
+        """Working memory under the tip, made when first needed."""
         if state.tip is None:
+            if self.tips is None:
+                raise QueryError("position", f"scene {self.name!r} was trained without a tip")
             state.tip = TipState(self.tips, self._tip_ground, self.tip_estimator.coefficients)
-        return touch.answer(state.tip, at, started, most)
+        return state.tip
+
+    @cached_property
+    def _tip_stepper(self) -> TipStepper:
+        assert self.models.viscous_tips is not None, "or there would be no history"
+        assert self.tips is not None
+        return TipStepper(
+            self._tip_state(self._state).bound,
+            self.models.viscous_tips,
+            self.scene.tissue.prony,
+            self.tips.points.weights.shape[1],
+        )
 
     @cached_property
     def _tip_ground(self) -> Ground:
@@ -931,13 +1006,27 @@ class Atlas:
 
     def coefficients(self, solution: Solution | Touch | Moment) -> dict[int, Field]:
         """Displacement as coefficients (M,) in the basis of each region that takes part."""
-        if isinstance(solution, Moment):
-            return self._by_region(self.models.modes, self._stepper.answers(solution))
-        modes = self.models.modes
+        modes, past = self._modes(solution), self._past(solution)
+        if past is not None:
+            carrier, moment = past
+            return self._by_region(modes, carrier.answers(moment))
+        assert not isinstance(solution, Moment)
+        return self._by_region(modes, solution.patches)
+
+    def _modes(self, solution: Solution | Touch | Moment) -> Field:
+        """Modes (p, M, r) that an answer is given in."""
         if isinstance(solution, Touch):
             assert self.models.tips is not None, "or there would be no such answer"
-            modes = self.models.tips.modes
-        return self._by_region(modes, solution.patches)
+            return self.models.tips.modes
+        return self.models.modes
+
+    def _past(self, solution: Solution | Touch | Moment) -> tuple[Carrier, Remembered] | None:
+        """What carries the past of an answer, if it has one."""
+        if isinstance(solution, Moment):
+            return self._stepper, solution
+        if isinstance(solution, Touch) and solution.active:
+            return self._tip_stepper, solution
+        return None
 
     def _by_region(
         self, modes: Field, answers: Sequence[tuple[int, float, Array]]
@@ -948,10 +1037,6 @@ class Atlas:
             share = modes[k] @ (weight * c).astype(np.float32)
             total[region] = total[region] + share if region in total else share
         return total
-
-    def _expanded(self, answers: Sequence[tuple[int, float, Array]]) -> Field:
-        """Displacement (n, 3) mm of patches with weights and answers in their wide spaces."""
-        return self._field(self._by_region(self.models.modes, answers))
 
     def _field(self, coefficients: Mapping[int, Field]) -> Field:
         field = np.zeros(self.models.basis.shape[2], np.float32)
@@ -973,9 +1058,10 @@ class Atlas:
         """Nodal von Mises stress (k,) kPa; ``displacement`` of all nodes saves its recovery."""
         if displacement is None:
             displacement = self.displacement(solution, "all")
-        if isinstance(solution, Moment):
-            past = self._remembered(solution)
-            nodal_von_mises_after(self._recovery, displacement, past, self._stress)
+        past = self._past(solution)
+        if past is not None:
+            B = self._remembered(self._modes(solution), *past)
+            nodal_von_mises_after(self._recovery, displacement, B, self._stress)
         else:
             nodal_von_mises(self._recovery, displacement, self._stress)
         stress = self._stress if region == "all" else self._stress[self.surface_nodes]
@@ -983,14 +1069,15 @@ class Atlas:
         with np.errstate(over="ignore"):
             return stress.astype(np.float32)
 
-    def _remembered(self, moment: Moment) -> Array:
+    def _remembered(self, modes: Field, carrier: Carrier, moment: Remembered) -> Array:
         """``B`` of ``shared.viscosity`` (e, 6, 8) at the points of all elements."""
         B = np.zeros((len(self.body.elements), 6, 8))
-        for k, share, knot in self._stepper.knots(moment):
-            remember(self._recovery, self._expanded([(k, 1.0, knot)]), share, B)
-        lasting = self._stepper.lasting(moment)
+        for k, share, knot in carrier.knots(moment):
+            u = self._field(self._by_region(modes, [(k, 1.0, knot)]))
+            remember(self._recovery, u, share, B)
+        lasting = carrier.lasting(moment)
         if lasting:
-            remember_linearly(self._recovery, self._expanded(lasting), B)
+            remember_linearly(self._recovery, self._field(self._by_region(modes, lasting)), B)
         return B
 
 
@@ -1004,6 +1091,14 @@ def _local_tips(arrays: dict[str, NDArray[Any]]) -> LocalTips:
         pairs=arrays["tip_pairs"],
         overlaps=arrays["tip_overlaps"].astype(np.float32),
         residuals=arrays["tip_residuals"],
+    )
+
+
+def _viscous_models(arrays: dict[str, NDArray[Any]], name: str) -> ViscousModels:
+    return ViscousModels(
+        arrays[f"{name}_deviatoric"],
+        arrays["viscous_pairs"],
+        arrays[f"{name}_overlap"].astype(np.float32),
     )
 
 

@@ -6,9 +6,10 @@ See ``shared.reduced_history`` for the theory.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,7 +70,7 @@ class Remains(NamedTuple):
 class Local:
     """History of a patch in use, and what each move of the tool left in the spaces of others."""
 
-    memory: Memory
+    memory: Any  # reduced_history.Memory, or touch_history.TipMemory under the tip
     remains: tuple[Mapping[int, Remains], ...]
 
 
@@ -134,6 +135,18 @@ class Moment(NamedTuple):
     solve_seconds: float
 
 
+class Remembered(Protocol):
+    """An answer with what its patches remember."""
+
+    @property
+    def time(self) -> float:
+        """Since rest, s."""
+
+    @property
+    def active(self) -> tuple[tuple[int, float, Local], ...]:
+        """Patches that answer, with their weights."""
+
+
 class Pressed(NamedTuple):
     """What pressing some patches for a time step has led to."""
 
@@ -145,12 +158,11 @@ class Pressed(NamedTuple):
     min_jacobian: float
 
 
-class Stepper:
-    """Takes histories from step to step and from patch to patch.
+class Carrier(ABC):
+    """Takes what patches remember from one to the next.
 
     Parameters
     ----------
-    solver : Bound of shared.reduced.Solver
     models : ViscousModels
     prony : sequence of (float, float)
     points : int
@@ -158,19 +170,13 @@ class Stepper:
     """
 
     def __init__(
-        self,
-        solver: Any,
-        models: ViscousModels,
-        prony: Sequence[tuple[float, float]],
-        points: int,
+        self, models: ViscousModels, prony: Sequence[tuple[float, float]], points: int
     ) -> None:
-        self._solver = solver
         self._models = models
         self._share, self._tau = np.array(prony, dtype=float).T
         self._points = points
         self.modes = models.deviatoric.shape[1]
         self._pair = {(int(k), int(n)): i for i, (k, n) in enumerate(models.pairs)}
-        self._scratch = new_scratch(self.modes, points)
         # the slowest that anything recovers
         self._slowest = self._tau.max() / (1.0 - self._share.sum())
         # of D: Q, and of the terms that each of its eigenvalues couples
@@ -180,34 +186,20 @@ class Stepper:
         coupled = d[:, :, None, None] * np.outer(coupling, coupling) - np.diag(1.0 / self._tau)
         self._rates, self._coupled = np.linalg.eigh(coupled)
 
-    def press(
-        self,
-        history: History,
-        active: Sequence[tuple[int, float]],
-        pressure: float,
-        radius: float,
-        weights: Weights,
-    ) -> Pressed:
-        """Press patches (number and weight) where ``place`` has found, at the end of a step."""
-        found: dict[int, Local] = {}
-        moved, part = np.zeros(3), np.zeros(3)
-        iterations, smallest, converged, area = 0, math.inf, True, 0.0
-        for k, share in active:
-            local = history.locals.get(k) or self.follow(history, k)
-            memory = copied(local.memory)
-            status, count, least, area = step_at(
-                self._solver, k, pressure, radius, self._models.deviatoric[k], weights,
-                memory, self._scratch, part,
-            )  # fmt: skip
-            found[k] = Local(memory, local.remains)
-            moved += share * part
-            iterations, smallest = max(iterations, count), min(smallest, least)
-            converged = converged and status == equilibrium.CONVERGED
-        return Pressed(found, moved, area, converged, iterations, smallest)
+    @abstractmethod
+    def _new_memory(self) -> Any:
+        """Of a patch that nothing has happened to; a named tuple as ``reduced_history.Memory``."""
+
+    @abstractmethod
+    def _take_over(self, k: int, new: Any, old: Any, overlap: Field | None) -> None:
+        """Make a memory whose knots, shares and means are known one of patch k.
+
+        ``old`` is of the patch before, ``overlap`` ``B_k^T K_0 B`` with that if the two meet.
+        """
 
     def at_rest(self) -> Local:
         """A patch that nothing has happened to."""
-        return Local(new_memory(len(self._tau), self.modes, self._points), ())
+        return Local(self._new_memory(), ())
 
     def follow(self, history: History, k: int) -> Local:
         """Local history of patch k, which does not have one yet.
@@ -218,14 +210,13 @@ class Stepper:
         if history.main < 0:
             return self.at_rest()
         source, time = history.locals[history.main], history.time
-        new = new_memory(len(self._tau), self.modes, self._points)
+        new = self._new_memory()
         old, move = source.memory, {history.main: Remains(source.memory.mean, time)}
         T = self._overlap(k, history.main)
         if T is not None:
             new.knots[:] = old.knots @ T.T
             new.share[:] = old.share
             new.mean[:] = old.mean @ T.T
-            new.load[:] = T @ old.load
             self._add(move, k, -new.mean, time)
         remains = [move]
         for earlier in source.remains:
@@ -238,7 +229,7 @@ class Stepper:
                 self._add(left, k, -mean, time)
             remains.append(left)
         new.wide[:] = new.knots[-1]
-        recall_points(self._solver, k, new, self._scratch)
+        self._take_over(k, new, old, T)
         return Local(new, self._largest(remains, time))
 
     def _projected(
@@ -259,7 +250,7 @@ class Stepper:
             moved += T @ (self._models.deviatoric[n] @ (self._share @ own))
         return mean, moved
 
-    def answers(self, moment: Moment) -> Answers:
+    def answers(self, moment: Remembered) -> Answers:
         """Displacements of a moment: patch, weight and (r,) in the wide space of each part."""
         found = [(k, weight, local.memory.wide) for k, weight, local in moment.active]
         return found + [
@@ -267,7 +258,7 @@ class Stepper:
             for k, weight, mean in self.lasting(moment)
         ]
 
-    def knots(self, moment: Moment) -> Answers:
+    def knots(self, moment: Remembered) -> Answers:
         """Displacements of the past, likewise, each with its share in the stress."""
         return [
             (k, weight * float(share), knot)
@@ -278,7 +269,7 @@ class Stepper:
             if share > 0.0
         ]
 
-    def lasting(self, moment: Moment) -> Answers:
+    def lasting(self, moment: Remembered) -> Answers:
         """Means over the past, times shares, of what remains in patches that do not answer."""
         return [
             (n, weight, self._share @ self._recover(n, remains, moment.time))
@@ -328,3 +319,58 @@ class Stepper:
         y = np.einsum("rab,ra->rb", modes, (remains.mean @ Q).T * self._scale)
         y *= np.exp(self._rates[k] * (time - remains.time))
         return np.asarray((np.einsum("rab,rb->ra", modes, y) / self._scale).T @ Q.T)
+
+
+class Stepper(Carrier):
+    """Presses footprints on patches, step by step.
+
+    Parameters
+    ----------
+    solver : Bound of shared.reduced.Solver
+    models, prony, points
+        See ``Carrier``.
+    """
+
+    def __init__(
+        self,
+        solver: Any,
+        models: ViscousModels,
+        prony: Sequence[tuple[float, float]],
+        points: int,
+    ) -> None:
+        super().__init__(models, prony, points)
+        self._solver = solver
+        self._scratch = new_scratch(self.modes, points)
+
+    def press(
+        self,
+        history: History,
+        active: Sequence[tuple[int, float]],
+        pressure: float,
+        radius: float,
+        weights: Weights,
+    ) -> Pressed:
+        """Press patches (number and weight) where ``place`` has found, at the end of a step."""
+        found: dict[int, Local] = {}
+        moved, part = np.zeros(3), np.zeros(3)
+        iterations, smallest, converged, area = 0, math.inf, True, 0.0
+        for k, share in active:
+            local = history.locals.get(k) or self.follow(history, k)
+            memory = copied(local.memory)
+            status, count, least, area = step_at(
+                self._solver, k, pressure, radius, self._models.deviatoric[k], weights,
+                memory, self._scratch, part,
+            )  # fmt: skip
+            found[k] = Local(memory, local.remains)
+            moved += share * part
+            iterations, smallest = max(iterations, count), min(smallest, least)
+            converged = converged and status == equilibrium.CONVERGED
+        return Pressed(found, moved, area, converged, iterations, smallest)
+
+    def _new_memory(self) -> Memory:
+        return new_memory(len(self._tau), self.modes, self._points)
+
+    def _take_over(self, k: int, new: Memory, old: Memory, overlap: Field | None) -> None:
+        if overlap is not None:
+            new.load[:] = overlap @ old.load
+        recall_points(self._solver, k, new, self._scratch)

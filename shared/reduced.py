@@ -249,7 +249,7 @@ def increments(state, gradients, out):
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def _lower_products(A, B, K):
+def lower_products(A, B, K):
     """Lower triangle of ``K = A B^T``: A, B (4 k, n) float32; some entries above it as well."""
     for i in range(0, len(A), 2):
         a, b = A[i], A[i + 1]
@@ -361,10 +361,10 @@ def _factorise(system, u, shift):
         superpose(system.gradients, u, system.H)
         linearise(system.H, system.weights, system.mu, system.lam, system.state)
         increments(system.state, system.gradients, system.increments)
-        _lower_products(system.gradients, system.increments, system.tangent)
+        lower_products(system.gradients, system.increments, system.tangent)
         for i in range(len(u)):
             system.tangent[i, i] += 1.0
-        return _cholesky(system.tangent, shift, system.factor)
+        return cholesky(system.tangent, shift, system.factor)
 
     return factorise
 
@@ -398,7 +398,7 @@ def back_substitute(L, x):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _cholesky(K, shift, L):
+def cholesky(K, shift, L):
     """Lower Cholesky factor of ``K + shift I``, row by row; False if a pivot is not positive.
 
     ``I`` is the rest stiffness: the modes are orthonormal in its energy.

@@ -150,7 +150,7 @@ def new_scratch(modes: int, points: int) -> Scratch:
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _inverse_cube_root(J):
+def inverse_cube_root(J):
     """``J^(-1/3)`` to double precision for J from 0.2 to 5 by Newton's method: vector code."""
     y = 3.0 / (2.0 + J)
     for _ in range(5):
@@ -223,7 +223,7 @@ def add_past_stress(H, weights, mu, J, B, S, loss, energy, P):
             h6, h7, h8 = float(h[6 * LANES + c]), float(h[7 * LANES + c]), float(h[8 * LANES + c])
             b0, b1, b2 = float(b[c]), float(b[LANES + c]), float(b[2 * LANES + c])
             b3, b4, b5 = float(b[3 * LANES + c]), float(b[4 * LANES + c]), float(b[5 * LANES + c])
-            root = _inverse_cube_root(j[c])
+            root = inverse_cube_root(j[c])
             scale = m[c] * root * root
             contraction, q0, q1, q2, q3, q4, q5, q6, q7, q8 = viscosity.overstress(
                 1.0 + h0, h1, h2, h3, 1.0 + h4, h5, h6, h7, 1.0 + h8,
@@ -461,7 +461,7 @@ def step_patch(patches, k, deviatoric, time, load, memory, scratch):
             )
     wide[:] = start
     memory.load[:] = load
-    _add_knot(memory, time)
+    add_knot(memory, time)
     return status, iterations, smallest
 
 
@@ -469,7 +469,7 @@ def step_patch(patches, k, deviatoric, time, load, memory, scratch):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _add_knot(memory, time):
+def add_knot(memory, time):
     """Append the last answer to the knots; two of the others become one."""
     knots, share = memory.knots, memory.share
     last = len(knots) - 1
@@ -504,8 +504,13 @@ def _add_knot(memory, time):
 @njit(cache=True, error_model="numpy", nogil=True)
 def recall_points(solver, k, memory, scratch):
     """Give the points of local model k the history that the knots and the means tell."""
-    patches = solver.patches
-    gradients, steps, points = patches.gradients[k], patches.steps[k], memory.points
+    recall(solver.patches.gradients[k], solver.patches.steps[k], memory, scratch)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def recall(gradients, steps, memory, scratch):
+    """``recall_points`` of a local model with gradients (r, 9 c) in units of ``steps`` (r,)."""
+    points = memory.points
     terms, last = len(memory.mean), len(memory.knots) - 1
     points[:] = np.float32(0.0)
     for j in range(last + 1):

@@ -241,15 +241,6 @@ class Scene(_Part):
         return self._folder
 
     @model_validator(mode="after")
-    def _tip_presses_elastic_tissue(self) -> Scene:
-        if self.endoscope.tip and self.tissue.prony:
-            raise PydanticCustomError(
-                "tip",
-                "endoscope.tip: the rigid tip knows elastic tissue only, without tissue.prony",
-            )
-        return self
-
-    @model_validator(mode="after")
     def _sides_exist(self) -> Scene:
         for name in ("support", "surface"):
             side = getattr(self, name).side

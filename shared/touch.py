@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from shared import equilibrium, tissue
 from shared.bound import bind, bind_compiled
 from shared.errors import QueryError
+from shared.history import Local
 from shared.reduced import (
     FAST,
     LANES,
@@ -41,14 +42,14 @@ from shared.reduced import (
     ROUND_OFF,
     STATE,
     TILE,
-    _cholesky,
-    _lower_products,
     activate,
     added_energy,
     back_substitute,
+    cholesky,
     increments,
     is_system,
     linearise,
+    lower_products,
     nonlinear_stress,
     project,
     residual_features,
@@ -311,7 +312,7 @@ def _move(nodes, modes, q, moved):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _contact(system, q, wanted):
+def form_contact(system, q, wanted):
     """What the tip does to the state q: (faces touched, energy, largest penetration)."""
     moved = system.moved
     _move(system.nodes, system.modes, q, moved)
@@ -332,7 +333,7 @@ def _potential(system, u, residual):
         if not smallest > 0.0:
             return tissue.INVERTED, smallest
         project(system.gradients, system.P, residual)
-        count, energy, _ = _contact(system, u, STIFFNESS)
+        count, energy, _ = form_contact(system, u, STIFFNESS)
         system.latest[:] = u
         energy += added_energy(weights, mu, lam, J, trace, linear)
         for j in range(len(u)):
@@ -356,20 +357,20 @@ def _factorise(system, u, shift):
         return None
 
     def factorise(system, u, shift):
-        known = _far(u, system.formed) <= LAG * LAG
+        known = far(u, system.formed) <= LAG * LAG
         if shift > 0.0:
-            _contact(system, u, CONVEX)
+            form_contact(system, u, CONVEX)
             system.latest[:] = np.inf
-        elif _far(u, system.latest) > 0.0:
-            _contact(system, u, STIFFNESS)
+        elif far(u, system.latest) > 0.0:
+            form_contact(system, u, STIFFNESS)
             system.latest[:] = u
         while True:
             if not known:
                 _form_bulk(system, u)
             system.tangent[:] = system.bulk
             for c in range(system.touching.touched[0]):
-                _add_face(system, c)
-            if _cholesky(system.tangent, shift, system.factor):
+                add_face(system, c)
+            if cholesky(system.tangent, shift, system.factor):
                 return True
             if not known:
                 return False
@@ -379,7 +380,7 @@ def _factorise(system, u, shift):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _far(u, other):
+def far(u, other):
     """Squared distance of a state from another, relative to its size."""
     size = distance = 0.0
     for j in range(len(u)):
@@ -396,14 +397,14 @@ def _form_bulk(system, u):
     superpose(gradients, u, H)
     linearise(H, system.tangent_weights, system.tangent_mu, system.tangent_lam, system.state)
     increments(system.state, gradients, system.increments)
-    _lower_products(gradients, system.increments, bulk)
+    lower_products(gradients, system.increments, bulk)
     for j in range(len(u)):
         bulk[j, j] += 1.0
     system.formed[:] = u
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def _add_face(system, c):
+def add_face(system, c):
     """Add a touching face's stiffness to the lower triangle of the tangent."""
     K, own, folded = system.touching.stiffness[c], system.own, system.folded
     tangent = system.tangent
@@ -457,7 +458,7 @@ def _response(tip, depth):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _settle(system, q, work, depth, tolerance, most):
+def settle(system, tip, q, work, depth, tolerance, most):
     """Equilibrium near q, in place: (status, iterations, energy, smallest det F).
 
     The tolerance is relative to the response, which is not known before; the depth says what it may
@@ -465,8 +466,8 @@ def _settle(system, q, work, depth, tolerance, most):
     """
     energy, smallest = equilibrium.potential(system, q, work[0])
     status, iterations = equilibrium.CONVERGED, 0
-    least = _response(system.tip, SLIGHT * system.tip.radius)
-    size = max(math.sqrt(np.dot(q, q)), _response(system.tip, depth), least)
+    least = _response(tip, SLIGHT * tip.radius)
+    size = max(math.sqrt(np.dot(q, q)), _response(tip, depth), least)
     while True:
         status, more, energy, smallest = descend(
             system, q, work, energy, smallest, tolerance * size, 0.0, most, False, ROUND_OFF
@@ -479,7 +480,7 @@ def _settle(system, q, work, depth, tolerance, most):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _system(models, k, slot, memory, scratch):
+def tip_system(models, k, slot, memory, scratch):
     """Local model k under the tip at ``scratch.position``, by reference."""
     nodes = slice(models.node_from[k], models.node_from[k + 1])
     faces = slice(models.face_from[k], models.face_from[k + 1])
@@ -522,7 +523,8 @@ def _system(models, k, slot, memory, scratch):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _guess(models, k, x, depth, features, q):
+def first_guess(models, k, x, depth, features, q):
+    """First guess of model k with the tip at x so deep, by what was trained, into q (m,)."""
     tip_features(models.frames[k], models.centres[:, k], x, max(depth, 0.0), features)
     q[:] = 0.0
     for f in range(TIP_FEATURES):
@@ -563,8 +565,8 @@ def _take_over(models, k, x, memory, scratch, q):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _settle_on_the_way(system, q, work, depth, normal):
-    """As ``_settle``, from rest along the way in, for where a jump fails."""
+def settle_on_the_way(system, tip, q, work, depth, normal):
+    """As ``settle``, from rest along the way in, for where a jump fails."""
     at = system.x
     away = depth * normal
     at += away
@@ -573,8 +575,8 @@ def _settle_on_the_way(system, q, work, depth, normal):
     for _ in range(RAMP):
         if status == equilibrium.CONVERGED:
             at -= away / RAMP
-            status, more, energy, smallest = _settle(
-                system, q, work, depth, TOLERANCE, MAX_ITERATIONS
+            status, more, energy, smallest = settle(
+                system, tip, q, work, depth, TOLERANCE, MAX_ITERATIONS
             )
             iterations += more
     return status, iterations, energy, smallest
@@ -589,24 +591,24 @@ def _solve(models, k, slot, x, normal, depth, most, memory, scratch, outcome):
     else:
         memory.formed[slot] = np.inf
         if not _take_over(models, k, x, memory, scratch, q):
-            _guess(models, k, x, depth, scratch.features, q)
+            first_guess(models, k, x, depth, scratch.features, q)
     scratch.position[:] = x
     scratch.latest[:] = np.inf
-    system = _system(models, k, slot, memory, scratch)
+    system = tip_system(models, k, slot, memory, scratch)
     tolerance = TOLERANCE / max(outcome.weight[slot], LEAST_SHARE)
-    status, iterations, energy, smallest = _settle(
-        system, q, scratch.newton, depth, tolerance, most
+    status, iterations, energy, smallest = settle(
+        system, models.tip, q, scratch.newton, depth, tolerance, most
     )
     if status != equilibrium.CONVERGED and depth > 0.0 and most == MAX_ITERATIONS:
-        status, more, energy, smallest = _settle_on_the_way(
-            system, q, scratch.newton, depth, normal
+        status, more, energy, smallest = settle_on_the_way(
+            system, models.tip, q, scratch.newton, depth, normal
         )
         iterations += more
     if status == equilibrium.CONVERGED and not equilibrium.factorise(system, q, 0.0):
         status = equilibrium.STALLED  # a saddle
     if status == equilibrium.CONVERGED:
         coupling, force = scratch.coupling[slot], outcome.forces[slot]
-        _react(system, coupling, force, outcome.tangents[slot])
+        react(system, coupling, force, outcome.tangents[slot])
         residual, step = scratch.newton[0], scratch.newton[1]
         equilibrium.correct(system, residual, step)
         energy += 0.5 * np.dot(residual, step)
@@ -644,7 +646,7 @@ def _remember(memory, scratch, outcome, x):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _react(system, coupling, force, tangent):
+def react(system, coupling, force, tangent):
     """Force, its derivative and B of an equilibrium whose tangent has just been factorised."""
     touching, modes = system.touching, system.modes
     count = touching.touched[0]
@@ -668,7 +670,7 @@ def _react(system, coupling, force, tangent):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _weight_gradients(models, outcome, x, scratch):
+def weight_gradients(models, outcome, x, scratch):
     """Gradients of the weights in the tip's position, into ``scratch.fade``."""
     fade, centres, weight = scratch.fade, models.centres, outcome.weight
     fade[:] = 0.0
@@ -728,7 +730,7 @@ def query(solver, x, most):
         return
     outcome.patch[:] = memory.patch
     activate(models, x, outcome, scratch.distance, outcome.weight)
-    _weight_gradients(models, outcome, x, scratch)
+    weight_gradients(models, outcome, x, scratch)
     for slot in range(MAX_ACTIVE):
         if outcome.weight[slot] > 0.0:
             k = outcome.patch[slot]
@@ -913,7 +915,7 @@ class Touch(NamedTuple):
     penetration : float, mm
         How far at most the tip overlaps the deformed surface.
     energy : float, mN mm
-        Stored in tissue and contact.
+        Stored in tissue and contact; of tissue that remembers, the potential of its last step.
     converged : bool
     iterations : int
     in_range : bool
@@ -930,6 +932,10 @@ class Touch(NamedTuple):
         Active patches: number, weight, answer (m,) in the patch's modes under
         the tip; see ``Atlas.displacement``.
     solve_seconds : float
+    time : float, s
+        Since rest, of tissue that remembers.
+    active : tuple of (int, float, Local)
+        Of such tissue, the active patches with all that they remember.
     """
 
     position: Array
@@ -953,6 +959,8 @@ class Touch(NamedTuple):
     features: Array
     patches: tuple[tuple[int, float, Array], ...]
     solve_seconds: float
+    time: float = 0.0
+    active: tuple[tuple[int, float, Local], ...] = ()
 
 
 def answer(state: TipState, position: Array, started: float, most: int = MAX_ITERATIONS) -> Touch:

@@ -37,6 +37,7 @@ namespace Palpate
         InRange = 4,
         Clamped = 8,
         Fallback = 16,
+        Stalled = 32,
     }
 
     [StructLayout(LayoutKind.Explicit, Size = 40)]

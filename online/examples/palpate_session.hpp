@@ -38,6 +38,7 @@ enum Flag : std::uint16_t {
     in_range = 4,
     clamped = 8,
     fallback = 16,
+    stalled = 32,
 };
 
 struct Request {

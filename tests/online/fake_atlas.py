@@ -2,6 +2,7 @@
 
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -46,6 +47,7 @@ class FakeAtlas:
     stride = np.inf
     snap = 0
     tips: object | None = "a bed of springs"
+    models = SimpleNamespace(viscous=None)
 
     def __init__(
         self, name: str = "toy", divisions: int = 10, collapse: float = 40.0, poison: bool = False

@@ -1,0 +1,262 @@
+"""The reduced against the full model over histories of the rigid tip it has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from offline.histories import Hand, Press, random_course
+from offline.norms import relative, statistics
+from offline.touches import OTHER_EQUILIBRIUM, QUANTITIES
+from offline.validate import UNSEEN, calibrate, coverage, write_rows
+from offline.workers import completed, worker_pool
+from offline.workshop import Workshop, open_artifact
+from shared.artifact import read_artifact
+from shared.atlas import Atlas, Estimator
+from shared.endoscope import TIP_DEPTH
+from shared.errors import PalpateError, QueryError
+from shared.scene import Scene
+from shared.surface import Surface
+from shared.tip_history import TipHistory
+from shared.touch import Touch
+
+Array = NDArray[np.float64]
+
+OFF = 0.05
+"""Millimetres between the surface at rest and a tip that does not press."""
+
+COVERAGE, DAMPING = 0.97, 30.0
+"""Of the error estimate: moments of one history err alike, so that few errors are known."""
+
+
+class Course(NamedTuple):
+    """Positions of the tip at the ends of time steps."""
+
+    positions: Array  # (t, 3) mm
+    times: list[float]  # (t,) s, lengths of the steps
+
+
+class _TipHand(Hand):
+    """A rigid tip instead of a footprint: a press says where its centre is."""
+
+    def _press(self, dt: float) -> Press:
+        depth = self._level * self._limits[TIP_DEPTH] if self._level > 0.0 else -OFF
+        centre = self._x + (self._endoscope.radius - depth) * self._normal
+        return Press(dt, centre, -self._normal, 0.0)
+
+
+def random_courses(
+    surface: Surface, limits: Array, scene: Scene, count: int, rng: np.random.Generator
+) -> list[Course]:
+    """Ramps, holds, releases, taps and slides; one course in eight begins on the rim."""
+    courses = []
+    for number in range(count):
+        hand = _TipHand(surface, limits, scene, rng, rim=number % 8 == 0)
+        presses = random_course(hand)
+        courses.append(Course(np.array([p.position for p in presses]), [p.dt for p in presses]))
+    return courses
+
+
+def play_course(atlas: Atlas, course: Course) -> list[Touch]:
+    """Answers of the reduced model."""
+    history, answers = TipHistory(), []
+    for position, dt in zip(*course, strict=True):
+        answer, history = atlas.touch_step(history, dt, position)
+        answers.append(answer)
+    return answers
+
+
+@dataclass
+class Moment:
+    """A history until one of its moments, answered by both models.
+
+    Attributes
+    ----------
+    displacement, von_mises, force : float
+        Largest errors until then over all nodes, over all nodes outside the clamped layer, and of
+        the force, relative to the largest norms until then.
+    converged : bool
+    features : ndarray
+    estimated_displacement, estimated_von_mises, estimated_force : float
+    """
+
+    displacement: float
+    von_mises: float
+    force: float
+    converged: bool
+    features: Array = field(repr=False)
+    estimated_displacement: float = float("nan")
+    estimated_von_mises: float = float("nan")
+    estimated_force: float = float("nan")
+
+    @property
+    def typical(self) -> bool:
+        """Whether it counts for the error estimate: both models rest in the same equilibrium."""
+        return self.converged and self.displacement <= OTHER_EQUILIBRIUM
+
+    @property
+    def covered(self) -> bool:
+        """Whether all three errors are within their estimates."""
+        return all(getattr(self, n) <= getattr(self, f"estimated_{n}") for n in QUANTITIES)
+
+    def estimate(self, estimator: Estimator) -> None:
+        """Fill in the estimated errors."""
+        self.estimated_displacement, self.estimated_von_mises, self.estimated_force = estimator(
+            self.features
+        )
+
+
+@dataclass
+class CourseComparison:
+    """One history answered by both models.
+
+    Attributes
+    ----------
+    steps : int
+    seconds : float
+    travel : float, mm
+        Of the tip.
+    displacement, von_mises, force : float
+        Relative L2 errors over all nodes (outside the clamped layer) and all moments.
+    worst_displacement, worst_von_mises, worst_force : float
+        Largest error of a moment, over the largest norm until then.
+    unconverged : int
+    moments : list of Moment
+    """
+
+    steps: int
+    seconds: float
+    travel: float
+    displacement: float
+    von_mises: float
+    force: float
+    worst_displacement: float
+    worst_von_mises: float
+    worst_force: float
+    unconverged: int
+    moments: list[Moment] = field(repr=False)
+
+    @property
+    def typical(self) -> bool:
+        """Whether both models rest in the same equilibria."""
+        return self.displacement <= OTHER_EQUILIBRIUM
+
+
+def compare_course(
+    workshop: Workshop, atlas: Atlas, course: Course, full: Sequence[NDArray[Any]]
+) -> CourseComparison:
+    """Answer a history with the reduced model and compare with full solutions (t, ...)."""
+    answers = play_course(atlas, course)
+    kept = workshop.beyond_clamped_layer
+    u = np.array([atlas.displacement(answer) for answer in answers], float)
+    s = np.array([atlas.von_mises(answer) for answer in answers], float)[:, kept]
+    f = np.array([answer.force for answer in answers])
+    pairs = list(zip((u, s, f), (full[0], full[1][:, kept], full[2]), strict=True))
+    errors = np.array([_moments(a, b) for a, b in pairs])
+    overall = [relative(a, b.astype(float)) for a, b in pairs]
+    worst = errors.max(axis=1).tolist()
+    return CourseComparison(
+        steps=len(answers),
+        seconds=float(sum(course.times)),
+        travel=float(np.linalg.norm(np.diff(course.positions, axis=0), axis=1).sum()),
+        displacement=overall[0],
+        von_mises=overall[1],
+        force=overall[2],
+        worst_displacement=worst[0],
+        worst_von_mises=worst[1],
+        worst_force=worst[2],
+        unconverged=sum(not answer.converged for answer in answers),
+        moments=[
+            Moment(
+                displacement=own[0],
+                von_mises=own[1],
+                force=own[2],
+                converged=answer.converged,
+                features=answer.features,
+                estimated_displacement=answer.error_displacement,
+                estimated_von_mises=answer.error_von_mises,
+                estimated_force=answer.error_force,
+            )
+            for own, answer in zip(errors.T.tolist(), answers, strict=True)
+        ],
+    )
+
+
+def _moments(a: Array, b: Array) -> Array:
+    """Largest errors (t,) of fields a (t, ...) until each moment, over the largest norm of b."""
+    away, size = (
+        np.maximum.accumulate(np.linalg.norm(x.reshape(len(x), -1), axis=1)) for x in (a - b, b)
+    )
+    return np.asarray(away / np.maximum(size, 1e-9 * max(float(size[-1]), 1e-300)))
+
+
+def calibrate_courses(rows: Sequence[CourseComparison]) -> Estimator:
+    """Fit the error estimate of histories of the tip to known errors."""
+    moments = [moment for row in rows for moment in row.moments]
+    return calibrate(moments, QUANTITIES, COVERAGE, DAMPING)
+
+
+def validate_courses(
+    artifact: Path, count: int, seed: int, csv: Path | None = None
+) -> dict[str, Any]:
+    """Compare an artifact with its full model over new random histories of the rigid tip.
+
+    Parameters
+    ----------
+    artifact : Path
+    count : int
+        Histories, over the whole surface and range of depths; one in eight begins on the rim.
+    seed : int
+    csv : Path, optional
+        Where to write one row per history.
+
+    Returns
+    -------
+    dict
+        As ``summarise_courses``, and ``without_equilibrium``: histories that the full model could
+        not follow, and which count in nothing else.
+    """
+    atlas = Atlas.load(artifact)
+    if atlas.models.viscous_tips is None:
+        raise QueryError("histories", f"scene {atlas.name!r} has no tip that knows of time")
+    workshop = Workshop.of_artifact(read_artifact(artifact))
+    rng = np.random.default_rng([atlas.scene.seed, UNSEEN, seed])
+    courses = random_courses(atlas.surface, atlas.limits, atlas.scene, count, rng)
+    tasks = {str(i): (Workshop.follow_tip, *course) for i, course in enumerate(courses)}
+    rows = {}
+    with worker_pool(open_artifact, artifact) as pool:
+        for name, found in tqdm(completed(pool, tasks), "full solutions", len(tasks)):
+            if found is not None:
+                rows[int(name)] = compare_course(workshop, atlas, courses[int(name)], found)
+    compared = [rows[i] for i in sorted(rows)]
+    if not compared:
+        raise PalpateError(f"{artifact}: the full model could follow none of the histories")
+    if csv:
+        csv.parent.mkdir(parents=True, exist_ok=True)
+        write_rows(csv, compared)
+    return summarise_courses(compared) | {"without_equilibrium": count - len(compared)}
+
+
+def summarise_courses(rows: Sequence[CourseComparison]) -> dict[str, Any]:
+    """Statistics over histories, those left out in which the models part.
+
+    ``covered``: the share of all converged moments that are within their three estimates.
+    """
+    moments = [moment for row in rows for moment in row.moments if moment.converged]
+    covered, ratios = coverage(moments, QUANTITIES)
+    typical = [row for row in rows if row.typical]
+    names = [*QUANTITIES, *(f"worst_{name}" for name in QUANTITIES)]
+    return {
+        "histories": len(rows),
+        "steps": sum(row.steps for row in rows),
+        "unconverged": sum(row.unconverged for row in rows),
+        "other_equilibrium": len(rows) - len(typical),
+        "covered": covered,
+        "estimate_over_error_median": ratios,
+    } | {name: statistics([getattr(row, name) for row in typical]) for name in names}

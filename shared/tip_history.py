@@ -1,0 +1,257 @@
+"""Histories of visco-elastic tissue under the rigid tip, and their steps.
+
+See ``shared.touch_history`` for the theory.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared import equilibrium
+from shared.bound import Bound, bind
+from shared.errors import QueryError
+from shared.history import Carrier, History, Local, ViscousModels
+from shared.touch import (
+    BESIDE,
+    DEPTH,
+    ENERGY,
+    ITERATIONS,
+    MAX_ITERATIONS,
+    PENETRATION,
+    SKIN,
+    SMALLEST_J,
+    TOUCHED,
+    TipState,
+    Touch,
+)
+from shared.touch_history import (
+    SHAPE,
+    TipMemory,
+    conclude,
+    new_memory,
+    new_scratch,
+    place_tip,
+    recall_tip_points,
+    step_tip,
+)
+from shared.viscosity import Weights
+
+Array = NDArray[np.float64]
+Field = NDArray[np.float32]
+
+HISTORY_FEATURES = 9
+"""Of the error estimate; see ``_features``."""
+
+
+@dataclass(frozen=True)
+class TipHistory(History):
+    """All that the tissue remembers of the tip; see ``shared.history.History``.
+
+    Attributes
+    ----------
+    position : ndarray, shape (3,), mm, or None
+        Where the tip was over the surface last: models about it answer when it is off.
+    share : float
+        Largest depth so far, over its limit there.
+    force : float, mN
+        Largest so far.
+    travel : float, mm
+        Of the tip over the surface.
+    smallest : float
+        Smallest det F so far.
+    """
+
+    share: float = 0.0
+    force: float = 0.0
+    travel: float = 0.0
+    smallest: float = 1.0
+
+
+class TipStepper(Carrier):
+    """Moves the tip over patches, step by step.
+
+    Parameters
+    ----------
+    solver : Bound of shared.touch.TipSolver
+    models, prony, points
+        See ``shared.history.Carrier``.
+    """
+
+    def __init__(
+        self,
+        solver: Bound,
+        models: ViscousModels,
+        prony: Sequence[tuple[float, float]],
+        points: int,
+    ) -> None:
+        super().__init__(models, prony, points)
+        self._solver = solver
+        self._scratch = new_scratch(self.modes, points)
+        self._bound = bind(self._scratch)
+
+    def press(
+        self,
+        history: TipHistory,
+        active: Sequence[tuple[int, int]],
+        position: Array,
+        weights: Weights,
+        most: int,
+    ) -> dict[int, Local] | None:
+        """Step patches (slot and number) where ``place_tip`` has found; None without an answer."""
+        found: dict[int, Local] = {}
+        for slot, k in active:
+            local = history.locals.get(k) or self.follow(history, k)
+            memory = TipMemory(*[part.copy() for part in local.memory])
+            status = step_tip(
+                self._solver, slot, position, self._models.deviatoric[k], weights, most,
+                memory, self._bound,
+            )  # fmt: skip
+            if status != equilibrium.CONVERGED:
+                return None
+            found[k] = Local(memory, local.remains)
+        return found
+
+    def conclude(self, position: Array) -> float:
+        """Write where the force acts on the tip; return its size, mN."""
+        size: float = conclude(self._solver, position)
+        return size
+
+    def _new_memory(self) -> TipMemory:
+        return new_memory(len(self._tau), self.modes, self._points)
+
+    def _take_over(self, k: int, new: Any, old: Any, overlap: Field | None) -> None:
+        new.known[0] = SHAPE
+        recall_tip_points(self._solver, k, new, self._bound)
+
+
+def step(
+    state: TipState,
+    stepper: TipStepper,
+    history: TipHistory,
+    dt: float,
+    weights: Weights,
+    position: Array,
+    coefficients: Array,
+    started: float,
+    most: int = MAX_ITERATIONS,
+) -> tuple[Touch, TipHistory]:
+    """Answer a finite position of the tip ``dt`` (s) after the end of a history.
+
+    Parameters
+    ----------
+    state : TipState
+        Working memory; it keeps nothing from step to step.
+    stepper : TipStepper
+    history : TipHistory
+        Not changed.
+    dt : float, s
+    weights : Weights
+        Of ``dt``.
+    position : ndarray, shape (3,), mm
+    coefficients : ndarray, shape (3, HISTORY_FEATURES)
+        Of the error estimate: displacement, von Mises stress, force.
+    started : float, s
+        When the clock began to run.
+    most : int
+        Iterations in one local model; see ``shared.touch.query``.
+
+    Returns
+    -------
+    touch : Touch
+        Its estimated errors are the largest until now of displacement, stress and force, relative
+        to the largest of these until now.
+    history : TipHistory
+        To go on from; the old one if the answer did not converge.
+
+    Raises
+    ------
+    QueryError
+        If the tip's centre lies below the surface.
+    """
+    last = position if history.position is None else history.position
+    place_tip(state.bound, position, last)
+    outcome, radius = state.outcome, state.radius
+    scalars, limit = outcome.scalars, outcome.limit.item()
+    depth = scalars.item(DEPTH)
+    if depth > radius:
+        raise QueryError(
+            "position",
+            f"the tip's centre lies {depth - radius:.2f} mm below the accessible surface",
+        )
+    off = depth < -SKIN * radius
+    active: list[tuple[int, int]] = []
+    shares = outcome.weight.tolist()
+    if not (off and history.main < 0):
+        numbers = state.outcome.patch.tolist()
+        active = [(slot, -2 - numbers[slot]) for slot, share in enumerate(shares) if share > 0.0]
+    found = stepper.press(history, active, position, weights, most)
+    converged = found is not None
+    if not converged:  # not even in part
+        outcome.force[:] = 0.0
+        outcome.tangent[:] = 0.0
+    pushed = stepper.conclude(position)
+    after = TipHistory(
+        time=history.time + dt,
+        locals=found or {},
+        main=max(active, key=lambda pair: shares[pair[0]])[1] if active else -1,
+        position=history.position if off else position,
+        share=max(history.share, depth / limit),
+        force=max(history.force, pushed),
+        travel=history.travel + (0.0 if off else math.dist(position, last)),
+        smallest=min(history.smallest, scalars.item(SMALLEST_J)),
+    )
+    features = _features(outcome.upward, after)
+    errors = np.exp(coefficients @ features).tolist()
+    contact = scalars.item(TOUCHED) > 0
+    out_of_range: tuple[str, ...] = ()
+    if contact and scalars.item(BESIDE):
+        out_of_range += ("position",)
+    if depth > limit * (1 + 1e-9):
+        out_of_range += ("depth",)
+    parts = tuple((k, shares[slot], found[k]) for slot, k in active) if found else ()
+    touch = Touch(
+        position=position,
+        contact=contact,
+        force=outcome.force.copy(),
+        tangent=outcome.tangent.copy(),
+        contact_point=outcome.point.copy(),
+        normal=outcome.normal.copy(),
+        depth=depth,
+        depth_limit=limit,
+        penetration=scalars.item(PENETRATION),
+        energy=scalars.item(ENERGY),
+        converged=converged,
+        iterations=int(scalars.item(ITERATIONS)),
+        in_range=not out_of_range,
+        out_of_range=out_of_range,
+        error_displacement=errors[0],
+        error_von_mises=errors[1],
+        error_force=errors[2],
+        min_jacobian=scalars.item(SMALLEST_J),
+        features=features,
+        patches=tuple((k, share, local.memory.wide) for k, share, local in parts),
+        solve_seconds=time.perf_counter() - started,
+        time=after.time,
+        active=parts,
+    )
+    return touch, after if converged else history
+
+
+def _features(upward: Array, history: TipHistory) -> Array:
+    """What the error estimate is made of: ``log error = c . features``.
+
+    1; the largest share of the limit so far and its log; smallest det F so far; the normal (where
+    on the body); the way over the surface; the log of the largest force over the largest share.
+    """
+    share = max(history.share, 1e-6)
+    return np.array([
+        1.0, share, math.log(share), history.smallest, *upward.tolist(),
+        math.log1p(history.travel), math.log(max(history.force / share, 1e-6)),
+    ])  # fmt: skip
