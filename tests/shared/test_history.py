@@ -96,7 +96,8 @@ def one_patch(atlas, prony, workshop, middle):
                     "centres",
                     "frames",
                     "pressures",
-                    "modes",
+                    "whole",
+                    "mix",
                     "path",
                     "defect",
                     "guess",
@@ -137,7 +138,7 @@ def test_with_every_point_a_step_is_an_equilibrium_of_the_full_model(one_patch, 
         elastic = patch.modes.T @ force
         assembly.viscous_residual(*args, model.mu, past, u, force)
         residual = patch.modes.T @ force - load
-        # modes, their gradients and D are stored in 16 bits
+        # gradients of the modes are stored in 16 bits
         assert np.linalg.norm(residual) <= 4 * ACCURATE * np.linalg.norm(elastic)
         assembly.advance(model.connectivity, model.gradients, u, weights, history)
 
