@@ -1,6 +1,7 @@
 """Load tests of a toy service on a real socket."""
 
 import json
+import re
 
 import pytest
 from click.testing import CliRunner
@@ -73,5 +74,9 @@ def test_the_command_prints_a_table(url):
     arguments = [url, "toy", "--rate", "50", "--queries-per-second", "50", "--duration", "0.5"]
     outputs = ["--output", "displacement", "--output", "half"]
     result = CliRunner().invoke(loadtest, [*arguments, *outputs])
-    assert "| frames, all windows | 25 | 0 | 0 |" in result.output
-    assert "| queries, all windows | 25 | 0 | 0 |" in result.output
+    for kind in ("frames", "queries"):
+        row = re.search(rf"\| {kind}, all windows \| (\d+) \| (\d+) \| (\d+) \|", result.output)
+        assert row, result.output
+        answered, lost, superseded = map(int, row.groups())
+        assert lost == 0
+        assert answered + superseded == 25  # a busy machine may send some late, in a bunch
