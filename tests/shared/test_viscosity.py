@@ -10,6 +10,8 @@ from scipy.integrate import solve_ivp
 
 from shared import tissue, viscosity
 
+from .differences import central_difference
+
 MU, LAM = tissue.lame(15.0, 0.45)
 PRONY = ((0.3, 0.1), (0.2, 1.0))
 SHARE, TAU = np.array(PRONY).T
@@ -49,19 +51,6 @@ def go(history, F, dt, prony=PRONY):
     viscosity.driving(F.ravel(), np.empty(9), m)
     viscosity.advance(history, m, viscosity.step_weights(prony, dt))
     return answer(F, B)
-
-
-def central_difference(function, at, step=1e-3):
-    """Derivative of ``function`` with respect to the entries of ``at``, last axis; fourth order."""
-    columns = []
-    for i in range(at.size):
-        shift = np.zeros(at.size)
-        shift[i] = step
-        shift = shift.reshape(at.shape)
-        near = function(at + shift) - function(at - shift)
-        far = function(at + 2 * shift) - function(at - 2 * shift)
-        columns.append((8 * near - far) / (12 * step))
-    return np.stack(columns, axis=-1)
 
 
 def elastic_isochoric(F):
