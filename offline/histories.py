@@ -9,22 +9,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from offline.norms import relative, statistics
 from offline.sampling import cone, random_points, tangents
-from offline.validate import UNSEEN, write_rows
-from offline.workers import completed, worker_pool
-from offline.workshop import Load, Workshop, open_artifact
+from offline.validate import UNSEEN, judged
+from offline.workshop import Load, Workshop
 from shared.artifact import read_artifact
 from shared.atlas import Atlas
 from shared.endoscope import pressure_limit
-from shared.errors import PalpateError, QueryError
+from shared.errors import QueryError
 from shared.history import History, Moment
 from shared.scene import Scene
 from shared.surface import Surface
 
 Array = NDArray[np.float64]
+
+NONE_FOLLOWED = "the full model could follow none of the histories"
 
 SEGMENTS = 4
 """Movements in a history."""
@@ -246,25 +246,19 @@ def validate_histories(
     workshop = Workshop.of_artifact(read_artifact(artifact))
     rng = np.random.default_rng([atlas.scene.seed, UNSEEN, seed])
     histories = [random_history(atlas, rng, rim=i % 8 == 0) for i in range(count)]
-    tasks = {
-        str(i): (
+
+    def judge(i: int, found: tuple[Array, Array] | None) -> HistoryComparison | None:
+        return None if found is None else compare_history(workshop, atlas, histories[i], *found)
+
+    tasks = [
+        (
             Workshop.follow,
             [Load(p.position, p.direction, p.pressure) for p in presses],
             [p.dt for p in presses],
         )
-        for i, presses in enumerate(histories)
-    }
-    rows = {}
-    with worker_pool(open_artifact, artifact) as pool:
-        for name, found in tqdm(completed(pool, tasks), "full solutions", len(tasks)):
-            if found is not None:
-                rows[int(name)] = compare_history(workshop, atlas, histories[int(name)], *found)
-    compared = [rows[i] for i in sorted(rows)]
-    if not compared:
-        raise PalpateError(f"{artifact}: the full model could follow none of the histories")
-    if csv:
-        csv.parent.mkdir(parents=True, exist_ok=True)
-        write_rows(csv, compared)
+        for presses in histories
+    ]
+    compared = judged(artifact, tasks, judge, NONE_FOLLOWED, csv)
     return summarise_histories(compared) | {"without_equilibrium": count - len(compared)}
 
 

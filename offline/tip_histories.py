@@ -9,18 +9,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
-from offline.histories import Hand, Press, random_course
+from offline.histories import NONE_FOLLOWED, Hand, Press, random_course
 from offline.norms import relative, statistics
 from offline.touches import OTHER_EQUILIBRIUM, QUANTITIES
-from offline.validate import UNSEEN, calibrate, coverage, write_rows
-from offline.workers import completed, worker_pool
-from offline.workshop import Workshop, open_artifact
+from offline.validate import UNSEEN, calibrate, coverage, judged
+from offline.workshop import Workshop
 from shared.artifact import read_artifact
 from shared.atlas import Atlas, Estimator
 from shared.endoscope import TIP_DEPTH
-from shared.errors import PalpateError, QueryError
+from shared.errors import QueryError
 from shared.scene import Scene
 from shared.surface import Surface
 from shared.tip_history import TipHistory
@@ -228,18 +226,12 @@ def validate_courses(
     workshop = Workshop.of_artifact(read_artifact(artifact))
     rng = np.random.default_rng([atlas.scene.seed, UNSEEN, seed])
     courses = random_courses(atlas.surface, atlas.limits, atlas.scene, count, rng)
-    tasks = {str(i): (Workshop.follow_tip, *course) for i, course in enumerate(courses)}
-    rows = {}
-    with worker_pool(open_artifact, artifact) as pool:
-        for name, found in tqdm(completed(pool, tasks), "full solutions", len(tasks)):
-            if found is not None:
-                rows[int(name)] = compare_course(workshop, atlas, courses[int(name)], found)
-    compared = [rows[i] for i in sorted(rows)]
-    if not compared:
-        raise PalpateError(f"{artifact}: the full model could follow none of the histories")
-    if csv:
-        csv.parent.mkdir(parents=True, exist_ok=True)
-        write_rows(csv, compared)
+
+    def judge(i: int, found: Sequence[NDArray[Any]] | None) -> CourseComparison | None:
+        return None if found is None else compare_course(workshop, atlas, courses[i], found)
+
+    tasks = [(Workshop.follow_tip, *course) for course in courses]
+    compared = judged(artifact, tasks, judge, NONE_FOLLOWED, csv)
     return summarise_courses(compared) | {"without_equilibrium": count - len(compared)}
 
 

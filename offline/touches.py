@@ -14,13 +14,11 @@ from tqdm import tqdm
 from offline.cubature import damped_fit
 from offline.norms import relative, statistics
 from offline.sampling import random_points_and_rim
-from offline.validate import UNSEEN, calibrate, coverage, write_rows
-from offline.workers import completed, worker_pool
-from offline.workshop import TouchSample, Workshop, open_artifact
+from offline.validate import UNSEEN, calibrate, coverage, judged
+from offline.workshop import TouchSample, Workshop
 from shared.artifact import read_artifact
 from shared.atlas import Atlas, Estimator
 from shared.endoscope import TIP_DEPTH
-from shared.errors import PalpateError
 from shared.reduced import RESIDUAL_FEATURES, residual_features
 from shared.scene import Scene
 from shared.surface import Surface
@@ -235,19 +233,12 @@ def validate_touches(
     rng = np.random.default_rng([atlas.scene.seed, UNSEEN, seed])
     positions = random_positions(atlas.surface, atlas.limits, atlas.scene, queries, rng)
     answers = [atlas.touch(position) for position in positions]
-    tasks = {
-        str(i): (Workshop.touch, answer.position, atlas.displacement(answer))
-        for i, answer in enumerate(answers)
-    }
-    rows = {}
-    with worker_pool(open_artifact, artifact) as pool:
-        for name, sample in tqdm(completed(pool, tasks), "full solutions", len(tasks)):
-            if sample.displacement.size:
-                rows[int(name)] = compare_touch(workshop, atlas, answers[int(name)], sample)
-    compared = [rows[i] for i in sorted(rows)]
-    if not compared:
-        raise PalpateError(f"{artifact}: the full model has no equilibrium at any position")
-    if csv:
-        csv.parent.mkdir(parents=True, exist_ok=True)
-        write_rows(csv, compared)
+
+    def judge(i: int, sample: TouchSample) -> TouchComparison | None:
+        known = sample.displacement.size > 0
+        return compare_touch(workshop, atlas, answers[i], sample) if known else None
+
+    tasks = [(Workshop.touch, answer.position, atlas.displacement(answer)) for answer in answers]
+    nothing = "the full model has no equilibrium at any position"
+    compared = judged(artifact, tasks, judge, nothing, csv)
     return summarise_touches(compared) | {"without_equilibrium": queries - len(compared)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv as csv_format
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -124,19 +124,46 @@ def validate(artifact: Path, queries: int, seed: int, csv: Path | None = None) -
     atlas = Atlas.load(artifact)
     workshop = Workshop.of_artifact(read_artifact(artifact))
     loads = unseen_loads(atlas, queries, seed)
-    tasks = {str(i): (Workshop.sample, load) for i, load in enumerate(loads)}
+
+    def judge(i: int, reference: Array | None) -> Comparison | None:
+        return None if reference is None else compare(workshop, atlas, loads[i], reference)
+
+    tasks = [(Workshop.sample, load) for load in loads]
+    nothing = "the full model has no equilibrium under any of the loads"
+    compared = judged(artifact, tasks, judge, nothing, csv)
+    return summarise(compared) | {"without_equilibrium": queries - len(compared)}
+
+
+def judged(
+    artifact: Path,
+    tasks: Sequence[tuple[Any, ...]],
+    judge: Callable[[int, Any], Any | None],
+    nothing: str,
+    csv: Path | None,
+) -> list[Any]:
+    """What ``judge`` makes of the full model's result of each task (its number comes first).
+
+    None, where the full model has no answer, is left out; ``csv`` gets a row of each other.
+
+    Raises
+    ------
+    PalpateError
+        If all are; ``nothing`` is what it says then.
+    """
+    numbered = {str(i): task for i, task in enumerate(tasks)}
     rows = {}
     with worker_pool(open_artifact, artifact) as pool:
-        for name, reference in tqdm(completed(pool, tasks), "full solutions", len(tasks)):
-            if reference is not None:
-                rows[int(name)] = compare(workshop, atlas, loads[int(name)], reference)
-    compared = [rows[i] for i in sorted(rows)]
-    if not compared:
-        raise PalpateError(f"{artifact}: the full model has no equilibrium under any of the loads")
+        for name, found in tqdm(completed(pool, numbered), "full solutions", len(numbered)):
+            row = judge(int(name), found)
+            if row is not None:
+                rows[int(name)] = row
+    if not rows:
+        raise PalpateError(f"{artifact}: {nothing}")
+    ordered = [rows[i] for i in sorted(rows)]
     if csv:
         csv.parent.mkdir(parents=True, exist_ok=True)
-        write_rows(csv, compared)
-    return summarise(compared) | {"without_equilibrium": queries - len(compared)}
+        write_rows(csv, ordered)
+    return ordered
 
 
 def unseen_loads(atlas: Atlas, count: int, seed: int) -> list[Load]:
