@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from offline.moments import KnownMoment, covered_moments, errors_so_far, known_moments
 from offline.norms import relative, statistics
 from offline.sampling import cone, random_points, tangents
-from offline.validate import UNSEEN, judged
+from offline.validate import ESTIMATED, UNSEEN, judged
 from offline.workshop import Load, Workshop
 from shared.artifact import read_artifact
-from shared.atlas import Atlas
+from shared.atlas import Atlas, Estimator
 from shared.endoscope import pressure_limit
 from shared.errors import QueryError
 from shared.history import History, Moment
@@ -51,6 +52,16 @@ def random_history(atlas: Atlas, rng: np.random.Generator, rim: bool) -> list[Pr
         Whether to begin on the rim of the surface.
     """
     return random_course(Hand(atlas.surface, atlas.limits, atlas.scene, rng, rim))
+
+
+def random_histories(atlas: Atlas, count: int, rng: np.random.Generator) -> list[list[Press]]:
+    """Histories over the whole surface and range of loads; one in eight begins on the rim."""
+    return [random_history(atlas, rng, rim=i % 8 == 0) for i in range(count)]
+
+
+def loads_of(presses: Sequence[Press]) -> tuple[list[Load], list[float]]:
+    """What ``Workshop.follow`` is told of a history."""
+    return [Load(p.position, p.direction, p.pressure) for p in presses], [p.dt for p in presses]
 
 
 def random_course(hand: Hand) -> list[Press]:
@@ -161,6 +172,7 @@ class HistoryComparison:
     last_displacement : float
         Error of the last moment over the largest norm.
     unconverged : int
+    moments : list of KnownMoment
     """
 
     steps: int
@@ -173,6 +185,12 @@ class HistoryComparison:
     worst_von_mises: float
     last_displacement: float
     unconverged: int
+    moments: list[KnownMoment] = field(repr=False)
+
+    def estimate(self, estimator: Estimator) -> None:
+        """Fill in the estimated errors of its moments."""
+        for moment in self.moments:
+            moment.estimate(estimator)
 
 
 def play(atlas: Atlas, presses: Sequence[Press]) -> list[Moment]:
@@ -217,6 +235,7 @@ def compare_history(
         worst_von_mises=float(off.max() / sizes[1]),
         last_displacement=float(away[-1] / sizes[0]),
         unconverged=sum(not moment.converged for moment in moments),
+        moments=known_moments(errors_so_far(((u, U), (s, S))), moments),
     )
 
 
@@ -245,25 +264,21 @@ def validate_histories(
         raise QueryError("histories", f"scene {atlas.name!r} is elastic and has none")
     workshop = Workshop.of_artifact(read_artifact(artifact))
     rng = np.random.default_rng([atlas.scene.seed, UNSEEN, seed])
-    histories = [random_history(atlas, rng, rim=i % 8 == 0) for i in range(count)]
+    histories = random_histories(atlas, count, rng)
 
     def judge(i: int, found: tuple[Array, Array] | None) -> HistoryComparison | None:
         return None if found is None else compare_history(workshop, atlas, histories[i], *found)
 
-    tasks = [
-        (
-            Workshop.follow,
-            [Load(p.position, p.direction, p.pressure) for p in presses],
-            [p.dt for p in presses],
-        )
-        for presses in histories
-    ]
+    tasks = [(Workshop.follow, *loads_of(presses)) for presses in histories]
     compared = judged(artifact, tasks, judge, NONE_FOLLOWED, csv)
     return summarise_histories(compared) | {"without_equilibrium": count - len(compared)}
 
 
 def summarise_histories(rows: Sequence[HistoryComparison]) -> dict[str, Any]:
-    """Statistics over histories."""
+    """Statistics over histories.
+
+    ``covered``: the share of all converged moments that are within both estimates.
+    """
     names = (
         "displacement", "von_mises", "depth", "worst_displacement", "worst_von_mises",
         "last_displacement",
@@ -272,4 +287,5 @@ def summarise_histories(rows: Sequence[HistoryComparison]) -> dict[str, Any]:
         "histories": len(rows),
         "steps": sum(row.steps for row in rows),
         "unconverged": sum(row.unconverged for row in rows),
+        **covered_moments(rows, ESTIMATED),
     } | {name: statistics([getattr(row, name) for row in rows]) for name in names}

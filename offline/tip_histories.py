@@ -11,26 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offline.histories import NONE_FOLLOWED, Hand, Press, random_course
+from offline.moments import KnownMoment, covered_moments, errors_so_far, known_moments
 from offline.norms import relative, statistics
 from offline.touches import OTHER_EQUILIBRIUM, QUANTITIES
-from offline.validate import UNSEEN, calibrate, coverage, judged
+from offline.validate import UNSEEN, judged
 from offline.workshop import Workshop
 from shared.artifact import read_artifact
 from shared.atlas import Atlas, Estimator
 from shared.endoscope import TIP_DEPTH
 from shared.errors import QueryError
+from shared.history import History
 from shared.scene import Scene
 from shared.surface import Surface
-from shared.tip_history import TipHistory
 from shared.touch import Touch
 
 Array = NDArray[np.float64]
 
 OFF = 0.05
 """Millimetres between the surface at rest and a tip that does not press."""
-
-COVERAGE, DAMPING = 0.97, 30.0
-"""Of the error estimate: moments of one history err alike, so that few errors are known."""
 
 
 class Course(NamedTuple):
@@ -63,51 +61,11 @@ def random_courses(
 
 def play_course(atlas: Atlas, course: Course) -> list[Touch]:
     """Answers of the reduced model."""
-    history, answers = TipHistory(), []
+    history, answers = History(), []
     for position, dt in zip(*course, strict=True):
         answer, history = atlas.touch_step(history, dt, position)
         answers.append(answer)
     return answers
-
-
-@dataclass
-class Moment:
-    """A history until one of its moments, answered by both models.
-
-    Attributes
-    ----------
-    displacement, von_mises, force : float
-        Largest errors until then over all nodes, over all nodes outside the clamped layer, and of
-        the force, relative to the largest norms until then.
-    converged : bool
-    features : ndarray
-    estimated_displacement, estimated_von_mises, estimated_force : float
-    """
-
-    displacement: float
-    von_mises: float
-    force: float
-    converged: bool
-    features: Array = field(repr=False)
-    estimated_displacement: float = float("nan")
-    estimated_von_mises: float = float("nan")
-    estimated_force: float = float("nan")
-
-    @property
-    def typical(self) -> bool:
-        """Whether it counts for the error estimate: both models rest in the same equilibrium."""
-        return self.converged and self.displacement <= OTHER_EQUILIBRIUM
-
-    @property
-    def covered(self) -> bool:
-        """Whether all three errors are within their estimates."""
-        return all(getattr(self, n) <= getattr(self, f"estimated_{n}") for n in QUANTITIES)
-
-    def estimate(self, estimator: Estimator) -> None:
-        """Fill in the estimated errors."""
-        self.estimated_displacement, self.estimated_von_mises, self.estimated_force = estimator(
-            self.features
-        )
 
 
 @dataclass
@@ -125,7 +83,7 @@ class CourseComparison:
     worst_displacement, worst_von_mises, worst_force : float
         Largest error of a moment, over the largest norm until then.
     unconverged : int
-    moments : list of Moment
+    moments : list of KnownMoment
     """
 
     steps: int
@@ -138,12 +96,17 @@ class CourseComparison:
     worst_von_mises: float
     worst_force: float
     unconverged: int
-    moments: list[Moment] = field(repr=False)
+    moments: list[KnownMoment] = field(repr=False)
 
     @property
     def typical(self) -> bool:
         """Whether both models rest in the same equilibria."""
         return self.displacement <= OTHER_EQUILIBRIUM
+
+    def estimate(self, estimator: Estimator) -> None:
+        """Fill in the estimated errors of its moments."""
+        for moment in self.moments:
+            moment.estimate(estimator)
 
 
 def compare_course(
@@ -156,7 +119,7 @@ def compare_course(
     s = np.array([atlas.von_mises(answer) for answer in answers], float)[:, kept]
     f = np.array([answer.force for answer in answers])
     pairs = list(zip((u, s, f), (full[0], full[1][:, kept], full[2]), strict=True))
-    errors = np.array([_moments(a, b) for a, b in pairs])
+    errors = errors_so_far(pairs)
     overall = [relative(a, b.astype(float)) for a, b in pairs]
     worst = errors.max(axis=1).tolist()
     return CourseComparison(
@@ -170,34 +133,8 @@ def compare_course(
         worst_von_mises=worst[1],
         worst_force=worst[2],
         unconverged=sum(not answer.converged for answer in answers),
-        moments=[
-            Moment(
-                displacement=own[0],
-                von_mises=own[1],
-                force=own[2],
-                converged=answer.converged,
-                features=answer.features,
-                estimated_displacement=answer.error_displacement,
-                estimated_von_mises=answer.error_von_mises,
-                estimated_force=answer.error_force,
-            )
-            for own, answer in zip(errors.T.tolist(), answers, strict=True)
-        ],
+        moments=known_moments(errors, answers),
     )
-
-
-def _moments(a: Array, b: Array) -> Array:
-    """Largest errors (t,) of fields a (t, ...) until each moment, over the largest norm of b."""
-    away, size = (
-        np.maximum.accumulate(np.linalg.norm(x.reshape(len(x), -1), axis=1)) for x in (a - b, b)
-    )
-    return np.asarray(away / np.maximum(size, 1e-9 * max(float(size[-1]), 1e-300)))
-
-
-def calibrate_courses(rows: Sequence[CourseComparison]) -> Estimator:
-    """Fit the error estimate of histories of the tip to known errors."""
-    moments = [moment for row in rows for moment in row.moments]
-    return calibrate(moments, QUANTITIES, COVERAGE, DAMPING)
 
 
 def validate_courses(
@@ -240,8 +177,6 @@ def summarise_courses(rows: Sequence[CourseComparison]) -> dict[str, Any]:
 
     ``covered``: the share of all converged moments that are within their three estimates.
     """
-    moments = [moment for row in rows for moment in row.moments if moment.converged]
-    covered, ratios = coverage(moments, QUANTITIES)
     typical = [row for row in rows if row.typical]
     names = [*QUANTITIES, *(f"worst_{name}" for name in QUANTITIES)]
     return {
@@ -249,6 +184,5 @@ def summarise_courses(rows: Sequence[CourseComparison]) -> dict[str, Any]:
         "steps": sum(row.steps for row in rows),
         "unconverged": sum(row.unconverged for row in rows),
         "other_equilibrium": len(rows) - len(typical),
-        "covered": covered,
-        "estimate_over_error_median": ratios,
+        **covered_moments(rows, QUANTITIES),
     } | {name: statistics([getattr(row, name) for row in typical]) for name in names}

@@ -22,11 +22,11 @@ from offline.sampling import farthest
 from offline.viscous import deviatoric_of
 from shared import equilibrium
 from shared.atlas import Body, LocalModels, assemble_tips
-from shared.history import ViscousModels
+from shared.history import HISTORY_FEATURES, History, ViscousModels
 from shared.reduced import LANES, RESIDUAL_FEATURES
 from shared.reduced_history import SYMMETRIC, predict_points
 from shared.surface import Surface
-from shared.tip_history import HISTORY_FEATURES, TipHistory, TipStepper, step
+from shared.tip_history import TipStepper, step
 from shared.touch import (
     MAX_ITERATIONS,
     STATUS,
@@ -158,7 +158,7 @@ class TipClock:
 
     def rest(self) -> None:
         """Go back to where nothing has happened."""
-        self._history = TipHistory()
+        self._history = History()
         self._most = 0.0, 0.0
 
     def step(self, dt: float, position: Array, depth: float) -> _State | None:

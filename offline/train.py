@@ -19,6 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,15 @@ from offline.checkpoint import Checkpoint, content_key
 from offline.choose import LADDER, Trial, TrialResult, choose
 from offline.choose_mesh import with_mesh
 from offline.giving_way import lowered_limits
+from offline.histories import (
+    HistoryComparison,
+    compare_history,
+    loads_of,
+    random_histories,
+    summarise_histories,
+)
 from offline.mesh import mesh_quality
+from offline.moments import calibrate_moments
 from offline.patches import PatchResult, PatchTask, RegionResult
 from offline.refinement import MOST_DOFS, mesh_error_document
 from offline.sampling import (
@@ -49,13 +58,13 @@ from offline.scenes import default_artifact, find_scene
 from offline.spaces import Footprint
 from offline.tip_histories import (
     CourseComparison,
-    calibrate_courses,
     compare_course,
     random_courses,
     summarise_courses,
 )
 from offline.tips import local_tips
 from offline.touches import (
+    QUANTITIES,
     TouchComparison,
     calibrate_touches,
     compare_touch,
@@ -64,8 +73,10 @@ from offline.touches import (
     summarise_touches,
 )
 from offline.validate import (
+    ESTIMATED,
     Comparison,
     calibrate,
+    calibrate_by_halves,
     compare,
     random_loads,
     summarise,
@@ -75,12 +86,10 @@ from offline.viscous import viscous_models
 from offline.workers import Tasks, resume, worker_pool
 from offline.workshop import Load, TouchSample, Workshop, open_workshop, run
 from shared.artifact import Dataset, write_artifact
-from shared.atlas import Atlas, Estimator, LocalModels
+from shared.atlas import ESTIMATORS, Atlas, Estimator, Estimators, LocalModels
 from shared.endoscope import TIP_DEPTH
-from shared.reduced import ERROR_FEATURES, NARROW
+from shared.reduced import NARROW
 from shared.scene import Scene, Size, Tolerance
-from shared.tip_history import HISTORY_FEATURES
-from shared.touch import TIP_ERROR_FEATURES
 
 Array = NDArray[np.float64]
 
@@ -102,7 +111,7 @@ TIP_SAMPLES = 120
 """Full solutions under the tip that validate and calibrate."""
 
 MOST_COURSES = 48
-"""Full histories under the tip that validate and calibrate, a quarter of ``samples`` at most."""
+"""Full histories of each kind that validate and calibrate, a quarter of ``samples`` at most."""
 
 REFINED_LOADS = 4
 
@@ -199,15 +208,15 @@ class Pipeline:
         layout = self.layout(size)
         models = self.local_models(layout, limits)
         limits = self._lowered(models, limits)
-        estimator, documents, rows = self._validate(models, limits)
-        tip_estimator = Estimator(np.zeros((3, TIP_ERROR_FEATURES)))
+        estimators = {}
+        estimators["loads"], documents, rows = self._validate(models, limits)
         tip_rows: list[TouchComparison] = []
         if models.tips is not None:
             atlas = self._untested(models, limits)
             rng = np.random.default_rng([self.scene.seed, 7])
             residuals = fit_residuals(self.workshop, atlas, rng)
             models = replace(models, tips=replace(models.tips, residuals=residuals))
-            tip_estimator, tip_rows = self._validate_tip(models, limits)
+            estimators["touches"], tip_rows = self._validate_tip(models, limits)
             documents["validation_tip"] = summarise_touches(tip_rows)
         if 3 * len(self.workshop.mesh.nodes) <= MOST_DOFS:
             documents["mesh_error"] = self._mesh_error(limits)
@@ -216,11 +225,13 @@ class Pipeline:
             documents["training"]["choice"] = choice.document
         if mesh_choice is not None:
             documents["training"]["mesh_choice"] = mesh_choice
-        history_estimator = Estimator(np.zeros((3, HISTORY_FEATURES)))
+        if models.viscous is not None:
+            estimators["histories"], histories = self._validate_histories(models, limits)
+            documents["validation_histories"] = summarise_histories(histories)
         if models.viscous_tips is not None:
-            history_estimator, courses = self._validate_courses(models, limits)
+            estimators["courses"], courses = self._validate_courses(models, limits)
             documents["validation_tip_histories"] = summarise_courses(courses)
-        self._write(path, models, limits, estimator, tip_estimator, history_estimator, documents)
+        self._write(path, models, limits, estimators, documents)
         report = path.parent / path.stem / "report"
         report.mkdir(parents=True, exist_ok=True)
         write_rows(report / "validation.csv", rows)
@@ -423,36 +434,55 @@ class Pipeline:
             for name, answer in zip(tasks, answers, strict=True)
             if found[name]["displacement"].size
         ]
-        for half, other in ((rows[::2], rows[1::2]), (rows[1::2], rows[::2])):
-            estimator = calibrate_touches(other)
-            for row in half:
-                row.estimate(estimator)
-        return calibrate_touches(rows), rows
+        return calibrate_by_halves(rows, calibrate_touches), rows
+
+    def _validate_histories(
+        self, models: LocalModels, limits: Array
+    ) -> tuple[Estimator, list[HistoryComparison]]:
+        """Validate over histories of loads, and calibrate their error estimate."""
+        rng = np.random.default_rng([self.scene.seed, 8])
+        atlas = self._untested(models, limits)
+        histories = random_histories(atlas, self._courses, rng)
+        tasks = {
+            f"history-{i}": (Workshop.follow, *loads_of(presses))
+            for i, presses in enumerate(histories)
+        }
+        found = self._full_histories("full histories", tasks, "us")
+        rows = [
+            compare_history(self.workshop, atlas, presses, own["u"], own["s"])
+            for presses, own in zip(histories, found, strict=True)
+            if own["u"].size
+        ]
+        return calibrate_by_halves(rows, partial(calibrate_moments, quantities=ESTIMATED)), rows
 
     def _validate_courses(
         self, models: LocalModels, limits: Array
     ) -> tuple[Estimator, list[CourseComparison]]:
         """Validate over histories of the tip, and calibrate their error estimate."""
-        rng = np.random.default_rng([self.scene.seed, 7])
+        rng = np.random.default_rng([self.scene.seed, 9])
         atlas = self._untested(models, limits)
-        count = min(MOST_COURSES, self.scene.training.samples // 4)
-        courses = random_courses(self.surface, limits, self.scene, count, rng)
+        courses = random_courses(self.surface, limits, self.scene, self._courses, rng)
         tasks = {f"course-{i}": (Workshop.follow_tip, *course) for i, course in enumerate(courses)}
-        found = self._stage(
-            "full histories under the tip",
-            tasks,
-            lambda f: dict(zip("usf", ([],) * 3 if f is None else f, strict=True)),
-        )
+        found = self._full_histories("full histories under the tip", tasks, "usf")
         rows = [
-            compare_course(self.workshop, atlas, course, tuple(found[name][part] for part in "usf"))
-            for name, course in zip(tasks, courses, strict=True)
-            if found[name]["u"].size
+            compare_course(self.workshop, atlas, course, (own["u"], own["s"], own["f"]))
+            for course, own in zip(courses, found, strict=True)
+            if own["u"].size
         ]
-        for half, other in ((rows[::2], rows[1::2]), (rows[1::2], rows[::2])):
-            estimator = calibrate_courses(other)
-            for moment in (moment for row in half for moment in row.moments):
-                moment.estimate(estimator)
-        return calibrate_courses(rows), rows
+        return calibrate_by_halves(rows, partial(calibrate_moments, quantities=QUANTITIES)), rows
+
+    @property
+    def _courses(self) -> int:
+        return min(MOST_COURSES, self.scene.training.samples // 4)
+
+    def _full_histories(self, title: str, tasks: Tasks, parts: str) -> list[dict[str, Array]]:
+        """What the full model makes of histories, by letter; empty where it could not follow."""
+        found = self._stage(
+            title,
+            tasks,
+            lambda f: dict(zip(parts, ([],) * len(parts) if f is None else f, strict=True)),
+        )
+        return [found[name] for name in tasks]
 
     def _validate(
         self, models: LocalModels, limits: Array
@@ -477,11 +507,7 @@ class Pipeline:
             ]
             if len(rows) >= LEAST and _accurate(rows, self.scene.tolerance):
                 break
-        for half, other in ((rows[::2], rows[1::2]), (rows[1::2], rows[::2])):
-            estimator = calibrate(other)
-            for row in half:
-                row.estimate(estimator)
-        estimator = calibrate(rows)
+        estimator = calibrate_by_halves(rows, calibrate)
         documents = {
             "provenance": self.provenance,
             "training": {"seconds": self.seconds, "mesh": mesh_quality(self.workshop.mesh)},
@@ -557,8 +583,7 @@ class Pipeline:
         """An atlas without error estimates."""
         return Atlas(
             self.scene.name, self.scene, {}, self.workshop.body, self.surface, limits, models,
-            Estimator(np.zeros((2, ERROR_FEATURES))), Estimator(np.zeros((3, TIP_ERROR_FEATURES))),
-            Estimator(np.zeros((3, HISTORY_FEATURES))),
+            Estimators(),
         )  # fmt: skip
 
     def _write(
@@ -566,9 +591,7 @@ class Pipeline:
         path: Path,
         models: LocalModels,
         limits: Array,
-        estimator: Estimator,
-        tip_estimator: Estimator,
-        history_estimator: Estimator,
+        estimators: Mapping[str, Estimator],
         documents: dict[str, Any],
     ) -> None:
         mesh, surface = self.workshop.mesh, self.surface
@@ -614,9 +637,14 @@ class Pipeline:
             "cubature_from": Dataset(models.point_from, one, "first point of each local model"),
             "cubature_points": Dataset(models.points, one, "quadrature point, by element"),
             "cubature_weights": Dataset(models.weights, "mm^3", "weight of each point"),
-            "error_coefficients": Dataset(
-                estimator.coefficients, one, "log error = c . features; displacement, von Mises"
-            ),
+        }
+        datasets |= {
+            ESTIMATORS[kind]: Dataset(
+                estimator.coefficients,
+                one,
+                "log error = c . features; rows: displacement, von Mises, under the tip force",
+            )
+            for kind, estimator in estimators.items()
         }
         if models.tips is not None:
             tips = models.tips
@@ -636,9 +664,6 @@ class Pipeline:
                 ),
                 "tip_residuals": Dataset(
                     tips.residuals, one, "log of the residual in the full model, polynomials"
-                ),
-                "tip_error_coefficients": Dataset(
-                    tip_estimator.coefficients, one, "as error_coefficients; third row: force"
                 ),
             }
         if models.viscous is not None:
@@ -660,9 +685,6 @@ class Pipeline:
                 ),
                 "tip_viscous_overlap": Dataset(
                     viscous.overlap.astype(np.float16), one, "products of these, by viscous_pairs"
-                ),
-                "history_error_coefficients": Dataset(
-                    history_estimator.coefficients, one, "as tip_error_coefficients, of histories"
                 ),
             }
         documents["provenance"]["wall_seconds"] = round(sum(self.seconds.values()), 1)

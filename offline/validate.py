@@ -273,6 +273,17 @@ def calibrate(
     return Estimator(np.array(coefficients))
 
 
+def calibrate_by_halves(
+    rows: Sequence[Any], fit: Callable[[Sequence[Any]], Estimator]
+) -> Estimator:
+    """Fit an estimate to all rows; those of the rows themselves come from one of the other half."""
+    for half, other in ((rows[::2], rows[1::2]), (rows[1::2], rows[::2])):
+        estimator = fit(other)
+        for row in half:
+            row.estimate(estimator)
+    return fit(rows)
+
+
 def coverage(rows: Sequence[Any], quantities: Sequence[str]) -> tuple[float, dict[str, float]]:
     """Share of rows whose errors are all within their estimates; median of estimate over error."""
     covered = [

@@ -237,7 +237,10 @@ class ContactAnswer(BaseModel):
 
 
 class ErrorEstimate(BaseModel):
-    """Expected relative L2 errors against the full model, as fractions."""
+    """Relative L2 errors against the full model that 95 % of answers stay within, as fractions.
+
+    Over a history: the largest so far, over the largest so far of the field.
+    """
 
     displacement: float
     von_mises: float
@@ -282,18 +285,6 @@ class Answer(BaseModel):
     timing: Timing
 
 
-class MomentTrust(BaseModel):
-    """Whether and how far to believe a step's answer."""
-
-    converged: bool = Field(description="Always true: a load without equilibrium is refused.")
-    iterations: int = Field(description="Newton steps taken.")
-    in_range: bool = Field(
-        description="Whether the load is in the range the model was trained for."
-    )
-    out_of_range: list[str] = Field(description="The contact's fields that are not.")
-    min_jacobian: float = Field(description="Smallest volume ratio met; 1 at rest, 0 is collapse.")
-
-
 class MomentAnswer(BaseModel):
     """How the tissue answers at the time of a step."""
 
@@ -301,7 +292,7 @@ class MomentAnswer(BaseModel):
     contact: ContactAnswer
     force: Vector = Field(description="Force on the tissue, mN.")
     contact_displacement: Vector = Field(description="Displacement of the contact point, mm.")
-    trust: MomentTrust
+    trust: Trust
 
 
 class HistoryAnswer(BaseModel):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from online.follower import MOST_ITERATIONS, Follower, Step, is_finite
 from online.frames import Flag
 from shared.atlas import Atlas
-from shared.tip_history import TipHistory
+from shared.history import History
 from shared.touch import Touch
 
 Array = NDArray[np.float64]
@@ -31,7 +31,7 @@ _STALLED = int(Flag.STALLED)
 class Snapshot(NamedTuple):
     """State of the tissue, to go back to; nothing in it ever changes."""
 
-    history: TipHistory
+    history: History
     good: Touch | None
 
 
@@ -53,7 +53,7 @@ class TimedFollower(Follower):
         self._rest()
 
     def _rest(self) -> None:
-        self._history = TipHistory()
+        self._history = History()
         self._clock: float | None = None
         self._span = self._share = 0.0
 

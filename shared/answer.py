@@ -15,17 +15,7 @@ def describe(scene: str, solution: Solution) -> dict[str, Any]:
         "contact": _contact(solution),
         "force": solution.force.tolist(),
         "contact_displacement": solution.contact_displacement.tolist(),
-        "trust": {
-            "converged": solution.converged,
-            "iterations": solution.iterations,
-            "in_range": solution.in_range,
-            "out_of_range": solution.out_of_range,
-            "error_estimate": {
-                "displacement": solution.error_displacement,
-                "von_mises": solution.error_von_mises,
-            },
-            "min_jacobian": solution.min_jacobian,
-        },
+        "trust": _trust(solution),
     }
 
 
@@ -36,13 +26,7 @@ def describe_moment(moment: Moment) -> dict[str, Any]:
         "contact": _contact(moment),
         "force": moment.force.tolist(),
         "contact_displacement": moment.contact_displacement.tolist(),
-        "trust": {
-            "converged": moment.converged,
-            "iterations": moment.iterations,
-            "in_range": moment.in_range,
-            "out_of_range": moment.out_of_range,
-            "min_jacobian": moment.min_jacobian,
-        },
+        "trust": _trust(moment),
     }
 
 
@@ -55,4 +39,18 @@ def _contact(solution: Solution | Moment) -> dict[str, Any]:
         "pressure": solution.pressure,
         "radius": solution.radius,
         "pressure_limit": solution.pressure_limit,
+    }
+
+
+def _trust(solution: Solution | Moment) -> dict[str, Any]:
+    return {
+        "converged": solution.converged,
+        "iterations": solution.iterations,
+        "in_range": solution.in_range,
+        "out_of_range": solution.out_of_range,
+        "error_estimate": {
+            "displacement": solution.error_displacement,
+            "von_mises": solution.error_von_mises,
+        },
+        "min_jacobian": solution.min_jacobian,
     }

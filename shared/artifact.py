@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from shared.errors import PalpateError
 
 FORMAT = "palpate-artifact"
-FORMAT_VERSION = 5
+FORMAT_VERSION = 6
 
 SEAL_BYTES = 512
 """The smallest user block that HDF5 offers."""

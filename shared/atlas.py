@@ -18,7 +18,16 @@ from shared.artifact import Artifact, ArtifactError, read_artifact
 from shared.bound import bind
 from shared.endoscope import LIMIT_FIELDS, TIP_DEPTH, SurfaceQuadrature
 from shared.errors import QueryError
-from shared.history import Carrier, History, Moment, Remembered, Stepper, ViscousModels
+from shared.history import (
+    HISTORY_FEATURES,
+    Carrier,
+    History,
+    Moment,
+    Remembered,
+    Stepper,
+    ViscousModels,
+    history_features,
+)
 from shared.quadrature import stress_recovery, surface_quadrature, volume_quadrature
 from shared.reduced import (
     DEPARTURE,
@@ -55,7 +64,7 @@ from shared.scene import Scene, SceneError, parse_scene
 from shared.stress import nodal_von_mises, nodal_von_mises_after, remember, remember_linearly
 from shared.surface import UPRIGHT, Ground, Surface, boundary_triangles
 from shared.tip import Tip, TipSurface, tip_of, tip_surface
-from shared.tip_history import HISTORY_FEATURES, TipHistory, TipStepper
+from shared.tip_history import TipStepper
 from shared.tissue import lame
 from shared.touch import (
     MAX_ITERATIONS,
@@ -530,12 +539,42 @@ class Estimator:
     For the features see ``shared.reduced``.
     """
 
-    coefficients: Array  # (2, ERROR_FEATURES): displacement, von Mises; under the tip also force
+    coefficients: Array  # (2, features): displacement, von Mises; under the tip also force
 
     def __call__(self, features: Array) -> list[float]:
         """Estimated relative errors, one for each row."""
         errors: list[float] = np.exp(self.coefficients @ features).tolist()
         return errors
+
+
+@dataclass(frozen=True)
+class Estimators:
+    """Error estimates of loads and of the tip, at once and over histories; 1 if not calibrated."""
+
+    loads: Estimator = Estimator(np.zeros((2, ERROR_FEATURES)))
+    touches: Estimator = Estimator(np.zeros((3, TIP_ERROR_FEATURES)))
+    histories: Estimator = Estimator(np.zeros((2, HISTORY_FEATURES)))
+    courses: Estimator = Estimator(np.zeros((3, HISTORY_FEATURES)))
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, NDArray[Any]]) -> Estimators:
+        """Read from an artifact, which holds those of its scene."""
+        return cls(
+            **{
+                name: Estimator(arrays[dataset])
+                for name, dataset in ESTIMATORS.items()
+                if dataset in arrays
+            }
+        )
+
+
+ESTIMATORS = {
+    "loads": "error_coefficients",
+    "touches": "tip_error_coefficients",
+    "histories": "history_error_coefficients",
+    "courses": "tip_history_error_coefficients",
+}
+"""Where an artifact keeps each."""
 
 
 class Atlas:
@@ -553,8 +592,7 @@ class Atlas:
     limits : ndarray, shape (v, LIMIT_FIELDS)
         Load range at the surface's vertices; see ``shared.endoscope.pressure_limit``.
     models : LocalModels
-    estimator, tip_estimator, history_estimator : Estimator
-        Of loads, of the tip on elastic tissue, and of the tip on tissue that remembers.
+    estimators : Estimators
     """
 
     def __init__(
@@ -566,9 +604,7 @@ class Atlas:
         surface: Surface,
         limits: Array,
         models: LocalModels,
-        estimator: Estimator,
-        tip_estimator: Estimator,
-        history_estimator: Estimator,
+        estimators: Estimators,
     ) -> None:
         self.name = name
         self.scene = scene
@@ -577,16 +613,14 @@ class Atlas:
         self.surface = surface
         self.limits = limits
         self.models = models
-        self.estimator = estimator
-        self.tip_estimator = tip_estimator
-        self.history_estimator = history_estimator
+        self.estimators = estimators
         self.patches = assemble_patches(body, models, scene.endoscope.radius)
         terms = Terms(
             ground=surface.ground(limits),
             reach=scene.endoscope.reach,
             max_tilt=scene.endoscope.max_tilt,
             residuals=models.residuals,
-            coefficients=estimator.coefficients,
+            coefficients=estimators.loads.coefficients,
         )
         self._terms = bind(terms)
         self.surface_nodes, self.surface_triangles = boundary_triangles(body.faces)
@@ -661,17 +695,7 @@ class Atlas:
                 if scene.tissue.prony and scene.endoscope.tip
                 else None,
             ),
-            estimator=Estimator(arrays["error_coefficients"]),
-            tip_estimator=Estimator(
-                arrays["tip_error_coefficients"]
-                if scene.endoscope.tip
-                else np.zeros((3, TIP_ERROR_FEATURES))
-            ),
-            history_estimator=Estimator(
-                arrays["history_error_coefficients"]
-                if scene.endoscope.tip and scene.tissue.prony
-                else np.zeros((3, HISTORY_FEATURES))
-            ),
+            estimators=Estimators.of(arrays),
         )
 
     @property
@@ -864,11 +888,24 @@ class Atlas:
         active = [(-2 - k, share) for k, share in zip(numbers, shares, strict=True) if share > 0.0]
         found = self._stepper.press(history, active, pressure, radius, self._step_weights(dt))
         main = max(active, key=lambda pair: pair[1])[0]
-        after = History(history.time + dt, found.locals, main, record[_POINT])
+        point, moved = record[_POINT], math.hypot(*found.displacement.tolist())
+        travelled = 0.0 if history.position is None else math.dist(point, history.position)
+        after = History(
+            time=history.time + dt,
+            locals=found.locals,
+            main=main,
+            position=point,
+            share=max(history.share, pressure / scalars[LIMIT]),
+            response=max(history.response, moved),
+            travel=history.travel + travelled,
+            smallest=min(history.smallest, found.min_jacobian),
+        )
+        features = history_features(record[_NORMAL], after)
+        errors = self.estimators.histories(features)
         out_of_range = self._out_of_range(at, record, scalars, pressure, radius)
         moment = Moment(
             time=after.time,
-            contact_point=record[_POINT],
+            contact_point=point,
             normal=record[_NORMAL],
             distance=scalars[DISTANCE],
             direction=record[_DIRECTION],
@@ -882,7 +919,10 @@ class Atlas:
             iterations=found.iterations,
             in_range=not out_of_range,
             out_of_range=out_of_range,
+            error_displacement=errors[0],
+            error_von_mises=errors[1],
             min_jacobian=found.min_jacobian,
+            features=features,
             active=tuple((k, share, found.locals[k]) for k, share in active),
             solve_seconds=time.perf_counter() - started,
         )
@@ -942,17 +982,17 @@ class Atlas:
 
     def touch_step(
         self,
-        history: TipHistory,
+        history: History,
         dt: float,
         position: ArrayLike,
         most: int = MAX_ITERATIONS,
-    ) -> tuple[Touch, TipHistory]:
+    ) -> tuple[Touch, History]:
         """Answer a position of the rigid tip on visco-elastic tissue.
 
         Parameters
         ----------
-        history : TipHistory
-            ``TipHistory()`` is rest. It is not changed.
+        history : History
+            ``History()`` is rest. It is not changed.
         dt : float, s
             Since the end of the history; may be 0, for a sudden change. The tip moved evenly.
         position : array_like, shape (3,), mm
@@ -965,7 +1005,7 @@ class Atlas:
         touch : Touch
             Its estimated errors are the largest until now of displacement, stress and force,
             relative to the largest of these until now.
-        history : TipHistory
+        history : History
             To go on from; the old one if the answer did not converge.
 
         Raises
@@ -978,7 +1018,7 @@ class Atlas:
         at = _vector("position", position)
         return tip_history.step(
             self._tip_state(self._state), self._tip_stepper, history, dt, self._step_weights(dt),
-            at, self.history_estimator.coefficients, started, most,
+            at, self.estimators.courses.coefficients, started, most,
         )  # fmt: skip
 
     def _tip_state(self, state: State) -> TipState:
@@ -986,7 +1026,7 @@ class Atlas:
         if state.tip is None:
             if self.tips is None:
                 raise QueryError("position", f"scene {self.name!r} was trained without a tip")
-            state.tip = TipState(self.tips, self._tip_ground, self.tip_estimator.coefficients)
+            state.tip = TipState(self.tips, self._tip_ground, self.estimators.touches.coefficients)
         return state.tip
 
     @cached_property

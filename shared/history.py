@@ -37,6 +37,9 @@ MOST_REMAINS = 12
 MOST_PARTS = 4
 """Patches among which a move is shared out."""
 
+HISTORY_FEATURES = 9
+"""Of the error estimate; see ``history_features``."""
+
 Answers = list[tuple[int, float, Array]]
 
 
@@ -86,17 +89,46 @@ class History:
     main : int
         The patch that had most weight; -1 at rest.
     position : ndarray, shape (3,), mm, or None
-        The last contact point.
+        The last contact point; where the tip was over the surface last: models about it answer
+        when it is off.
+    share : float
+        Largest pressure or depth so far, over its limit there.
+    response : float
+        Largest displacement of the contact (mm), or force of the tip (mN), so far.
+    travel : float, mm
+        Over the surface.
+    smallest : float
+        Smallest det F so far.
     """
 
     time: float = 0.0
     locals: Mapping[int, Local] = field(default_factory=dict)
     main: int = -1
     position: Array | None = None
+    share: float = 0.0
+    response: float = 0.0
+    travel: float = 0.0
+    smallest: float = 1.0
+
+
+def history_features(normal: Array, history: History) -> Array:
+    """What the error estimate is made of: ``log error = c . features``.
+
+    1; the largest share of the limit so far and its log; smallest det F so far; the normal (where
+    on the body); the way over the surface; the log of the largest response over the largest share.
+    """
+    share = max(history.share, 1e-6)
+    return np.array([
+        1.0, share, math.log(share), history.smallest, *normal.tolist(),
+        math.log1p(history.travel), math.log(max(history.response / share, 1e-6)),
+    ])  # fmt: skip
 
 
 class Moment(NamedTuple):
     """Answer at the end of a time step; see ``shared.atlas.Solution``.
+
+    Its estimated errors are the largest until now of displacement and stress, relative to the
+    largest of these until now.
 
     Attributes
     ----------
@@ -109,7 +141,10 @@ class Moment(NamedTuple):
     iterations : int
     in_range : bool
     out_of_range : tuple of str
+    error_displacement, error_von_mises : float
     min_jacobian : float
+    features : ndarray, shape (HISTORY_FEATURES,)
+        What the error estimate is made of.
     active : tuple of (int, float, Local)
         Patches that answer, with their weights.
     solve_seconds : float
@@ -130,7 +165,10 @@ class Moment(NamedTuple):
     iterations: int
     in_range: bool
     out_of_range: tuple[str, ...]
+    error_displacement: float
+    error_von_mises: float
     min_jacobian: float
+    features: Array
     active: tuple[tuple[int, float, Local], ...]
     solve_seconds: float
 

@@ -38,7 +38,7 @@ from shared.elements import quadrilateral, shape
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
-HARDNESS = 7000.0
+HARDNESS = 12000.0
 """Of the penalty, in units of Young's modulus over the tip's radius."""
 
 ONSET = 5e-4

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from shared import equilibrium
 from shared.bound import Bound, bind
 from shared.errors import QueryError
-from shared.history import Carrier, History, Local, ViscousModels
+from shared.history import Carrier, History, Local, ViscousModels, history_features
 from shared.touch import (
     BESIDE,
     DEPTH,
@@ -46,33 +45,6 @@ from shared.viscosity import Weights
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
 
-HISTORY_FEATURES = 9
-"""Of the error estimate; see ``_features``."""
-
-
-@dataclass(frozen=True)
-class TipHistory(History):
-    """All that the tissue remembers of the tip; see ``shared.history.History``.
-
-    Attributes
-    ----------
-    position : ndarray, shape (3,), mm, or None
-        Where the tip was over the surface last: models about it answer when it is off.
-    share : float
-        Largest depth so far, over its limit there.
-    force : float, mN
-        Largest so far.
-    travel : float, mm
-        Of the tip over the surface.
-    smallest : float
-        Smallest det F so far.
-    """
-
-    share: float = 0.0
-    force: float = 0.0
-    travel: float = 0.0
-    smallest: float = 1.0
-
 
 class TipStepper(Carrier):
     """Moves the tip over patches, step by step.
@@ -98,7 +70,7 @@ class TipStepper(Carrier):
 
     def press(
         self,
-        history: TipHistory,
+        history: History,
         active: Sequence[tuple[int, int]],
         position: Array,
         weights: Weights,
@@ -134,14 +106,14 @@ class TipStepper(Carrier):
 def step(
     state: TipState,
     stepper: TipStepper,
-    history: TipHistory,
+    history: History,
     dt: float,
     weights: Weights,
     position: Array,
     coefficients: Array,
     started: float,
     most: int = MAX_ITERATIONS,
-) -> tuple[Touch, TipHistory]:
+) -> tuple[Touch, History]:
     """Answer a finite position of the tip ``dt`` (s) after the end of a history.
 
     Parameters
@@ -149,7 +121,7 @@ def step(
     state : TipState
         Working memory; it keeps nothing from step to step.
     stepper : TipStepper
-    history : TipHistory
+    history : History
         Not changed.
     dt : float, s
     weights : Weights
@@ -167,7 +139,7 @@ def step(
     touch : Touch
         Its estimated errors are the largest until now of displacement, stress and force, relative
         to the largest of these until now.
-    history : TipHistory
+    history : History
         To go on from; the old one if the answer did not converge.
 
     Raises
@@ -197,17 +169,17 @@ def step(
         outcome.force[:] = 0.0
         outcome.tangent[:] = 0.0
     pushed = stepper.conclude(position)
-    after = TipHistory(
+    after = History(
         time=history.time + dt,
         locals=found or {},
         main=max(active, key=lambda pair: shares[pair[0]])[1] if active else -1,
         position=history.position if off else position,
         share=max(history.share, depth / limit),
-        force=max(history.force, pushed),
+        response=max(history.response, pushed),
         travel=history.travel + (0.0 if off else math.dist(position, last)),
         smallest=min(history.smallest, scalars.item(SMALLEST_J)),
     )
-    features = _features(outcome.upward, after)
+    features = history_features(outcome.upward, after)
     errors = np.exp(coefficients @ features).tolist()
     contact = scalars.item(TOUCHED) > 0
     out_of_range: tuple[str, ...] = ()
@@ -242,16 +214,3 @@ def step(
         active=parts,
     )
     return touch, after if converged else history
-
-
-def _features(upward: Array, history: TipHistory) -> Array:
-    """What the error estimate is made of: ``log error = c . features``.
-
-    1; the largest share of the limit so far and its log; smallest det F so far; the normal (where
-    on the body); the way over the surface; the log of the largest force over the largest share.
-    """
-    share = max(history.share, 1e-6)
-    return np.array([
-        1.0, share, math.log(share), history.smallest, *upward.tolist(),
-        math.log1p(history.travel), math.log(max(history.force / share, 1e-6)),
-    ])  # fmt: skip

@@ -17,13 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from offline.moments import covered_moments
 from offline.tip_histories import Course, compare_course
+from offline.touches import QUANTITIES
 from offline.workshop import Workshop
 from shared.artifact import read_artifact
 from shared.atlas import Atlas
 from shared.endoscope import TIP_DEPTH
 from shared.errors import QueryError
-from shared.tip_history import TipHistory
+from shared.history import History
 
 Array = NDArray[np.float64]
 
@@ -146,7 +148,7 @@ def _course(atlas: Atlas, case: Case) -> Course:
 
 def _outcome(atlas: Atlas, workshop: Workshop, case: Case) -> Outcome:
     course = _course(atlas, case)
-    history, answers = TipHistory(), []
+    history, answers = History(), []
     for position, dt in zip(*course, strict=True):
         answer, history = atlas.touch_step(history, dt, position)
         answers.append(answer)
@@ -165,7 +167,7 @@ def _outcome(atlas: Atlas, workshop: Workshop, case: Case) -> Outcome:
         displacement=np.nan if row is None else row.worst_displacement,
         von_mises=np.nan if row is None else row.worst_von_mises,
         force=np.nan if row is None else row.worst_force,
-        covered=np.nan if row is None else float(np.mean([m.covered for m in row.moments])),
+        covered=np.nan if row is None else covered_moments([row], QUANTITIES)["covered"],
     )
 
 
@@ -177,7 +179,7 @@ def _drift(atlas: Atlas, workshop: Workshop, many: int) -> float:
     course = _course(atlas, period)
     full = workshop.follow_tip(np.tile(course.positions, (PERIODS, 1)), course.times * PERIODS)
     assert full is not None, "depths are well within the range"
-    history, forces = TipHistory(), np.empty((PERIOD, 3))
+    history, forces = History(), np.empty((PERIOD, 3))
     for number in tqdm(range(many), "many steps"):
         at = number % PERIOD
         answer, history = atlas.touch_step(history, course.times[at], course.positions[at])

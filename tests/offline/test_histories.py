@@ -45,6 +45,8 @@ def test_validation_over_histories(visco_artifact, tmp_path):
     assert report["unconverged"] == 0
     assert 0.0 < report["displacement"]["max"] < 0.05
     assert 0.0 < report["von_mises"]["max"] < 0.1
+    assert 0.5 < report["covered"] <= 1.0
+    assert 1.0 < report["estimate_over_error_median"]["von_mises"] < 10.0
     assert report["worst_displacement"]["max"] >= report["last_displacement"]["max"]
     with rows.open() as file:
         assert len(list(csv.DictReader(file))) == report["histories"]

@@ -101,7 +101,7 @@ def test_one_compilation_serves_training_and_queries(artifact):
     by_columns = np.asfortranarray(atlas.limits)
     other = Atlas(
         atlas.name, atlas.scene, {}, atlas.body, atlas.surface, by_columns, atlas.models,
-        atlas.estimator, atlas.tip_estimator, atlas.history_estimator,
+        atlas.estimators,
     )  # fmt: skip
     other.solve(atlas.surface.vertices[0], 0.1)
     assert len(query.signatures) == 1

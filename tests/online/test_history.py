@@ -50,6 +50,8 @@ def test_steps_are_those_of_the_atlas(ask, atlas):
             step["contact_displacement"], moment.contact_displacement, rtol=1e-6, atol=1e-9
         )
         assert step["trust"]["converged"]
+        assert 0.0 < step["trust"]["error_estimate"]["displacement"] < 0.2
+        assert 0.0 < step["trust"]["error_estimate"]["von_mises"] < 0.2
         assert step["contact"]["pressure"] == pressure
         assert step["time"] == pytest.approx(moment.time)
     pressed, held, released, rested = (s["contact_displacement"][2] for s in answered["steps"])

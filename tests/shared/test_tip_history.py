@@ -7,7 +7,7 @@ from offline.workshop import Workshop
 from shared.artifact import read_artifact
 from shared.atlas import Atlas
 from shared.errors import QueryError
-from shared.tip_history import TipHistory
+from shared.history import History
 
 HOLD = ((0.5, 0.0, 0.0), (0.5, 0.0, 0.05), (0.5, 0.0, 0.3), (0.5, 0.0, 1.0))
 """Depths and places aside (mm), time steps (s)."""
@@ -30,7 +30,7 @@ def place(atlas, depth, aside=0.0):
 
 
 def follow(atlas, course, history=None):
-    history, answers = history or TipHistory(), []
+    history, answers = history or History(), []
     for depth, aside, dt in course:
         answer, history = atlas.touch_step(history, dt, place(atlas, depth, aside))
         assert answer.converged
@@ -135,7 +135,7 @@ def test_a_lifted_tip_feels_nothing_and_the_dent_recovers(atlas):
 
 
 def test_a_tip_that_never_touched_leaves_rest(atlas):
-    answer, history = atlas.touch_step(TipHistory(), 0.1, place(atlas, -3.0))
+    answer, history = atlas.touch_step(History(), 0.1, place(atlas, -3.0))
     assert answer.converged
     assert answer.patches == ()
     assert history.time == 0.1
@@ -144,7 +144,7 @@ def test_a_tip_that_never_touched_leaves_rest(atlas):
 
 def test_many_steps_end_where_few_do(atlas):
     """Periodic movement leads to a periodic force: rounding does not add up."""
-    history, seen = TipHistory(), []
+    history, seen = History(), []
     for number in range(4000):
         depth = 0.4 + 0.2 * np.sin(2 * np.pi * number / 100)
         answer, history = atlas.touch_step(history, 0.02, place(atlas, depth))
@@ -155,7 +155,7 @@ def test_many_steps_end_where_few_do(atlas):
 
 
 def test_extreme_steps_have_answers(atlas):
-    history = TipHistory()
+    history = History()
     for depth, dt in ((0.6, 0.0), (0.1, 0.0), (0.6, 1e-9), (0.6, 1e9), (-0.1, 1e-3), (0.6, 0.0)):
         answer, history = atlas.touch_step(history, dt, place(atlas, depth))
         assert answer.converged
@@ -176,11 +176,11 @@ def test_the_estimate_covers_most_and_is_of_all_that_was(atlas):
 )
 def test_what_is_wrong_is_named(atlas, dt, depth, field):
     with pytest.raises(QueryError) as caught:
-        atlas.touch_step(TipHistory(), dt, place(atlas, depth))
+        atlas.touch_step(History(), dt, place(atlas, depth))
     assert caught.value.field == field
 
 
 def test_elastic_tissue_has_no_time(artifact):
     elastic = Atlas.load(artifact)
     with pytest.raises(QueryError, match="is elastic"):
-        elastic.touch_step(TipHistory(), 0.1, place(elastic, 0.1))
+        elastic.touch_step(History(), 0.1, place(elastic, 0.1))

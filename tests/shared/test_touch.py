@@ -177,7 +177,7 @@ def test_contact_begins_where_the_surface_is_cut_short(atlas):
     lower = ground._replace(vertices=ground.vertices - [0.0, 0.0, 0.01])
     radius, low = atlas.scene.endoscope.radius, atlas.nodes[:, 2].max() - 0.01
     for depth in (0.0085, 0.005, 0.002):
-        state = TipState(atlas.tips, lower, atlas.tip_estimator.coefficients)
+        state = TipState(atlas.tips, lower, atlas.estimators.touches.coefficients)
         x = above(atlas, 0.0, (0.4, 0.6))
         x[2] = low + radius - (depth - 0.01)
         answer = answer_touch(state, x, 0.0)
