@@ -79,7 +79,7 @@ state.  Newton's method squares it (to 1e-5, say), which need not be evaluated."
 LEAST_SHARE = 0.1
 """Weight of a model below which its residual may not be larger still: that counts by weight."""
 
-LAG = 0.015
+LAG = 0.005
 """Change of the response, relative to it, up to which the tissue's part of the tangent serves
 again.  The contact's never does: it is far stiffer and changes as fast as the tip moves."""
 
