@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from offline.cubature import compress, damped_fit, nonlinear_forces, nonnegative, point_forces
 from offline.full_model import FullModel
-from offline.sampling import cone, tangents
+from offline.sampling import cone, fewer, tangents
 from offline.spaces import RITZ_VECTORS, Footprint, local_modes, whole_numbers
 from offline.tips import TipResult, compile_tip_query, train_tip
 from shared import equilibrium
@@ -80,7 +80,10 @@ WIDE_SKETCH = 24
 """Random combinations that stand for the forces in the wide space; their errors add up alike."""
 
 EQUATIONS = 300
-"""Combinations of the reduced internal force that cubature is fitted to."""
+"""Combinations of the reduced internal force that cubature is fitted to.
+
+This, ``LOADS`` and ``RESIDUAL_LOADS`` are for the usual tolerance; see ``offline.sampling.fewer``.
+"""
 
 
 @dataclass(frozen=True)
@@ -174,7 +177,7 @@ class LocalTrainer:
     def __init__(self, scene: Scene, body: Body, surface: Surface, models: LocalModels) -> None:
         self.radius = scene.endoscope.radius
         self.models = models
-        self.patches: Patches = assemble_patches(body, models, self.radius)
+        self.patches: Patches = assemble_patches(body, models, scene)
         self.state = State(self.patches, surface.clusters)
         no_limit = np.tile(np.eye(LIMIT_FIELDS)[1:4].sum(0), (len(surface.vertices), 1))
         no_limit[:, 0] = NO_LIMIT
@@ -308,7 +311,9 @@ def train_patch(
     )
     galerkin = local_trainer(scene, body, surface, region, task, everywhere)
     contributions = _training_forces(galerkin, scene, task, rng)[: len(weights)]
-    points, chosen = _cubature(contributions, weights, task.size.cubature_points, rng)
+    most = task.size.cubature_points
+    equations = max(most, fewer(EQUATIONS, scene.tolerance))
+    points, chosen = _cubature(contributions, weights, equations, most, rng)
     result = replace(everywhere, points=points.astype(np.int32), weights=chosen)
     reduced = local_trainer(scene, body, surface, region, task, result)
     defect = _fit_defect(galerkin, reduced, scene, task, frame, rng)
@@ -414,7 +419,7 @@ def _fit_residual(
     """Log of the full model's relative residual (RESIDUAL_FEATURES,), by ``residual_features``."""
     rows, states, loads = [], [], []
     nodal, features = np.zeros(len(body.nodes)), np.zeros(RESIDUAL_FEATURES)
-    for _ in range(RESIDUAL_LOADS):
+    for _ in range(fewer(RESIDUAL_LOADS, scene.tolerance)):
         x, direction, limit = _limit(scene, task, rng, border=False)
         share = np.sqrt(rng.random())
         if reduced.solve(x, direction, share * limit):
@@ -501,7 +506,7 @@ def _training_forces(
     patches = trainer.patches
     gradients = _point_gradients(patches)
     law = patches.weights[0], patches.mu[0], patches.lam[0]
-    for _ in range(LOADS):
+    for _ in range(fewer(LOADS, scene.tolerance)):
         if not trainer.solve(*_training_load(scene, task, rng)):
             continue
         wide, load = trainer.wide, trainer.load_size
@@ -524,10 +529,14 @@ def _point_gradients(patches: Patches) -> NDArray[np.float32]:
 
 
 def _cubature(
-    contributions: NDArray[np.float32], weights: Array, most: int, rng: np.random.Generator
+    contributions: NDArray[np.float32],
+    weights: Array,
+    equations: int,
+    most: int,
+    rng: np.random.Generator,
 ) -> tuple[NDArray[np.int64], Array]:
     """Points and weights that reproduce the sums of the contributions."""
-    A, b = compress(contributions, EQUATIONS, rng)
+    A, b = compress(contributions, equations, rng)
     chosen, x = nonnegative(A, b, most)
     return chosen, x * weights[chosen]
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from shared.scene import Tolerance
 from shared.surface import Surface
 
 Array = NDArray[np.float64]
@@ -81,6 +82,15 @@ def centred_points(surface: Surface, count: int, rng: np.random.Generator) -> Ar
         points = np.where(members[:, None] > 0, sums / np.maximum(members, 1)[:, None], points)
         points = np.array([surface.project(x)[0] for x in points])
     return points
+
+
+def fewer(count: int, tolerance: Tolerance) -> int:
+    """Samples to learn from, of ``count`` for the usual tolerance.
+
+    What n samples tell is uncertain by the root of n: a looser tolerance needs fewer, but the root
+    of its looseness is all that is saved, for it may be uncertain, not wrong.
+    """
+    return math.ceil(count / math.sqrt(tolerance.looseness))
 
 
 def spacing_count(surface: Surface, spacing: float) -> int:

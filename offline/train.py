@@ -49,6 +49,7 @@ from offline.refinement import MOST_DOFS, mesh_error_document
 from offline.sampling import (
     area,
     centred_points,
+    fewer,
     neighbours,
     random_points,
     spacing_count,
@@ -101,7 +102,8 @@ RITZ_REACH = 0.8
 """How far from its centre a local model learns from footprints, in units of the patch spacing."""
 
 BATCH, LEAST = 60, 300
-"""Full solutions between two looks at whether they suffice, and the least that calibrate."""
+"""Full solutions between two looks at whether they suffice, and the least that calibrate at the
+usual tolerance."""
 
 CONTACTS_PER_PATCH = 400
 
@@ -492,7 +494,7 @@ class Pipeline:
         What validation says of the estimate is of one calibrated on the other half of the loads.
         """
         rng = np.random.default_rng([self.scene.seed, 3])
-        count = self.scene.training.samples
+        count, least = self.scene.training.samples, fewer(LEAST, self.scene.tolerance)
         loads = random_loads(self.workshop.surface, limits, self.scene, count, rng)
         atlas = self._untested(models, limits)
         rows: list[Comparison] = []
@@ -505,7 +507,7 @@ class Pipeline:
                 for name, load in batch.items()
                 if found[name]["u"].size
             ]
-            if len(rows) >= LEAST and _accurate(rows, self.scene.tolerance):
+            if len(rows) >= least and _accurate(rows, self.scene.tolerance):
                 break
         estimator = calibrate_by_halves(rows, calibrate)
         documents = {
@@ -519,7 +521,8 @@ class Pipeline:
         """Press at half the range on finer and other meshes."""
         rng = np.random.default_rng([self.scene.seed, 5])
         tasks = {}
-        for i, point in enumerate(spread_points(self.surface, REFINED_LOADS, rng)):
+        count = fewer(REFINED_LOADS, self.scene.tolerance)
+        for i, point in enumerate(spread_points(self.surface, count, rng)):
             x, normal, _, fields = self.surface.locate(point, limits)
             tasks[f"mesh-{i}"] = Workshop.mesh_error, Load(x, -normal, float(fields[0]) / 2)
         found = self._stage(

@@ -216,8 +216,8 @@ class LocalModels:
         return self.whole.astype(np.float32) @ self.mix
 
 
-def assemble_patches(body: Body, models: LocalModels, radius: float) -> Patches:
-    """Everything the compiled query needs; ``radius`` (mm) is the largest footprint allowed."""
+def assemble_patches(body: Body, models: LocalModels, scene: Scene) -> Patches:
+    """Everything the compiled query needs for footprints of up to the scene's radius."""
     gradients, surface = body.gradients, body.boundary
     per_element = gradients.shape[1]
     bases = models.basis.reshape(*models.steps.shape, len(body.nodes), 3)
@@ -242,7 +242,7 @@ def assemble_patches(body: Body, models: LocalModels, radius: float) -> Patches:
             point_gradients[k] = np.rint(G / steps[k, :, None])
             weights[k, : len(element)] = models.weights[own]
             mu[k, : len(element)], lam[k, : len(element)] = body.mu[element], body.lam[element]
-            reach = models.extent + radius
+            reach = models.extent + scene.endoscope.radius
             near = np.flatnonzero(np.sum((surface.points - models.centres[k]) ** 2, 1) < reach**2)
             nodes, local = np.unique(surface.nodes[near], return_inverse=True)
             modes[k] = _rows(basis, nodes, C)
@@ -269,6 +269,7 @@ def assemble_patches(body: Body, models: LocalModels, radius: float) -> Patches:
         defect=models.defect,
         guess=np.pad(models.guess, ((0, 0), (0, 0), (0, NARROW - models.guess.shape[2]))),
         blend=models.blend,
+        slack=scene.tolerance.looseness,
     )
 
 
@@ -614,7 +615,7 @@ class Atlas:
         self.limits = limits
         self.models = models
         self.estimators = estimators
-        self.patches = assemble_patches(body, models, scene.endoscope.radius)
+        self.patches = assemble_patches(body, models, scene)
         terms = Terms(
             ground=surface.ground(limits),
             reach=scene.endoscope.reach,

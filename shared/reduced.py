@@ -64,7 +64,8 @@ MAX_ACTIVE = 4
 
 TOLERANCE = 3e-4
 """Residual at equilibrium relative to the load in the wide space: in the energy norm of the rest
-state both are displacements, so this is the solver's share of the error."""
+state both are displacements, so this is the solver's share of the error.  Where a scene's tolerance
+is looser than the usual, so are this, ``FOLLOWED`` and ``MISSED_MOST``: ``Patches.slack``."""
 
 FOLLOWED = 2e-3
 """The same of a warm answer; a cold one misses as much in the wide space (median 4e-3)."""
@@ -529,6 +530,7 @@ class Patches(NamedTuple):
     defect: Field  # (p, PATH_FEATURES, r) force that the points miss, by load_features
     guess: Field  # (p, FEATURES, NARROW), the last column zero
     blend: float  # mm, excess distance over the nearest centre at which a patch fades out
+    slack: float  # times the solver's tolerances
 
 
 POSITION_FEATURES = 6
@@ -963,8 +965,9 @@ def _follow(patches, k, size, secants, origin, scratch):
     start, work = scratch.start, scratch.wide_newton
     energy, smallest = equilibrium.potential(system, start, work[0])
     status, iterations, energy, smallest = descend(
-        system, start, work, energy, smallest, FOLLOWED * size, np.inf, MAX_SECANTS, True, ROUND_OFF
-    )
+        system, start, work, energy, smallest, patches.slack * FOLLOWED * size, np.inf,
+        MAX_SECANTS, True, ROUND_OFF,
+    )  # fmt: skip
     return status, iterations, smallest
 
 
@@ -1009,11 +1012,11 @@ def _solve_narrow(patches, k, size, wide, scratch):
             break
         missed = again
         status, more, energy, smallest = descend(
-            system, q, work, energy, smallest, TOLERANCE * size, REUSE, MAX_ITERATIONS,
-            iterations > 0, ROUND_OFF,
+            system, q, work, energy, smallest, patches.slack * TOLERANCE * size, REUSE,
+            MAX_ITERATIONS, iterations > 0, ROUND_OFF,
         )  # fmt: skip
         iterations += more
-        if missed <= MISSED_MOST:
+        if missed <= patches.slack * MISSED_MOST:
             break
         _merge(scratch)
     _to_wide(q, vectors, wide)

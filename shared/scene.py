@@ -183,6 +183,14 @@ class Tolerance(_Part):
     displacement: Fraction = Field(description="relative L2 error over all nodes")
     von_mises: Fraction = Field(description="relative L2 error over all unclamped nodes")
 
+    @property
+    def looseness(self) -> float:
+        """How many times it is 1 % of displacement and 2 % of stress, at least 1.
+
+        What training and the solver spend on more accuracy than asked for falls with it.
+        """
+        return max(1.0, min(self.displacement / 0.01, self.von_mises / 0.02))
+
 
 class Budget(_Part):
     """The time a query may take."""

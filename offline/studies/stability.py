@@ -3,6 +3,8 @@
 Every method answers the same loads, inside the trained range and far out of it, for which the full
 model's answer is known.  A method that gives a wrong answer and vouches for it has failed silently,
 which is the one failure a user cannot guard against; most methods have no way to fail otherwise.
+One kind of wrong answer is told apart and counted with the others: where a load has several
+equilibria, that which its path does not lead to.
 
 Tissue of another Poisson's ratio is a scene of its own, from which all methods are built anew but
 the artifact.  Only the artifact can start from its last answer: nothing else is asked on the way
@@ -37,6 +39,7 @@ from offline.methods.tetrahedra import scaled
 from offline.studies import stressors
 from offline.studies.stressors import (
     CONTROL,
+    HYSTERESIS,
     SEVERAL,
     Stressors,
     Trial,
@@ -69,8 +72,10 @@ ARTIFACT, WARM, FULL = "artifact", "artifact, warm", "full model, one jump"
 RIGHT = "right"
 RIGHT_FLAGGED = "right but flagged"
 WRONG_FLAGGED = "wrong but flagged"
+ANOTHER_FLAGGED = "another equilibrium but flagged"
 REFUSED = "refused, or rightly none"
 DIVERGED = "not converged"
+ANOTHER = "silently another equilibrium"
 ROUGH = "silently wrong, displacement within 10 %"
 SILENT = "silently wrong"
 INVERTED = "silently inverted"
@@ -79,15 +84,17 @@ OUTCOMES = {
     RIGHT: "#0072B2",
     RIGHT_FLAGGED: "#8CC5E8",
     WRONG_FLAGGED: "#C8C8C8",
+    ANOTHER_FLAGGED: "#EBC9DB",
     REFUSED: "#ECECEC",
     DIVERGED: "#7F7F7F",
+    ANOTHER: "#CC79A7",
     ROUGH: "#F0E442",
     SILENT: "#D55E00",
     INVERTED: "#000000",
 }
 """What can become of an answer, and its colour: after Okabe & Ito, told apart by all eyes."""
 
-SILENT_OUTCOMES = (ROUGH, SILENT, INVERTED)
+SILENT_OUTCOMES = (ANOTHER, ROUGH, SILENT, INVERTED)
 
 
 @dataclass(frozen=True)
@@ -152,7 +159,8 @@ def stability(
         ``artifact``: totals of its silent errors, of answers that are not finite and of crashes,
         and the share of right answers that it flags, overall and in range; ``methods``: outcomes;
         ``without_equilibrium``: cases that the full model has no answer to;
-        ``with_several_equilibria``: cases whose path and jump end apart, a column if there are any.
+        ``with_several_equilibria``, ``with_hysteresis``: cases whose path and jump end apart, of
+        loads that are raised and that are lowered again, a column each if there are any.
     """
     atlas = Atlas.load(artifact)
     workshop = Workshop.of_artifact(read_artifact(artifact))
@@ -224,21 +232,23 @@ def _training(
 def _several(
     trials: Mapping[str, Sequence[Trial]], found: Mapping[str, Sequence[Truth]], most: int
 ) -> dict[str, list[Question]]:
-    """Of all loads that were followed, those of several equilibria."""
-    followed = [
-        pair
-        for name, own in trials.items()
-        for pair in zip(own, found[name], strict=True)
-        if pair[0].follow
-    ]
-    return {SEVERAL: [pair for pair in followed if pair[1].several][:most]} if followed else {}
+    """Of all loads that were followed, those of several equilibria: raised, and lowered again."""
+    followed: dict[str, list[Question]] = {}
+    for name, own in trials.items():
+        for trial, truth in zip(own, found[name], strict=True):
+            if trial.follow:
+                column = followed.setdefault(HYSTERESIS if trial.before else SEVERAL, [])
+                column += [(trial, truth)] if truth.several else []
+    return {name: own[:most] for name, own in followed.items()}
 
 
 def _applies(method: str, trial: Trial, atlas: Atlas) -> bool:
     """Whether a method can be asked at all."""
     if method in (ARTIFACT, WARM) and trial.poisson != atlas.scene.tissue.poisson:
         return False
-    return method in (ARTIFACT, WARM) if trial.before else method != WARM
+    if trial.before:
+        return method in (ARTIFACT, WARM) or (method == FULL and trial.follow)
+    return method != WARM
 
 
 # --- methods -------------------------------------------------------------------------------------
@@ -364,20 +374,30 @@ def _judge(workshop: Workshop, u: Array | None, trusted: bool, truth: Truth) -> 
     if not np.isfinite(u).all():
         return Reply(DIVERGED, nan=True)
     inverted = not workshop.model.internal(u, np.empty_like(u))[1] > 0.0
-    errors = float("nan"), float("nan")
-    if truth.path is not None:
-        errors = workshop.errors(u.reshape(-1, 3), truth.path.reshape(-1, 3))
-    tolerance = workshop.scene.tolerance
-    right = errors[0] <= tolerance.displacement and errors[1] <= tolerance.von_mises
+    errors, right = _against(workshop, u, truth.path)
+    another = not right and _against(workshop, u, truth.other)[1]
     if not trusted:
-        outcome = RIGHT_FLAGGED if right else WRONG_FLAGGED
+        outcome = RIGHT_FLAGGED if right else ANOTHER_FLAGGED if another else WRONG_FLAGGED
     elif inverted:
         outcome = INVERTED
     elif right:
         outcome = RIGHT
+    elif another:
+        outcome = ANOTHER
     else:
         outcome = ROUGH if errors[0] <= ROUGHLY else SILENT
     return Reply(outcome, *errors, inverted)
+
+
+def _against(
+    workshop: Workshop, u: Array, reference: Array | None
+) -> tuple[tuple[float, float], bool]:
+    """Errors of displacement and stress, NaN without a reference; whether they are tolerated."""
+    if reference is None:
+        return (float("nan"), float("nan")), False
+    errors = workshop.errors(u.reshape(-1, 3), reference.reshape(-1, 3))
+    tolerance = workshop.scene.tolerance
+    return errors, errors[0] <= tolerance.displacement and errors[1] <= tolerance.von_mises
 
 
 def _details(solution: Solution) -> dict[str, Any]:
@@ -467,6 +487,7 @@ def _summary(table: Table, questions: Mapping[str, Sequence[Question]]) -> dict[
     report: dict[str, Any] = {
         "without_equilibrium": {stressor: n for stressor, n in missing.items() if n},
         "with_several_equilibria": len(questions.get(SEVERAL, ())),
+        "with_hysteresis": len(questions.get(HYSTERESIS, ())),
     }
     for name in (ARTIFACT, WARM):
         if name in table:
@@ -484,6 +505,7 @@ def _honesty(columns: Mapping[str, Sequence[Reply]]) -> dict[str, Any]:
     return {
         "cases": len(replies),
         "silently_wrong": sum(reply.outcome in SILENT_OUTCOMES for reply in replies),
+        "of_these_another_equilibrium": sum(reply.outcome == ANOTHER for reply in replies),
         "nan": sum(reply.nan for reply in replies),
         "crashes": sum(reply.crashed for reply in replies),
         "right_but_flagged": _flagged(replies),

@@ -2,7 +2,9 @@
 
 The answer that counts is the one tissue comes to when the load is raised from nothing.  Within a
 few times the trained range a single jump finds the same; beyond it the load path is followed in
-small steps, and where the jump ends elsewhere the load has more than one equilibrium.
+small steps, and where the jump ends elsewhere the load has more than one equilibrium.  So it has
+where a load that was raised beyond the range and lowered again leaves the tissue elsewhere than
+one raised from nothing does: there what counts is where the way has led.
 """
 
 from __future__ import annotations
@@ -35,8 +37,17 @@ STRESS = 102
 
 CONTROL, SEVERAL = "inside the range", "several equilibria"
 
+LOWERED, HYSTERESIS = "raised, then lowered", "lowered, several equilibria"
+
 FACTORS = (1.5, 2.0, 4.0, 8.0)
 """Load jumps: pressures over the trained maximum."""
+
+RAISED, SNAPPED = (2.0, 2.0), (1.5, 4.0)
+"""The highest pressure over the trained maximum of a load that is lowered into the range again, at
+random between two: of any, and of those that are searched for several equilibria."""
+
+SEARCHED = 3
+"""Of the latter, for each one wanted: about one in twenty on the turbinate stays elsewhere."""
 
 TILTS = (45.0, 60.0)
 """Degrees."""
@@ -59,7 +70,7 @@ OFF = 0.5
 """Points as far from the accessible surface (mm) count as off it."""
 
 PATH_STEPS = 8
-"""Of a load path."""
+"""Of a load path; of one that is lowered again half of them lead up."""
 
 APART = 0.01
 """Two equilibria that differ by more are not the same."""
@@ -80,7 +91,7 @@ class Trial:
     before : tuple of Case
         Where the tool has been.
     follow : bool
-        Whether the full model follows the load path.
+        Whether the full model follows the load path: from nothing, or through the loads before.
     """
 
     case: Case
@@ -96,7 +107,7 @@ class Truth:
     Attributes
     ----------
     path, jump : ndarray or None
-        At the end of the load path, and in one jump from rest.
+        At the end of the load path, which is the answer that counts, and in one jump from rest.
     """
 
     path: Array | None
@@ -105,9 +116,14 @@ class Truth:
     @property
     def several(self) -> bool:
         """Whether path and jump end in different equilibria."""
-        if self.path is None or self.jump is None:
-            return False
-        return relative(self.jump, self.path) > APART
+        return self.path is not None and self.other is not None
+
+    @property
+    def other(self) -> Array | None:
+        """The equilibrium of the jump where it is not that of the path."""
+        if self.path is None or self.jump is None or relative(self.jump, self.path) > APART:
+            return self.jump
+        return None
 
 
 class Stressors:
@@ -145,6 +161,8 @@ class Stressors:
             **{f"Poisson {ratio:g}": partial(self._in_tissue, ratio) for ratio in RATIOS},
             **{f"tool moves {step:g} mm": partial(self._moves, step) for step in STEPS},
             TELEPORT: self._teleports,
+            LOWERED: partial(self._lowered, RAISED, self._count),
+            HYSTERESIS: partial(self._lowered, SNAPPED, SEARCHED * self._count),
         }
 
     def trials(self) -> dict[str, list[Trial]]:
@@ -181,6 +199,21 @@ class Stressors:
     def _extreme(self, rng: np.random.Generator) -> list[Trial]:
         loads = self._loads(rng)
         return [self._raised(load, rng.uniform(FACTORS[0], FACTORS[-1])) for load in loads]
+
+    def _lowered(
+        self, peaks: tuple[float, float], count: int, rng: np.random.Generator
+    ) -> list[Trial]:
+        loads = self._loads(rng, count)
+        return [self._up_and_down(load, rng.uniform(*peaks)) for load in loads]
+
+    def _up_and_down(self, load: Load, factor: float) -> Trial:
+        """A load in range that comes down from a multiple of the limit."""
+        peak, half = factor * self._limit(load.position, load.direction), PATH_STEPS // 2
+        turns = np.interp(
+            np.arange(1, PATH_STEPS + 1), (0, half, PATH_STEPS), (0, peak, load.pressure)
+        )
+        way = [replace(load, pressure=float(pressure)) for pressure in turns]
+        return replace(self._way(way), follow=True)
 
     def _tilted(self, tilt: float, rng: np.random.Generator) -> list[Trial]:
         loads = []
@@ -273,23 +306,32 @@ def tissue(workshop: Workshop, poisson: float) -> Workshop:
     return Workshop(scene.model_copy(update={"tissue": other}), workshop.mesh)
 
 
-def press(workshop: Workshop, poisson: float, case: Case, follow: bool) -> Truth:
-    """What the full model makes of a case, on the path to it and in one jump."""
-    own = tissue(workshop, poisson)
-    load = np.zeros((len(own.mesh.nodes), 3))
-    load[case.nodes] = case.forces
-    if not follow:
-        jump = _raise(own, load, 1, FINEST)
+def press(workshop: Workshop, trial: Trial) -> Truth:
+    """What the full model makes of a trial, on the path to it and in one jump."""
+    own = tissue(workshop, trial.poisson)
+    load = _forces(own, trial.case)
+    if not trial.follow:
+        jump = _lead(own, [load], FINEST)
         return Truth(jump, jump)
-    return Truth(_raise(own, load, PATH_STEPS, 1.0), _raise(own, load, 1, 1.0))
+    path = [_forces(own, case) for case in (*trial.before, trial.case)]
+    if not trial.before:
+        path = [(i + 1) / PATH_STEPS * load for i in range(PATH_STEPS)]
+    return Truth(_lead(own, path, 1.0), _lead(own, [load], 1.0))
 
 
-def _raise(workshop: Workshop, load: Array, steps: int, finest: float) -> Array | None:
-    """Displacement (3 n,) mm under a load raised from nothing in equal steps."""
+def _forces(workshop: Workshop, case: Case) -> Array:
+    """Nodal forces (n, 3) mN."""
+    load = np.zeros((len(workshop.mesh.nodes), 3))
+    load[case.nodes] = case.forces
+    return load
+
+
+def _lead(workshop: Workshop, loads: Sequence[Array], finest: float) -> Array | None:
+    """Displacement (3 n,) mm at the end of a path of loads from nothing."""
     u = None
-    for i in range(steps):
+    for load in loads:
         try:
-            found = workshop.model.solve((i + 1) / steps * load, u, smallest_step=finest)
+            found = workshop.model.solve(load, u, smallest_step=finest)
         except NoEquilibrium:
             return None
         u = found.displacement
@@ -301,10 +343,7 @@ def truths(
 ) -> dict[str, list[Truth]]:
     """What the full model makes of the trials of each stressor."""
     names = {(name, i): f"{name}-{i}" for name, own in trials.items() for i in range(len(own))}
-    tasks = {
-        text: (press, (trial := trials[name][i]).poisson, trial.case, trial.follow)
-        for (name, i), text in names.items()
-    }
+    tasks = {text: (press, trials[name][i]) for (name, i), text in names.items()}
     found = resume("full solutions", pool, checkpoint, tasks, _pack)
     answers: dict[str, list[Truth]] = {name: [] for name in trials}
     for (name, _), text in names.items():

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from offline.choose import LADDER, MARGIN, WORST, Trial, TrialResult, choose
+from offline.choose import LADDER, MARGIN, RUNG, WORST, Trial, TrialResult, choose
+from offline.sampling import fewer
 from shared.scene import Budget, Tolerance
 
 BUDGET = Budget(query=150e-6)
@@ -21,13 +22,23 @@ def attempts(errors, seconds=50e-6):
     return attempt, tried
 
 
-@pytest.mark.parametrize("smallest", range(len(LADDER)))
-def test_the_smallest_size_that_is_good_enough(smallest):
-    errors = [0.02 if i < smallest else 0.007 for i in range(len(LADDER))]
-    attempt, tried = attempts(errors)
+PLACES = range(len(LADDER))
+
+
+@pytest.mark.parametrize("smallest", PLACES)
+@pytest.mark.parametrize(
+    ("errors", "most"),
+    [
+        (lambda k: 0.0075 * RUNG**k, 3),  # as sizes are expected to differ
+        (lambda k: 0.02 if k < 0 else 0.007, len(LADDER)),
+        (lambda k: 1.0 if k < 0 else 0.0, len(LADDER)),
+    ],
+)
+def test_the_smallest_size_that_is_good_enough(smallest, errors, most):
+    attempt, tried = attempts([errors(i - smallest) for i in PLACES])
     choice = choose(Tolerance(displacement=0.01, von_mises=0.02), BUDGET, attempt)
     assert choice.size == LADDER[smallest]
-    assert len(tried) == len(set(tried)) <= 3
+    assert len(tried) == len(set(tried)) <= most
     assert choice.why.startswith("the smallest")
     assert [LADDER.index(trial.size) for trial in choice.trials] == sorted(tried)
 
@@ -39,6 +50,13 @@ def test_a_looser_tolerance_takes_a_smaller_model():
         for t in (0.01, 0.02, 0.05)
     ]
     assert sizes == [LADDER[3], LADDER[1], LADDER[0]]
+
+
+def test_a_loose_tolerance_pays_for_no_trial_of_a_large_model():
+    errors = [0.03 * RUNG**i for i in PLACES]
+    attempt, tried = attempts(errors)
+    choose(Tolerance(displacement=0.05, von_mises=0.1), BUDGET, attempt)
+    assert tried == [0]
 
 
 def test_a_tolerance_out_of_reach_is_said_plainly():
@@ -69,3 +87,11 @@ def test_a_single_wild_error_is_not_outweighed_by_many_good_ones():
     wild = np.append(error, 1.01 * WORST * 0.01)
     assert good.meets(tolerance)
     assert not Trial.of(LADDER[0], [TrialResult(wild, error, 1e-4)]).meets(tolerance)
+
+
+def test_a_looser_tolerance_is_served_by_fewer_samples():
+    usual = Tolerance(displacement=0.01, von_mises=0.02)
+    loose = Tolerance(displacement=0.04, von_mises=0.1)
+    tight = Tolerance(displacement=0.001, von_mises=0.02)
+    assert [fewer(300, tolerance) for tolerance in (usual, loose, tight)] == [300, 150, 300]
+    assert fewer(1, loose) == 1

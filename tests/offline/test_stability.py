@@ -1,21 +1,40 @@
 """The map of failures: the artifact never fails silently, others do, and the study resumes."""
 
 import csv
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from offline.full_model import NoEquilibrium
+from offline.methods.method import Case
+from offline.scenes import find_scene
 from offline.studies import stability as study
 from offline.studies.stability import (
+    ANOTHER,
+    ANOTHER_FLAGGED,
     ARTIFACT,
     FULL,
     OUTCOMES,
     RIGHT,
     RIGHT_FLAGGED,
+    SILENT,
     SILENT_OUTCOMES,
     WARM,
+    WRONG_FLAGGED,
     stability,
 )
-from offline.studies.stressors import CONTROL, TELEPORT
+from offline.studies.stressors import (
+    CONTROL,
+    HYSTERESIS,
+    LOWERED,
+    SEVERAL,
+    TELEPORT,
+    Trial,
+    Truth,
+    press,
+)
+from offline.workshop import Load, Workshop
 
 CASES, SNAPSHOTS, SEED = 3, 50, 1
 
@@ -23,7 +42,7 @@ METHODS = (ARTIFACT, WARM, FULL, "derivatives 19", "pod 40", "pod 40, no line se
 
 COLUMNS = (
     CONTROL, "load x 4", "tilt 60°", "off surface, out of reach", "half the radius",
-    "1.5 x the radius", "two contacts", "Poisson 0.49", "tool moves 0.5 mm", TELEPORT,
+    "1.5 x the radius", "two contacts", "Poisson 0.49", "tool moves 0.5 mm", TELEPORT, LOWERED,
 )  # fmt: skip
 
 
@@ -86,3 +105,70 @@ def test_a_killed_run_goes_on_where_it_stopped(report, artifact, monkeypatch):
             run(artifact)
     monkeypatch.setattr(study, "_ask", lambda *_: pytest.fail("asked again"))
     assert run(artifact) == report
+
+
+class Buckled:
+    """A body of one node: its z is u + 2, ``u³ − 3 u = f − 3``; it snaps on at 5 mN, back at 1."""
+
+    mesh = SimpleNamespace(nodes=np.zeros((1, 3)))
+    scene = SimpleNamespace(tissue=SimpleNamespace(poisson=0.45))
+
+    @property
+    def model(self):
+        return self
+
+    def solve(self, load, start=None, smallest_step=1.0):
+        z = 0.0 if start is None else start[0, 2]
+        roots = np.roots([1.0, 0.0, -3.0, 3.0 - load[0, 2]]) + 2.0
+        stable = [r.real for r in roots if abs(r.imag) < 1e-9 and abs(r.real - 2.0) > 1.0]
+        if not stable:
+            raise NoEquilibrium("load: none")
+        u = np.zeros((1, 3))
+        u[0, 2] = min(stable, key=lambda root: abs(root - z))
+        return SimpleNamespace(displacement=u)
+
+
+def buckled(*forces):
+    """A trial that leads through forces on that node, and what the full model makes of it."""
+    cases = [Case((), np.array([0]), np.array([[0.0, 0.0, force]])) for force in forces]
+    trial = Trial(cases[-1], 0.45, tuple(cases[:-1]), follow=True)
+    return trial, press(Buckled(), trial)
+
+
+def test_a_load_that_snapped_and_was_lowered_stays_on_its_branch():
+    raised, lowered = buckled(3.0), buckled(3.0, 6.0, 3.0)
+    assert not raised[1].several
+    assert raised[1].path[2] == pytest.approx(2.0 - 3**0.5)
+    assert lowered[1].path[2] == pytest.approx(2.0 + 3**0.5)
+    assert lowered[1].other[2] == pytest.approx(2.0 - 3**0.5)
+    assert not buckled(3.0, 6.0, 0.5)[1].several  # lowered so far that it snaps back
+    trials = {LOWERED: [raised[0], lowered[0]]}
+    found = {LOWERED: [raised[1], lowered[1]]}
+    assert study._several(trials, found, 9) == {SEVERAL: [], HYSTERESIS: [lowered]}
+
+
+@pytest.fixture(scope="module")
+def workshop():
+    return Workshop(find_scene("quick"))
+
+
+def test_an_answer_on_another_branch_is_told_apart_and_counts_as_silent(workshop):
+    x, normal, _ = workshop.surface.project(np.array([4.0, 5.5, 8.0]))
+    path, jump = (workshop.sample(Load(x, -normal, p)).ravel().astype(float) for p in (1.5, 1.0))
+    truth = Truth(path, jump)
+    outcomes = {
+        trusted: [
+            study._judge(workshop, u, trusted, truth).outcome for u in (path, jump, 0.5 * jump)
+        ]
+        for trusted in (True, False)
+    }
+    assert outcomes[True] == [RIGHT, ANOTHER, SILENT]
+    assert outcomes[False] == [RIGHT_FLAGGED, ANOTHER_FLAGGED, WRONG_FLAGGED]
+    assert ANOTHER in SILENT_OUTCOMES
+    assert study._judge(workshop, jump, True, Truth(None, jump)).outcome == ANOTHER
+    assert study._judge(workshop, jump, True, Truth(path, path)).outcome == SILENT
+
+
+def test_the_full_model_is_followed_up_and_down_beside_the_warm_artifact(rows):
+    assert {name for name, stressor in rows if stressor == LOWERED} == {ARTIFACT, WARM, FULL}
+    assert int(rows[FULL, LOWERED][RIGHT]) == CASES

@@ -52,7 +52,7 @@ class OnePatch:
     """A local model by itself, stepped through loads."""
 
     def __init__(self, atlas, prony, models, x, limit):
-        self.patches = assemble_patches(atlas.body, models, atlas.scene.endoscope.radius)
+        self.patches = assemble_patches(atlas.body, models, atlas.scene)
         self.state = State(self.patches, atlas.surface.clusters)
         _, r, _ = self.patches.gradients.shape
         points = self.patches.weights.shape[1]

@@ -11,7 +11,16 @@ from offline.workshop import Load, Workshop
 from shared import equilibrium
 from shared.artifact import read_artifact
 from shared.atlas import Atlas, assemble_patches
-from shared.reduced import FOLLOWED, NARROW, ROUND_OFF, STATE, LocalSystem, descend
+from shared.reduced import (
+    FOLLOWED,
+    ITERATIONS,
+    NARROW,
+    ROUND_OFF,
+    STATE,
+    LocalSystem,
+    descend,
+)
+from shared.scene import Tolerance
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +59,7 @@ def galerkin(atlas, workshop):
 
 @pytest.fixture(scope="module")
 def patches(atlas, galerkin):
-    return assemble_patches(atlas.body, galerkin, atlas.scene.endoscope.radius)
+    return assemble_patches(atlas.body, galerkin, atlas.scene)
 
 
 @pytest.fixture(scope="module")
@@ -313,3 +322,21 @@ def test_across_a_border_it_jumps_no_more_than_the_full_model(atlas, path, borde
 
 def test_nor_does_it_when_warm(atlas, path, border):
     assert jumps(atlas, path, border[2], atlas.new_state()) <= 0.01
+
+
+def test_a_loose_tolerance_is_answered_in_fewer_iterations_and_well_within_it(atlas, galerkin):
+    tolerance = Tolerance(displacement=0.05, von_mises=0.1)
+    loose = atlas.scene.model_copy(update={"tolerance": tolerance})
+    trainers = [
+        LocalTrainer(scene, atlas.body, atlas.surface, galerkin) for scene in (atlas.scene, loose)
+    ]
+    x, normal, _, fields = atlas.surface.locate(galerkin.centres[0], atlas.limits)
+    iterations = [0.0, 0.0]
+    for share in np.linspace(0.1, 1.0, 10):
+        for i, trainer in enumerate(trainers):
+            assert trainer.solve(x, -normal, share * fields[0])
+            iterations[i] += trainer.state.outcome.scalars[ITERATIONS]
+        strict, other = (trainer.wide for trainer in trainers)
+        # in the norm of energy, which stresses follow
+        assert norm(other - strict) < 0.3 * tolerance.von_mises * norm(strict)
+    assert iterations[1] < iterations[0]

@@ -5,7 +5,7 @@ import re
 import pytest
 from pydantic import ValidationError
 
-from shared.scene import Block, Extrusion, Scene, SceneError, load_scene, parse_scene
+from shared.scene import Block, Extrusion, Scene, SceneError, Tolerance, load_scene, parse_scene
 
 SLAB = """
 name = "slab"
@@ -81,6 +81,17 @@ def test_a_scene_is_immutable() -> None:
     scene = parse_scene(SLAB)
     with pytest.raises(ValidationError):
         scene.tissue.young = 1.0  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("displacement", "von_mises", "looseness"),
+    [(0.01, 0.02, 1.0), (0.05, 0.1, 5.0), (0.05, 0.02, 1.0), (0.005, 0.2, 1.0)],
+)
+def test_a_tolerance_is_as_loose_as_the_stricter_of_its_parts(
+    displacement, von_mises, looseness
+) -> None:
+    tolerance = Tolerance(displacement=displacement, von_mises=von_mises)
+    assert tolerance.looseness == pytest.approx(looseness)
 
 
 def test_load_scene_knows_its_folder(tmp_path) -> None:
