@@ -297,44 +297,45 @@ def mesh_independence(queries: int, seed: int, as_json: bool) -> None:
         _show(compare(queries, seed, Path(folder)), as_json)
 
 
-@study.command()
-@click.option(
+paper_report = click.option(
     "--report",
     type=click.Path(file_okay=False, path_type=Path),
-    default=Path("artifacts/cube/report"),
-    show_default=True,
-    help="Folder for the table and the chart.",
+    help="Folder for table and pictures  [default: artifacts/SCENE/report]",
 )
+
+
+@study.command()
+@click.argument("scene", type=click.Choice(["cube", "cube-visco"]), default="cube")
+@paper_report
 @json_option
-def cube(report: Path, as_json: bool) -> None:
+def cube(scene: str, report: Path | None, as_json: bool) -> None:
     """Redraw figure 1 of Radermacher & Reese.
 
     A cube under compression in modal, Ritz and POD bases: relative error at a point and ratio of
-    CPU times against the number of bases, and which of the paper's claims hold.
+    CPU times against the number of bases, and which of the paper's claims hold. SCENE cube-visco is
+    of tissue that knows time: pressed, held and let go.
     """
-    from offline.studies.paper import cube
+    from offline.studies import paper, paper_in_time
 
-    _show(cube(report), as_json)
+    study = paper_in_time if scene == "cube-visco" else paper
+    _show(study.cube(report or Path("artifacts", scene, "report")), as_json)
 
 
 @study.command()
-@click.option(
-    "--report",
-    type=click.Path(file_okay=False, path_type=Path),
-    default=Path("artifacts/turbinate/report"),
-    show_default=True,
-    help="Folder for the table, the chart and the contours.",
-)
+@click.argument("scene", type=click.Choice(["turbinate", "turbinate-visco"]), default="turbinate")
+@paper_report
 @json_option
-def turbinate(report: Path, as_json: bool) -> None:
+def turbinate(scene: str, report: Path | None, as_json: bool) -> None:
     """Redraw figures 1, 2c and 2d of Radermacher & Reese.
 
     The turbinate under one footprint in modal, Ritz and POD bases, and contours of the relative
-    errors in five POD bases. Needs PyVista: pip install -e '.[pictures]'.
+    errors in five POD bases, for which PyVista is needed: pip install -e '.[pictures]'. SCENE
+    turbinate-visco is of tissue that knows time, pressed, held and let go; without contours.
     """
-    from offline.studies.paper import turbinate
+    from offline.studies import paper, paper_in_time
 
-    _show(turbinate(report), as_json)
+    study = paper_in_time if scene == "turbinate-visco" else paper
+    _show(study.turbinate(report or Path("artifacts", scene, "report")), as_json)
 
 
 @study.command("newton-step")

@@ -387,7 +387,7 @@ def _correct(system, residual, step):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def step_patch(patches, k, deviatoric, time, load, memory, scratch):
+def step_patch(patches, k, deviatoric, time, load, memory, scratch, accurate=ACCURATE):
     """Equilibrium of local model k under a load at the end of a time step.
 
     Parameters
@@ -400,6 +400,8 @@ def step_patch(patches, k, deviatoric, time, load, memory, scratch):
     memory : Memory
         Goes to the end of the step if that has an answer, else it stays as it is.
     scratch : Scratch
+    accurate : float
+        Residual at equilibrium relative to load and past.
 
     Returns
     -------
@@ -425,7 +427,7 @@ def step_patch(patches, k, deviatoric, time, load, memory, scratch):
     for i in range(len(past)):
         scratch.load[i] = load[i] + exerted[i]
         size += max(load[i] ** 2, exerted[i] ** 2)
-    target = ACCURATE * max(math.sqrt(size), 1e-9)
+    target = accurate * max(math.sqrt(size), 1e-9)
     system = PastSystem(
         gradients, steps, weights, mu, lam, deviatoric, scratch.load, loss, scratch.B, scratch.S,
         scratch.H, scratch.P, scratch.J, scratch.trace, scratch.linear, scratch.stepped,
