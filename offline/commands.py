@@ -374,6 +374,62 @@ def stability(scene: str, artifact: Path | None, cases: int, seed: int, as_json:
     _show(stability(path, cases, seed), as_json)
 
 
+@study.command("chart-in-time")
+@artifact_argument
+@click.option(
+    "--histories",
+    type=click.IntRange(min=1),
+    default=20,
+    show_default=True,
+    help="That all methods answer.",
+)
+@click.option(
+    "--lessons",
+    type=click.IntRange(min=1),
+    default=20,
+    show_default=True,
+    help="Histories that POD learns from.",
+)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@json_option
+def chart_in_time(artifact: Path, histories: int, lessons: int, seed: int, as_json: bool) -> None:
+    """Set speed and accuracy of methods over histories side by side.
+
+    The visco-elastic artifact F, its twin without memory, the full model and Galerkin models with
+    all quadrature points in modal, Ritz and POD bases answer the HISTORIES that palpate validate
+    asks with this seed. Table and picture go to NAME/report/chart_in_time.csv and .png beside the
+    artifact.
+    """
+    from offline.studies.chart_in_time import chart_in_time
+
+    _show(chart_in_time(artifact, histories, lessons, seed), as_json)
+
+
+@study.command("stability-in-time")
+@artifact_argument
+@click.option("--cases", type=click.IntRange(min=1), default=4, show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option(
+    "--many",
+    type=click.IntRange(min=100),
+    default=100_000,
+    show_default=True,
+    help="Steps of the longest history.",
+)
+@json_option
+def stability_in_time(artifact: Path, cases: int, seed: int, many: int, as_json: bool) -> None:
+    """Map which methods fail under which histories, and whether they say so.
+
+    The visco-elastic artifact F, under footprints and its rigid tip, and other methods answer
+    histories in CASES places: very small and large steps, long holds, sudden reversals, contacts
+    that teleport and more. The map goes to NAME/report/stability_in_time.csv and .png beside the
+    artifact.
+    """
+    from offline.studies.stability_in_time import stability_in_time
+
+    _show(stability_in_time(artifact, cases, seed, many), as_json)
+
+
 @study.command()
 @artifact_argument
 @click.option("--at", "position", type=VECTOR, metavar="X Y Z", help="mm  [default: the middle]")

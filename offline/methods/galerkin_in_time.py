@@ -91,6 +91,10 @@ class GalerkinInTime:
         converged = status == equilibrium.CONVERGED
         return converged, after if converged else past
 
+    def trusted(self, past: Memory) -> bool:
+        """See ``InTime``."""
+        return True
+
     def displacement(self, past: Memory) -> Array:
         """See ``InTime``."""
         return (self._modes @ past.wide).reshape(-1, 3)
