@@ -301,8 +301,8 @@ def _draw_panel(axes: Any, field: str, points: Sequence[Point], scene: Scene) ->
     tolerance = getattr(scene.tolerance, field)
     axes.axhline(tolerance, color="#D55E00", lw=0.9, ls=":")
     axes.annotate(
-        f"the scene's tolerance: {percent(tolerance)}", (axes.get_xlim()[0], tolerance), (6, 4),
-        textcoords="offset points", color="#A34700",
+        f"the scene's tolerance: {percent(tolerance)}", (axes.get_xlim()[1], tolerance), (-6, 5),
+        textcoords="offset points", ha="right", color="#A34700",
     )  # fmt: skip
     error = percent(shipped.error(field, "p95"))
     axes.annotate(
