@@ -297,44 +297,45 @@ def mesh_independence(queries: int, seed: int, as_json: bool) -> None:
         _show(compare(queries, seed, Path(folder)), as_json)
 
 
-@study.command()
-@click.option(
+paper_report = click.option(
     "--report",
     type=click.Path(file_okay=False, path_type=Path),
-    default=Path("artifacts/cube/report"),
-    show_default=True,
-    help="Folder for the table and the chart.",
+    help="Folder for table and pictures  [default: artifacts/SCENE/report]",
 )
+
+
+@study.command()
+@click.argument("scene", type=click.Choice(["cube", "cube-visco"]), default="cube")
+@paper_report
 @json_option
-def cube(report: Path, as_json: bool) -> None:
+def cube(scene: str, report: Path | None, as_json: bool) -> None:
     """Redraw figure 1 of Radermacher & Reese.
 
     A cube under compression in modal, Ritz and POD bases: relative error at a point and ratio of
-    CPU times against the number of bases, and which of the paper's claims hold.
+    CPU times against the number of bases, and which of the paper's claims hold. SCENE cube-visco is
+    of tissue that knows time: pressed, held and let go.
     """
-    from offline.studies.paper import cube
+    from offline.studies import paper, paper_in_time
 
-    _show(cube(report), as_json)
+    study = paper_in_time if scene == "cube-visco" else paper
+    _show(study.cube(report or Path("artifacts", scene, "report")), as_json)
 
 
 @study.command()
-@click.option(
-    "--report",
-    type=click.Path(file_okay=False, path_type=Path),
-    default=Path("artifacts/turbinate/report"),
-    show_default=True,
-    help="Folder for the table, the chart and the contours.",
-)
+@click.argument("scene", type=click.Choice(["turbinate", "turbinate-visco"]), default="turbinate")
+@paper_report
 @json_option
-def turbinate(report: Path, as_json: bool) -> None:
+def turbinate(scene: str, report: Path | None, as_json: bool) -> None:
     """Redraw figures 1, 2c and 2d of Radermacher & Reese.
 
     The turbinate under one footprint in modal, Ritz and POD bases, and contours of the relative
-    errors in five POD bases. Needs PyVista: pip install -e '.[pictures]'.
+    errors in five POD bases, for which PyVista is needed: pip install -e '.[pictures]'. SCENE
+    turbinate-visco is of tissue that knows time, pressed, held and let go; without contours.
     """
-    from offline.studies.paper import turbinate
+    from offline.studies import paper, paper_in_time
 
-    _show(turbinate(report), as_json)
+    study = paper_in_time if scene == "turbinate-visco" else paper
+    _show(study.turbinate(report or Path("artifacts", scene, "report")), as_json)
 
 
 @study.command("newton-step")
@@ -371,6 +372,62 @@ def stability(scene: str, artifact: Path | None, cases: int, seed: int, as_json:
 
     path = artifact or default_artifact(find_scene(scene))
     _show(stability(path, cases, seed), as_json)
+
+
+@study.command("chart-in-time")
+@artifact_argument
+@click.option(
+    "--histories",
+    type=click.IntRange(min=1),
+    default=20,
+    show_default=True,
+    help="That all methods answer.",
+)
+@click.option(
+    "--lessons",
+    type=click.IntRange(min=1),
+    default=20,
+    show_default=True,
+    help="Histories that POD learns from.",
+)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@json_option
+def chart_in_time(artifact: Path, histories: int, lessons: int, seed: int, as_json: bool) -> None:
+    """Set speed and accuracy of methods over histories side by side.
+
+    The visco-elastic artifact F, its twin without memory, the full model and Galerkin models with
+    all quadrature points in modal, Ritz and POD bases answer the HISTORIES that palpate validate
+    asks with this seed. Table and picture go to NAME/report/chart_in_time.csv and .png beside the
+    artifact.
+    """
+    from offline.studies.chart_in_time import chart_in_time
+
+    _show(chart_in_time(artifact, histories, lessons, seed), as_json)
+
+
+@study.command("stability-in-time")
+@artifact_argument
+@click.option("--cases", type=click.IntRange(min=1), default=4, show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option(
+    "--many",
+    type=click.IntRange(min=100),
+    default=100_000,
+    show_default=True,
+    help="Steps of the longest history.",
+)
+@json_option
+def stability_in_time(artifact: Path, cases: int, seed: int, many: int, as_json: bool) -> None:
+    """Map which methods fail under which histories, and whether they say so.
+
+    The visco-elastic artifact F, under footprints and its rigid tip, and other methods answer
+    histories in CASES places: very small and large steps, long holds, sudden reversals, contacts
+    that teleport and more. The map goes to NAME/report/stability_in_time.csv and .png beside the
+    artifact.
+    """
+    from offline.studies.stability_in_time import stability_in_time
+
+    _show(stability_in_time(artifact, cases, seed, many), as_json)
 
 
 @study.command()

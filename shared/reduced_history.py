@@ -66,6 +66,10 @@ SYMMETRIC = 6
 ACCURATE = 1e-3
 """Residual at equilibrium relative to load and past, as ``shared.reduced.TOLERANCE``."""
 
+AT_REST = 3e-7
+"""Residual in the energy norm, (mN mm)^(1/2), that counts as equilibrium under any load: where all
+is lifted before time passes nothing is left to be relative to, and energies drown in round-off."""
+
 MOST_ITERATIONS = 40
 MOST_ITERATIONS_ANEW = 200
 
@@ -387,7 +391,7 @@ def _correct(system, residual, step):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def step_patch(patches, k, deviatoric, time, load, memory, scratch):
+def step_patch(patches, k, deviatoric, time, load, memory, scratch, accurate=ACCURATE):
     """Equilibrium of local model k under a load at the end of a time step.
 
     Parameters
@@ -400,6 +404,8 @@ def step_patch(patches, k, deviatoric, time, load, memory, scratch):
     memory : Memory
         Goes to the end of the step if that has an answer, else it stays as it is.
     scratch : Scratch
+    accurate : float
+        Residual at equilibrium relative to load and past.
 
     Returns
     -------
@@ -425,7 +431,7 @@ def step_patch(patches, k, deviatoric, time, load, memory, scratch):
     for i in range(len(past)):
         scratch.load[i] = load[i] + exerted[i]
         size += max(load[i] ** 2, exerted[i] ** 2)
-    target = ACCURATE * max(math.sqrt(size), 1e-9)
+    target = max(accurate * math.sqrt(size), AT_REST)
     system = PastSystem(
         gradients, steps, weights, mu, lam, deviatoric, scratch.load, loss, scratch.B, scratch.S,
         scratch.H, scratch.P, scratch.J, scratch.trace, scratch.linear, scratch.stepped,

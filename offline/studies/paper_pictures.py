@@ -54,8 +54,8 @@ def chart(path: Path, rows: list[dict[str, Any]], title: str) -> None:
         ratios.plot([row["bases"] for row in timed], [row["cpu_ratio"] for row in timed], **style)
     errors.axhline(100 * TOLERANCE, color="0.4", linestyle=":")
     ticks = sorted({row["bases"] for row in rows})
-    words = {"ha": "right", "va": "top", "color": "0.3"}
-    errors.text(ticks[-1], 80 * TOLERANCE, "tolerance of the reduced solver", **words)
+    words = {"va": "top", "color": "0.3", "fontsize": 9}
+    errors.text(ticks[0], 80 * TOLERANCE, "tolerance of the solver", **words)
     plain = FuncFormatter(lambda value, _: f"{value:g}")
     for axes in (errors, ratios):
         axes.set_xscale("log")

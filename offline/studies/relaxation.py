@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,11 @@ Array = NDArray[np.float64]
 PRESSED = 0.8
 """Pressure over its limit."""
 
+Phases = Sequence[tuple[float, int, float]]
+"""Of a course: seconds, steps, and the share of the load at the end."""
+
 PHASES = ((0.2, 10, 1.0), (4.0, 40, 1.0), (0.1, 5, 0.0), (4.0, 40, 0.0))
-"""Press, hold, release, rest: seconds, steps, and the share of the pressure at the end."""
+"""Press, hold, release, rest."""
 
 
 def relaxation(artifact: Path, position: Array | None = None) -> dict[str, Any]:
@@ -50,7 +54,9 @@ def relaxation(artifact: Path, position: Array | None = None) -> dict[str, Any]:
     if position is None:
         position = vertices[((vertices - vertices.mean(axis=0)) ** 2).sum(axis=1).argmin()]
     x, normal, _, fields = atlas.surface.locate(position, atlas.limits)
-    presses = [Press(dt, x, -normal, share * PRESSED * float(fields[0])) for dt, share in _course()]
+    presses = [
+        Press(dt, x, -normal, share * PRESSED * float(fields[0])) for dt, share in course(PHASES)
+    ]
     play(atlas, presses[:2])  # compiles
     moments = play(atlas, presses)
     force = np.array([np.linalg.norm(moment.force) for moment in moments])
@@ -71,10 +77,10 @@ def relaxation(artifact: Path, position: Array | None = None) -> dict[str, Any]:
     }
 
 
-def _course() -> list[tuple[float, float]]:
-    """Time steps and shares of the pressure at their ends."""
+def course(phases: Phases) -> list[tuple[float, float]]:
+    """Time steps (s) and shares of the load at their ends."""
     course, level = [], 0.0
-    for seconds, steps, share in PHASES:
+    for seconds, steps, share in phases:
         rest = share == level  # as less happens, steps grow
         ends = seconds * np.linspace(0, 1, steps + 1) ** (2 if rest else 1)
         levels = np.linspace(level, share, steps + 1)

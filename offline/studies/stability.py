@@ -431,7 +431,7 @@ def _publish(
     """Write the map, forget what it was made of, and sum it up."""
     report.mkdir(parents=True, exist_ok=True)
     rows = [
-        _row(method, stressor, table[method][stressor])
+        table_row(method, stressor, table[method][stressor])
         for method in table
         for stressor in questions
         if stressor in table[method]
@@ -445,15 +445,16 @@ def _publish(
         for i, reply in enumerate(replies)
         if reply.details
     ]
-    _write(report / "stability.csv", rows)
-    _write(report / "stability_silent.csv", silent)
+    write_table(report / "stability.csv", rows)
+    write_table(report / "stability_silent.csv", silent)
     draw(report / "stability.png", rows, [name for name, own in questions.items() if own])
     for checkpoint in checkpoints:
         checkpoint.remove()
     return _summary(table, questions)
 
 
-def _row(method: str, stressor: str, replies: Sequence[Reply]) -> dict[str, Any]:
+def table_row(method: str, stressor: str, replies: Sequence[Reply]) -> dict[str, Any]:
+    """What became of the cases of a stressor: counts of outcomes, median and largest errors."""
     counts = Counter(reply.outcome for reply in replies)
     row: dict[str, Any] = {"method": method, "stressor": stressor, "cases": len(replies)}
     row |= {outcome: counts[outcome] for outcome in OUTCOMES}
@@ -466,7 +467,8 @@ def _row(method: str, stressor: str, replies: Sequence[Reply]) -> dict[str, Any]
     return row
 
 
-def _write(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows of equal keys as CSV."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]) if rows else ["method"], lineterminator="\n")
         writer.writeheader()
@@ -519,7 +521,9 @@ def _flagged(replies: Sequence[Reply]) -> float:
     return counts[RIGHT_FLAGGED] / right if right else 0.0
 
 
-def draw(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> None:
+def draw(
+    path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str], asked: str = "loads"
+) -> None:
     """Draw the map: a bar of outcomes for each method and stressor, its median error below."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
@@ -540,7 +544,7 @@ def draw(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) 
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
     figure.suptitle(
         "Who fails under what, and who says so: what became of the answers to "
-        f"{rows[0]['cases']} loads of each kind\n"
+        f"{rows[0]['cases']} {asked} of each kind\n"
         "Below each bar: median error of displacement of the answers given, flagged ones included",
         fontsize=13,
     )

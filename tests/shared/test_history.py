@@ -217,6 +217,17 @@ def test_what_remains_recovers_like_a_patch_under_small_loads(one_patch, atlas):
 # --- the atlas -----------------------------------------------------------------------------------
 
 
+def test_what_is_pressed_and_lifted_in_no_time_has_an_answer(atlas, rng):
+    """Nothing is left then that the residual could be small beside."""
+    for _ in range(20):
+        x = atlas.nodes.max(axis=0) * [*rng.random(2), 1.0]
+        limit, history = float(atlas.surface.locate(x, atlas.limits)[3][0]), History()
+        for share in (0.8, 0.0, 0.8, 0.4, 0.0, 0.0):
+            moment, history = atlas.step(history, 0.0, x, share * limit)
+            assert moment.converged
+        assert np.linalg.norm(moment.contact_displacement) < 1e-5
+
+
 def follow(atlas, history, course, x, limit):
     for share, dt in course:
         moment, history = atlas.step(history, dt, x, share * limit)

@@ -1,0 +1,83 @@
+"""Galerkin models in time: the full model's histories in the span of a basis."""
+
+import numpy as np
+import pytest
+
+from offline.methods.galerkin_in_time import GalerkinInTime
+from offline.methods.in_time import FullInTime
+from offline.methods.method import Case
+from offline.methods.spaces import modal, pod
+from offline.scenes import find_scene
+from offline.workshop import Load, Workshop
+
+COURSE = ((0.5, 0.02), (1.0, 0.05), (1.0, 0.3), (1.0, 2.0), (0.2, 0.01), (0.0, 0.0), (0.0, 0.5))
+"""Shares of a pressure at the ends of time steps (s)."""
+
+
+@pytest.fixture(scope="module")
+def workshop():
+    scene = find_scene("quick-visco")
+    coarse = scene.geometry.model_copy(update={"divisions": (3, 3, 2)})
+    return Workshop(scene.model_copy(update={"geometry": coarse}))
+
+
+@pytest.fixture(scope="module")
+def cases(workshop):
+    down = np.array([0.3, 0.0, -1.0]) / np.hypot(0.3, 1.0)
+    at = np.array([4.0, 5.5, 8.0])
+    return [Case.of(workshop, Load(at, down, 1.5 * share)) for share, _ in COURSE]
+
+
+def pasts(method, cases):
+    found, past = [], method.at_rest()
+    for case, (_, dt) in zip(cases, COURSE, strict=True):
+        converged, past = method.step(past, case, dt)
+        assert converged
+        found.append(past)
+    return found
+
+
+@pytest.fixture(scope="module")
+def exact(workshop, cases):
+    return pasts(FullInTime(workshop), cases)
+
+
+@pytest.fixture(scope="module")
+def in_its_own_modes(workshop, exact):
+    known = np.array([past.displacement.ravel() for past in exact])
+    return GalerkinInTime("pod", "", workshop, pod(workshop.model, known, 8), accurate=1e-6)
+
+
+def test_a_basis_that_holds_the_history_finds_it(workshop, cases, exact, in_its_own_modes):
+    full = FullInTime(workshop)
+    for found, true in zip(pasts(in_its_own_modes, cases), exact, strict=True):
+        largest = np.abs(exact[3].displacement).max()
+        u = in_its_own_modes.displacement(found)
+        np.testing.assert_allclose(u, true.displacement, atol=1e-4 * largest)
+        stress = full.von_mises(true)
+        largest = full.von_mises(exact[3]).max()
+        np.testing.assert_allclose(in_its_own_modes.von_mises(found), stress, atol=1e-3 * largest)
+
+
+def test_it_remembers_at_the_points_what_the_full_model_does(cases, exact, in_its_own_modes):
+    found = in_its_own_modes.history(pasts(in_its_own_modes, cases)[4]).points[..., :6]
+    true = exact[4].points[..., :6]
+    np.testing.assert_allclose(found, true, atol=1e-3 * np.abs(true).max())
+
+
+def test_few_modes_are_stiffer_and_a_step_changes_no_past(workshop, cases, exact):
+    method = GalerkinInTime("modal", "", workshop, modal(workshop.model, 6))
+    first = method.at_rest()
+    _, second = method.step(first, cases[0], 0.02)
+    assert not first.wide.any()
+    assert second.wide.any()
+    held, true = pasts(method, cases)[3], exact[3]
+    work = [np.vdot(u[cases[3].nodes], cases[3].forces) for u in
+            (method.displacement(held), true.displacement)]  # fmt: skip
+    assert 0.0 < work[0] < work[1]
+
+
+def test_time_does_not_go_back(workshop, cases, in_its_own_modes):
+    for method in (FullInTime(workshop), in_its_own_modes):
+        with pytest.raises(ValueError, match="dt"):
+            method.step(method.at_rest(), cases[0], -0.1)
