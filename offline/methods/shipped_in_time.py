@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from offline.methods.method import Case
 from shared.atlas import Atlas, Solution
 from shared.history import History, Moment
-from shared.tip_history import TipHistory
 from shared.touch import Touch
 
 Array = NDArray[np.float64]
@@ -30,7 +29,7 @@ class Past(NamedTuple):
 class TipPast(NamedTuple):
     """The same under the tip."""
 
-    history: TipHistory
+    history: History
     touch: Touch | None
 
 
@@ -135,7 +134,7 @@ class TipInTime:
 
     def at_rest(self) -> TipPast:
         """See ``InTime``."""
-        return TipPast(TipHistory(), None)
+        return TipPast(History(), None)
 
     def step(self, past: TipPast, case: Case, dt: float) -> tuple[bool, TipPast]:
         """See ``InTime``; raises ``QueryError`` for what the atlas refuses."""
