@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offline.methods.method import Case
+from offline.workshop import Load
 from shared.atlas import Atlas, Solution
 from shared.history import History, Moment
 from shared.touch import Touch
@@ -23,14 +24,7 @@ class Past(NamedTuple):
     """What the tissue remembers, and the last answer."""
 
     history: History
-    moment: Moment | None
-
-
-class TipPast(NamedTuple):
-    """The same under the tip."""
-
-    history: History
-    touch: Touch | None
+    answer: Moment | Touch | None
 
 
 class ShippedInTime:
@@ -54,27 +48,47 @@ class ShippedInTime:
 
     def step(self, past: Past, case: Case, dt: float) -> tuple[bool, Past]:
         """See ``InTime``; raises ``QueryError`` for what the atlas refuses."""
-        (contact,) = case.contacts
-        moment, history = self._atlas.step(
-            past.history, dt, contact.position, contact.pressure, contact.direction
-        )
-        return moment.converged, Past(history, moment) if moment.converged else past
+        answer, history = self._answer(past.history, case.contacts[0], dt)
+        return answer.converged, Past(history, answer) if answer.converged else past
+
+    def _answer(self, history: History, contact: Load, dt: float) -> tuple[Moment | Touch, History]:
+        return self._atlas.step(history, dt, contact.position, contact.pressure, contact.direction)
 
     def trusted(self, past: Past) -> bool:
-        """In range: histories of loads have no error estimate."""
-        return past.moment is not None and past.moment.in_range
+        """In range, and estimated within the scene's tolerance."""
+        answer, tolerance = past.answer, self._atlas.scene.tolerance
+        return (
+            answer is not None
+            and answer.in_range
+            and answer.error_displacement <= tolerance.displacement
+            and answer.error_von_mises <= tolerance.von_mises
+        )
 
     def displacement(self, past: Past) -> Array:
         """See ``InTime``."""
-        if past.moment is None:
+        if past.answer is None:
             return np.zeros_like(self._atlas.nodes)
-        return self._atlas.displacement(past.moment).astype(float)
+        return self._atlas.displacement(past.answer).astype(float)
 
     def von_mises(self, past: Past) -> Array:
         """See ``InTime``."""
-        if past.moment is None:
+        if past.answer is None:
             return np.zeros(len(self._atlas.nodes))
-        return self._atlas.von_mises(past.moment).astype(float)
+        return self._atlas.von_mises(past.answer).astype(float)
+
+
+class TipInTime(ShippedInTime):
+    """An artifact's atlas under the rigid tip."""
+
+    family = label = "artifact, tip"
+
+    def __init__(self, atlas: Atlas) -> None:
+        super().__init__(atlas)
+        assert atlas.models.viscous_tips is not None, "the scene has a tip that knows of time"
+        self.unknowns = atlas.models.viscous_tips.deviatoric.shape[1]
+
+    def _answer(self, history: History, contact: Load, dt: float) -> tuple[Moment | Touch, History]:
+        return self._atlas.touch_step(history, dt, contact.position)
 
 
 class ElasticTwin:
@@ -115,51 +129,3 @@ class ElasticTwin:
     def von_mises(self, past: Solution) -> Array:
         """See ``InTime``."""
         return self._atlas.von_mises(past).astype(float)
-
-
-class TipInTime:
-    """An artifact's atlas under the rigid tip.
-
-    Parameters
-    ----------
-    atlas : Atlas
-    """
-
-    family = label = "artifact, tip"
-
-    def __init__(self, atlas: Atlas) -> None:
-        assert atlas.models.viscous_tips is not None, "the scene has a tip that knows of time"
-        self.unknowns = atlas.models.viscous_tips.deviatoric.shape[1]
-        self._atlas = atlas
-
-    def at_rest(self) -> TipPast:
-        """See ``InTime``."""
-        return TipPast(History(), None)
-
-    def step(self, past: TipPast, case: Case, dt: float) -> tuple[bool, TipPast]:
-        """See ``InTime``; raises ``QueryError`` for what the atlas refuses."""
-        (contact,) = case.contacts
-        touch, history = self._atlas.touch_step(past.history, dt, contact.position)
-        return touch.converged, TipPast(history, touch) if touch.converged else past
-
-    def trusted(self, past: TipPast) -> bool:
-        """In range, and estimated within the scene's tolerance."""
-        touch, tolerance = past.touch, self._atlas.scene.tolerance
-        return (
-            touch is not None
-            and touch.in_range
-            and touch.error_displacement <= tolerance.displacement
-            and touch.error_von_mises <= tolerance.von_mises
-        )
-
-    def displacement(self, past: TipPast) -> Array:
-        """See ``InTime``."""
-        if past.touch is None:
-            return np.zeros_like(self._atlas.nodes)
-        return self._atlas.displacement(past.touch).astype(float)
-
-    def von_mises(self, past: TipPast) -> Array:
-        """See ``InTime``."""
-        if past.touch is None:
-            return np.zeros(len(self._atlas.nodes))
-        return self._atlas.von_mises(past.touch).astype(float)

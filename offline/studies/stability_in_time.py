@@ -4,8 +4,7 @@ As ``offline.studies.stability``, for visco-elastic tissue: every method answers
 (``offline.studies.courses``), step by step, for which the full model's answers are known.  An
 answer is a whole history: right if its errors over all moments (relative L2 norms, over nodes and
 moments) are within the scene's tolerance, flagged if any of its moments is, inverted if any of them
-turns an element inside out.  Histories of loads have no error estimate, so the artifact can flag
-them only as out of range.
+turns an element inside out.
 
 Methods beside the artifact are Galerkin models with every quadrature point, on modes that vibrate
 and on POD of random histories, and the full model in larger steps.
