@@ -269,7 +269,7 @@ def assemble_patches(body: Body, models: LocalModels, scene: Scene) -> Patches:
         defect=models.defect,
         guess=np.pad(models.guess, ((0, 0), (0, 0), (0, NARROW - models.guess.shape[2]))),
         blend=models.blend,
-        slack=scene.tolerance.looseness,
+        slack=math.sqrt(scene.tolerance.looseness),
     )
 
 

@@ -337,6 +337,6 @@ def test_a_loose_tolerance_is_answered_in_fewer_iterations_and_well_within_it(at
             assert trainer.solve(x, -normal, share * fields[0])
             iterations[i] += trainer.state.outcome.scalars[ITERATIONS]
         strict, other = (trainer.wide for trainer in trainers)
-        # in the norm of energy, which stresses follow
-        assert norm(other - strict) < 0.3 * tolerance.von_mises * norm(strict)
+        # in the norm of energy, which stresses follow: the solver's share is half at most
+        assert norm(other - strict) < 0.5 * tolerance.von_mises * norm(strict)
     assert iterations[1] < iterations[0]
