@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from offline.moments import errors_so_far
 from offline.studies import steps
-from offline.tip_histories import _moments, play_course, random_courses
+from offline.tip_histories import play_course, random_courses
 from shared.atlas import Atlas
 from shared.cli import main
 
@@ -32,7 +33,7 @@ def test_courses_move_like_a_tool(atlas, rng):
 def test_moments_are_relative_to_the_largest_so_far():
     exact = np.array([[1.0, 0.0], [4.0, 0.0], [0.0, 0.0]])
     found = exact + np.array([[0.1, 0.0], [0.0, 0.2], [0.4, 0.0]])
-    np.testing.assert_allclose(_moments(found, exact), [0.1, 0.05, 0.1])
+    np.testing.assert_allclose(errors_so_far([(found, exact)]), [[0.1, 0.05, 0.1]])
 
 
 def test_validation_over_histories_of_the_tip(visco_artifact, tmp_path):
