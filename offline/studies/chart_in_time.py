@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from offline.histories import NONE_FOLLOWED, Press, random_history
+from offline.histories import NONE_FOLLOWED, Press, loads_of, random_histories
 from offline.methods.catalogue import Snapshots, Training
 from offline.methods.galerkin_in_time import GalerkinInTime
 from offline.methods.in_time import FullInTime, InTime
@@ -35,7 +35,7 @@ from offline.studies.chart_drawing import duration, percent
 from offline.studies.chart_points import Point, pareto, write_csv
 from offline.validate import UNSEEN
 from offline.workers import completed, worker_pool
-from offline.workshop import Load, Workshop, open_artifact
+from offline.workshop import Workshop, open_artifact
 from shared.artifact import read_artifact
 from shared.atlas import Atlas
 from shared.errors import PalpateError, QueryError
@@ -123,18 +123,11 @@ def _histories(
     asked = np.random.default_rng([atlas.scene.seed, UNSEEN, seed])
     learnt = np.random.default_rng([atlas.scene.seed, LEARNING, seed])
     histories = {
-        f"{name} {i}": random_history(atlas, rng, rim=i % 8 == 0)
+        f"{name} {i}": presses
         for name, rng, number in (("asked", asked, count), ("learnt", learnt, lessons))
-        for i in range(number)
+        for i, presses in enumerate(random_histories(atlas, number, rng))
     }
-    tasks = {
-        name: (
-            Workshop.follow,
-            [Load(p.position, p.direction, p.pressure) for p in presses],
-            [p.dt for p in presses],
-        )
-        for name, presses in histories.items()
-    }
+    tasks = {name: (Workshop.follow, *loads_of(presses)) for name, presses in histories.items()}
     with worker_pool(open_artifact, artifact) as pool:
         found = dict(tqdm(completed(pool, tasks), "full histories", len(tasks)))
     known = {name: found[name] for name in tasks if found[name] is not None}

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from offline.checkpoint import Checkpoint, content_key
-from offline.histories import Press, random_history
+from offline.histories import Press, loads_of, random_histories
 from offline.methods.galerkin_in_time import GalerkinInTime
 from offline.methods.in_time import FullInTime, InTime
 from offline.methods.method import Case
@@ -186,8 +186,8 @@ def _followed(
         if not trial.nonsense
     }
     rng = np.random.default_rng([atlas.scene.seed, LEARNING])
-    for i in range(lessons):
-        tasks[f"lesson {i}"] = _task(False, random_history(atlas, rng, rim=i % 8 == 0))
+    for i, presses in enumerate(random_histories(atlas, lessons, rng)):
+        tasks[f"lesson {i}"] = _task(False, presses)
     with worker_pool(open_artifact, artifact) as pool:
         found = resume("full histories", pool, checkpoint, tasks, _pack)
     known = [found[f"lesson {i}"] for i in range(lessons)]
@@ -209,10 +209,10 @@ def _label(tip: bool, name: str, number: int) -> str:
 
 
 def _task(tip: bool, presses: Sequence[Press]) -> tuple[Any, ...]:
-    times = [press.dt for press in presses]
+    loads, times = loads_of(presses)
     if tip:
-        return Workshop.follow_tip, np.array([press.position for press in presses]), times
-    return Workshop.follow, [Load(p.position, p.direction, p.pressure) for p in presses], times
+        return Workshop.follow_tip, np.array([load.position for load in loads]), times
+    return Workshop.follow, loads, times
 
 
 def _pack(found: Sequence[NDArray[Any]] | None) -> dict[str, NDArray[Any]]:
