@@ -27,6 +27,10 @@ from shared.tissue import lame
 
 Array = NDArray[np.float64]
 
+POINTWISE: tuple[ElementName, ...] = ("hex8", "hex20")
+"""Elements whose points stand alone. Where they share a dilatation, a cubature cannot sample them
+one by one, so only the full model has those."""
+
 TOLERANCE = 1e-9
 """Residual of an equilibrium relative to the load, both in the Euclidean norm of nodal forces."""
 

@@ -34,6 +34,7 @@ from tqdm import tqdm
 from offline.checkpoint import Checkpoint, content_key
 from offline.choose import LADDER, Trial, TrialResult, choose
 from offline.choose_mesh import with_mesh
+from offline.full_model import POINTWISE
 from offline.giving_way import lowered_limits
 from offline.histories import (
     HistoryComparison,
@@ -90,7 +91,7 @@ from shared.artifact import Dataset, write_artifact
 from shared.atlas import ESTIMATORS, Atlas, Estimator, Estimators, LocalModels
 from shared.endoscope import TIP_DEPTH
 from shared.reduced import NARROW
-from shared.scene import Scene, Size, Tolerance
+from shared.scene import Scene, SceneError, Size, Tolerance
 
 Array = NDArray[np.float64]
 
@@ -133,8 +134,19 @@ def train(scene: str | Path, out: Path | None = None, workers: int | None = None
     Returns
     -------
     path : Path
+
+    Raises
+    ------
+    SceneError
+        If the scene's element cannot be reduced.
     """
-    trained, mesh_choice = with_mesh(find_scene(scene))
+    untrained = find_scene(scene)
+    if untrained.geometry.element not in POINTWISE:
+        raise SceneError(
+            f"geometry.element: points of {untrained.geometry.element} share a dilatation, which "
+            f"no cubature samples; train with {' or '.join(POINTWISE)} (hex20 does not lock)"
+        )
+    trained, mesh_choice = with_mesh(untrained)
     path = out or default_artifact(trained)
     path.parent.mkdir(parents=True, exist_ok=True)
     pool = worker_pool(open_workshop, trained.text, str(trained.folder), count=workers)

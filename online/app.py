@@ -98,6 +98,7 @@ async def _prepare(store: Store, on_ready: Callable[[Store], None] | None) -> No
         with suppress(RuntimeError):  # the service has ended meanwhile
             loop.call_soon_threadsafe(tell, done)
 
+    logger.info("loading models; where kernels are compiled for the first time, it takes minutes")
     # a daemon: a service that is told to stop does not wait for it
     threading.Thread(target=load, name="loading", daemon=True).start()
     if not await opened:

@@ -8,9 +8,11 @@ to the worker that accepted it and is none of the others' business.
 import asyncio
 import json
 import logging
+import os
 import signal
 import sys
 import tempfile
+import threading
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -148,6 +150,13 @@ def serve(settings: Settings, host: str, port: int, public: bool) -> None:
     if not settings.token and not public:
         settings = replace(settings, hosts=_local_names(host))
     logs.set_up(settings)
+    try:
+        _run(settings, host, port)
+    finally:
+        _leave_loading()
+
+
+def _run(settings: Settings, host: str, port: int) -> None:
     with tempfile.TemporaryDirectory(prefix="palpate-") as directory:
         config = _config(settings, host, port)
         bound = config.bind_socket()
@@ -166,6 +175,18 @@ def serve(settings: Settings, host: str, port: int, public: bool) -> None:
             Supervisor(config, [bound]).run()
         else:
             uvicorn.Server(config).run([bound])
+
+
+def _leave_loading() -> None:
+    """End the process at once if models are still being loaded.
+
+    The interpreter's own end would wait for ever for locks of the compiler, which the thread that
+    loads holds while it is halted.
+    """
+    if any(thread.daemon for thread in threading.enumerate()):
+        logging.shutdown()
+        sys.stdout.flush()
+        os._exit(0)
 
 
 def _local_names(host: str) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from offline.full_model import FullModel
+from offline.full_model import POINTWISE, FullModel
 from offline.methods.method import Answer, Case
 from shared import equilibrium
 from shared.bound import bind
@@ -136,7 +136,7 @@ class ReducedModel:
     """
 
     def __init__(self, model: FullModel, size: int, cubature: Cubature) -> None:
-        if model.element not in ("hex8", "hex20"):
+        if model.element not in POINTWISE:
             raise ValueError(f"{model.element}: its points share a dilatation")
         self.points = cubature.points
         self._model = model

@@ -6,15 +6,19 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
+from offline import scenes
+from offline.train import train
 from offline.workshop import Workshop
 from shared.artifact import read_artifact
 from shared.atlas import Atlas
 from shared.reduced import query
+from shared.scene import SceneError
 
 STAGES = ("load range", "Ritz vectors", "local models", "full solutions")
 
@@ -115,3 +119,12 @@ def test_the_mesh_error_is_that_of_other_meshes(artifact):
     for errors in (own, other):
         assert -0.2 < errors["least"] <= errors["mean"] <= errors["greatest"] < 0.2
     assert abs(own["mean"]) < abs(other["mean"])
+
+
+def test_an_element_that_cannot_be_reduced_is_refused_at_once(tmp_path):
+    text = (Path(scenes.__file__).parent / "quick.toml").read_text()
+    scene = tmp_path / "locked.toml"
+    scene.write_text(re.sub('"hex(8|20)"', '"hex8-mean-dilatation"', text))
+    with pytest.raises(SceneError, match=r"geometry\.element.*train with hex8 or hex20"):
+        train(scene, tmp_path / "locked.h5")
+    assert list(tmp_path.iterdir()) == [scene]

@@ -1,10 +1,12 @@
 """`palpate serve` as its user meets it: a process and a socket."""
 
 import json
+import os
 import shlex
 import signal
 import socket
 import subprocess
+import time
 import urllib.request
 from urllib.parse import urlsplit
 
@@ -37,6 +39,25 @@ def test_it_ends_cleanly_on_a_signal(serve, artifact, number):
             client.scenes()
             assert server.stop(number) == 0
         assert "Traceback" not in server.log
+
+
+def test_it_ends_while_kernels_are_compiled(artifact, tmp_path):
+    process = subprocess.Popen(
+        [*PALPATE, "serve", "--artifacts", artifact.parent, "--port", "0"],
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)},
+    )
+    try:
+        while not list(tmp_path.rglob("*.nbi")):  # the first kernel
+            assert process.poll() is None
+            time.sleep(0.1)
+        process.terminate()
+        _, log = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert process.returncode == 0
+    assert "Traceback" not in log
 
 
 def test_a_client_that_hangs_up_leaves_no_trace(serve, artifact):
