@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from online.follower import MOST_ITERATIONS, Follower, Step, is_finite
+from online.follower import MOST_ITERATIONS, PATIENCE, Follower, Step, is_finite
 from online.frames import Flag
 from shared.atlas import Atlas
 from shared.history import History
@@ -80,10 +80,13 @@ class TimedFollower(Follower):
 
     def _solve(self, position: Array, share: float) -> bool:
         dt = (share - self._share) * self._span
-        touch, history = self._atlas.touch_step(self._history, dt, position, MOST_ITERATIONS)
+        # Where tissue snaps, a search must end with its frame: the next starts from the past, too.
+        most = MOST_ITERATIONS * (PATIENCE if self._lost else 1)
+        touch, history = self._atlas.touch_step(self._history, dt, position, most)
         if not (touch.converged and is_finite(touch)):
             return False
         self._history, self._good, self._share = history, touch, share
+        self._lost = 0
         return True
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from online.client import AsyncClient, Client
-from online.follower import Follower
+from online.follower import MOST_ITERATIONS, Follower
 from online.frames import Flag
 from online.recording import read_recording
 from online.replay import replay
@@ -31,6 +31,7 @@ class Slow(FakeAtlas):
         self.steps.append(dt)
         state = Memory()
         state.last = history.position
+        state.gone_on = most - MOST_ITERATIONS
         touch = self.touch(position, state, most)
         if not touch.converged:
             return touch, history
@@ -89,6 +90,19 @@ def test_without_an_answer_time_stands_still(atlas):
     assert step.flags == GOOD | Flag.FALLBACK
     assert step.touch is good.touch
     assert follower.follow((5.0, 5.0, 6.5), 0.0, 0.06).touch.time == pytest.approx(0.06)
+
+
+def test_where_tissue_snaps_the_second_frame_is_searched_for_long(atlas):
+    atlas.snap = 1
+    follower = TimedFollower(atlas)
+    good = follower.follow((5.0, 5.0, 7.0 - atlas.deepest), 0.0, 0.0)
+    step = follower.follow((5.0, 5.0, 5.3), 0.0, 0.01)
+    assert step.flags & Flag.FALLBACK
+    assert step.touch is good.touch
+    step = follower.follow((5.0, 5.0, 5.2), 0.0, 0.02)
+    assert step.flags == GOOD & ~Flag.IN_RANGE
+    assert step.touch.time == pytest.approx(0.02)
+    assert follower.follow((5.0, 5.0, 5.1), 0.0, 0.03).flags & Flag.FALLBACK
 
 
 def test_a_snapshot_brings_back_the_state(atlas):
