@@ -9,7 +9,7 @@ pay for trials of large models.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offline.norms import statistics
-from shared.scene import Budget, Size, Tolerance
+from shared.scene import Budget, Size, Tissue, Tolerance
 
 Array = NDArray[np.float64]
 
@@ -35,6 +35,9 @@ At 3.2 mm stress errs by half as much again, with 96 points, too.
 """
 
 RUNG = 2 / 3
+
+COMPRESSIBLE = 0.45
+"""Poisson's ratio up to which the ladder has points enough."""
 
 PLACE = 3
 """On the ladder, of the size that the turbinate takes at the usual tolerance."""
@@ -123,11 +126,31 @@ class Choice:
         return {"why": self.why, "tried": [trial.document for trial in self.trials]}
 
 
-def choose(tolerance: Tolerance, budget: Budget, attempt: Callable[[Size], Trial]) -> Choice:
-    """Find the smallest size of the ladder that meets the tolerance.
+def ladder(tissue: Tissue) -> tuple[Size, ...]:
+    """Sizes for a tissue: the less compressible, the more points take its volume's energy.
+
+    They go with the cube root of the ratio of Lame's constants: at a Poisson's ratio of 0.49 56
+    modes err by 2.1 % on 112 points and by 0.6 % on 192, and 80 modes by 1.5 % on 176.
+    """
+    lam, lam_there = (p / (1 - 2 * p) for p in (tissue.poisson, COMPRESSIBLE))
+    more = max(1.0, lam / lam_there) ** (1 / 3)
+    return tuple(
+        size.model_copy(
+            update={"cubature_points": 16 * math.ceil(more * size.cubature_points / 16)}
+        )
+        for size in LADDER
+    )
+
+
+def choose(
+    sizes: Sequence[Size], tolerance: Tolerance, budget: Budget, attempt: Callable[[Size], Trial]
+) -> Choice:
+    """Find the smallest size of a ladder that meets the tolerance.
 
     Parameters
     ----------
+    sizes : sequence of Size
+        From the smallest to the largest.
     tolerance : Tolerance
     budget : Budget
         A size over it is chosen all the same, and the reason says so.
@@ -135,25 +158,28 @@ def choose(tolerance: Tolerance, budget: Budget, attempt: Callable[[Size], Trial
         Tries a size.
     """
     trials: dict[int, Trial] = {}
-    low, high = 0, len(LADDER) - 1
+    low, high = 0, len(sizes) - 1
     guess = PLACE + round(math.log(tolerance.looseness) / math.log(RUNG))
     while low < high:
         place = min(max(guess, low), high - 1)
-        trials[place] = attempt(LADDER[place])
+        trials[place] = attempt(sizes[place])
         if trials[place].meets(tolerance):
             high = place
         else:
             low = place + 1
         guess = place + trials[place].rungs_to(tolerance)
     if low not in trials:  # the largest: nothing smaller will do
-        trials[low] = attempt(LADDER[low])
+        trials[low] = attempt(sizes[low])
     tried = [trials[i] for i in sorted(trials)]
-    return Choice(LADDER[low], tried, _reason(tolerance, budget, trials[low], tried))
+    reason = _reason(tolerance, budget, trials[low], tried, len(sizes))
+    return Choice(sizes[low], tried, reason)
 
 
-def _reason(tolerance: Tolerance, budget: Budget, chosen: Trial, tried: list[Trial]) -> str:
+def _reason(
+    tolerance: Tolerance, budget: Budget, chosen: Trial, tried: list[Trial], sizes: int
+) -> str:
     if chosen.meets(tolerance):
-        why = f"the smallest of {len(LADDER)} sizes that meets the tolerance: {_errors(chosen)}"
+        why = f"the smallest of {sizes} sizes that meets the tolerance: {_errors(chosen)}"
     else:
         why = (
             f"no size meets the tolerance of {tolerance.displacement:.2%} and "

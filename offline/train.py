@@ -32,7 +32,7 @@ from scipy.special import betaincinv
 from tqdm import tqdm
 
 from offline.checkpoint import Checkpoint, content_key
-from offline.choose import LADDER, Trial, TrialResult, choose
+from offline.choose import Trial, TrialResult, choose, ladder
 from offline.choose_mesh import with_mesh
 from offline.full_model import POINTWISE
 from offline.giving_way import lowered_limits
@@ -214,8 +214,10 @@ class Pipeline:
         choice = None
         size = self.scene.training.size
         if size is None:
+            scene = self.scene
+            sizes = ladder(scene.tissue)
             choice = choose(
-                self.scene.tolerance, self.scene.budget, lambda size: self._trial(size, limits)
+                sizes, scene.tolerance, scene.budget, lambda size: self._trial(size, limits)
             )
             size = choice.size
             tqdm.write(f"size: {size}\n{choice.why}", file=sys.stderr)
@@ -281,7 +283,7 @@ class Pipeline:
         chosen = np.unique(cKDTree(layout.centres).query(places)[1])
         footprints = self._footprints(layout, limits)
         tasks = {
-            f"trial-{LADDER.index(size)}-{k}": (
+            f"trial-{size.modes}-{k}": (
                 Workshop.trial, self._patch_task(layout, footprints, limits, int(k)),
             )
             for k in chosen

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from offline.choose import LADDER, MARGIN, RUNG, WORST, Trial, TrialResult, choose
+from offline.choose import LADDER, MARGIN, RUNG, WORST, Trial, TrialResult, choose, ladder
 from offline.sampling import fewer
-from shared.scene import Budget, Tolerance
+from shared.scene import Budget, Tissue, Tolerance
 
 BUDGET = Budget(query=150e-6)
 
@@ -36,7 +36,7 @@ PLACES = range(len(LADDER))
 )
 def test_the_smallest_size_that_is_good_enough(smallest, errors, most):
     attempt, tried = attempts([errors(i - smallest) for i in PLACES])
-    choice = choose(Tolerance(displacement=0.01, von_mises=0.02), BUDGET, attempt)
+    choice = choose(LADDER, Tolerance(displacement=0.01, von_mises=0.02), BUDGET, attempt)
     assert choice.size == LADDER[smallest]
     assert len(tried) == len(set(tried)) <= most
     assert choice.why.startswith("the smallest")
@@ -46,7 +46,7 @@ def test_the_smallest_size_that_is_good_enough(smallest, errors, most):
 def test_a_looser_tolerance_takes_a_smaller_model():
     errors = [0.03, 0.015, 0.01, 0.006, 0.004]
     sizes = [
-        choose(Tolerance(displacement=t, von_mises=2 * t), BUDGET, attempts(errors)[0]).size
+        choose(LADDER, Tolerance(displacement=t, von_mises=2 * t), BUDGET, attempts(errors)[0]).size
         for t in (0.01, 0.02, 0.05)
     ]
     assert sizes == [LADDER[3], LADDER[1], LADDER[0]]
@@ -55,13 +55,13 @@ def test_a_looser_tolerance_takes_a_smaller_model():
 def test_a_loose_tolerance_pays_for_no_trial_of_a_large_model():
     errors = [0.03 * RUNG**i for i in PLACES]
     attempt, tried = attempts(errors)
-    choose(Tolerance(displacement=0.05, von_mises=0.1), BUDGET, attempt)
+    choose(LADDER, Tolerance(displacement=0.05, von_mises=0.1), BUDGET, attempt)
     assert tried == [0]
 
 
 def test_a_tolerance_out_of_reach_is_said_plainly():
     attempt, _ = attempts([0.5, 0.4, 0.3, 0.2, 0.1])
-    choice = choose(Tolerance(displacement=0.01, von_mises=0.02), BUDGET, attempt)
+    choice = choose(LADDER, Tolerance(displacement=0.01, von_mises=0.02), BUDGET, attempt)
     assert choice.size == LADDER[-1]
     assert "no size meets the tolerance of 1.00%" in choice.why
     assert "10.00% displacement, 20.00% von Mises" in choice.why
@@ -73,7 +73,7 @@ def test_a_budget_exceeded_names_the_best_within_it():
         error = np.full(20, [0.5, 0.4, 0.3, 0.005, 0.004][place])
         return Trial.of(size, [TrialResult(error, error, 60e-6 * place)])
 
-    choice = choose(Tolerance(displacement=0.01, von_mises=0.02), BUDGET, attempt)
+    choice = choose(LADDER, Tolerance(displacement=0.01, von_mises=0.02), BUDGET, attempt)
     assert choice.size == LADDER[3]
     assert "180 µs to solve, over the budget of 150 µs" in choice.why
     assert "the best within it" in choice.why
@@ -95,3 +95,14 @@ def test_a_looser_tolerance_is_served_by_fewer_samples():
     tight = Tolerance(displacement=0.001, von_mises=0.02)
     assert [fewer(300, tolerance) for tolerance in (usual, loose, tight)] == [300, 150, 300]
     assert fewer(1, loose) == 1
+
+
+def test_the_less_compressible_the_more_points():
+    sizes = [
+        ladder(Tissue(law="neo-hookean", young=15.0, poisson=p)) for p in (0.3, 0.45, 0.49, 0.499)
+    ]
+    assert sizes[0] == sizes[1] == LADDER
+    for own in zip(*sizes[1:], strict=True):
+        assert len({size.modes for size in own}) == 1
+        points = np.array([size.cubature_points for size in own])
+        np.testing.assert_allclose(points[1:] / points[0], [1.76, 3.81], rtol=0.2)
