@@ -14,6 +14,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from tqdm import tqdm
 
 from offline.sampling import cone, random_points_and_rim
 from shared.atlas import Atlas
@@ -62,7 +63,7 @@ def _giving_way(
 ) -> list[tuple[Array, float]]:
     """Contact points where tissue gives way in a random direction, and what is bearable there."""
     found = []
-    for i, point in enumerate(points):
+    for i, point in enumerate(tqdm(points, "giving way")):
         x, normal, _, fields = atlas.surface.locate(point, atlas.limits)
         direction = cone(normal, atlas.scene.endoscope.max_tilt, 1, rng, border=i % 2 == 0)[0]
         share = bearable_share(atlas, x, direction, pressure_limit(fields, normal, direction))
