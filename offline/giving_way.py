@@ -46,10 +46,11 @@ def lowered_limits(atlas: Atlas, rng: np.random.Generator) -> Array:
     surface, limits = atlas.surface, atlas.limits.copy()
     vertices = cKDTree(surface.vertices)
     count = PATHS_PER_PATCH * len(atlas.models.centres)
-    found = _giving_way(atlas, random_points_and_rim(surface, count, rng), rng)
+    found = _giving_way(atlas, random_points_and_rim(surface, count, rng), count, rng)
     near = [rng.choice(vertices.query_ball_point(x, REACH), CLOSER) for x, _ in found]
     if near:
-        found += _giving_way(atlas, surface.vertices[np.concatenate(near)], rng)
+        closer = surface.vertices[np.concatenate(near)]
+        found += _giving_way(atlas, closer, len(closer), rng)
     share = np.ones(len(limits))
     for x, bearable in found:
         lowered = vertices.query_ball_point(x, REACH)
@@ -59,11 +60,11 @@ def lowered_limits(atlas: Atlas, rng: np.random.Generator) -> Array:
 
 
 def _giving_way(
-    atlas: Atlas, points: Iterable[Array], rng: np.random.Generator
+    atlas: Atlas, points: Iterable[Array], count: int, rng: np.random.Generator
 ) -> list[tuple[Array, float]]:
     """Contact points where tissue gives way in a random direction, and what is bearable there."""
     found = []
-    for i, point in enumerate(tqdm(points, "giving way")):
+    for i, point in enumerate(tqdm(points, "giving way", count)):
         x, normal, _, fields = atlas.surface.locate(point, atlas.limits)
         direction = cone(normal, atlas.scene.endoscope.max_tilt, 1, rng, border=i % 2 == 0)[0]
         share = bearable_share(atlas, x, direction, pressure_limit(fields, normal, direction))
