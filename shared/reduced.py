@@ -460,14 +460,15 @@ def _wide_correct(system, residual, step):
     if not is_system(WideSystem, system):
         return None
 
-    def correct(system, residual, step):
-        learn_secant(
-            system.secants, system.origin, system.latest, residual, system.load, system.change
-        )
-        for i in range(len(step)):
-            step[i] = -np.dot(system.secants[i], residual)
+    return lambda system, residual, step: correct_by_secants(system, residual, step)
 
-    return correct
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def correct_by_secants(system, residual, step):
+    """Newton step of a system with the inverse tangent that its secants make up."""
+    learn_secant(system.secants, system.origin, system.latest, residual, system.load, system.change)
+    for i in range(len(step)):
+        step[i] = -np.dot(system.secants[i], residual)
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)

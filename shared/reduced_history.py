@@ -42,10 +42,10 @@ from shared.reduced import (
     activate,
     added_energy,
     aim,
+    correct_by_secants,
     descend,
     forget_secants,
     is_system,
-    learn_secant,
     load_patch,
     nonlinear_stress,
     project,
@@ -380,14 +380,7 @@ def _correct(system, residual, step):
     if not is_system(PastSystem, system):
         return None
 
-    def correct(system, residual, step):
-        learn_secant(
-            system.secants, system.origin, system.latest, residual, system.load, system.change
-        )
-        for i in range(len(step)):
-            step[i] = -np.dot(system.secants[i], residual)
-
-    return correct
+    return lambda system, residual, step: correct_by_secants(system, residual, step)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
