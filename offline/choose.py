@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from offline.norms import statistics
 from shared.scene import Budget, Size, Tissue, Tolerance
+from shared.tissue import lame
 
 Array = NDArray[np.float64]
 
@@ -132,8 +133,8 @@ def ladder(tissue: Tissue) -> tuple[Size, ...]:
     They go with the cube root of the ratio of Lame's constants: at a Poisson's ratio of 0.49 56
     modes err by 2.1 % on 112 points and by 0.6 % on 192, and 80 modes by 1.5 % on 176.
     """
-    lam, lam_there = (p / (1 - 2 * p) for p in (tissue.poisson, COMPRESSIBLE))
-    more = max(1.0, lam / lam_there) ** (1 / 3)
+    (mu, lam), (usual_mu, usual_lam) = (lame(1.0, p) for p in (tissue.poisson, COMPRESSIBLE))
+    more = max(1.0, (lam / mu) / (usual_lam / usual_mu)) ** (1 / 3)
     return tuple(
         size.model_copy(
             update={"cubature_points": 16 * math.ceil(more * size.cubature_points / 16)}

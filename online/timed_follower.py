@@ -64,6 +64,7 @@ class TimedFollower(Follower):
     def restore(self, snapshot: Snapshot) -> None:
         """Go back to a snapshot; the client's time goes on from its last frame."""
         self._history, self._good = snapshot
+        self._lost = 0
 
     def _follow(
         self, position: Sequence[float], may_go_on: Callable[[int], bool], now: float

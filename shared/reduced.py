@@ -459,7 +459,6 @@ def _wide_factorise(system, u, shift):
 def _wide_correct(system, residual, step):
     if not is_system(WideSystem, system):
         return None
-
     return lambda system, residual, step: correct_by_secants(system, residual, step)
 
 

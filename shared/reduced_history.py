@@ -379,7 +379,6 @@ def _factorise(system, u, shift):
 def _correct(system, residual, step):
     if not is_system(PastSystem, system):
         return None
-
     return lambda system, residual, step: correct_by_secants(system, residual, step)
 
 

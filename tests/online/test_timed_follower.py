@@ -117,6 +117,16 @@ def test_a_snapshot_brings_back_the_state(atlas):
     np.testing.assert_array_equal(again.touch.force, first.touch.force)
 
 
+def test_a_restored_state_knows_nothing_of_a_search(atlas):
+    atlas.snap = 1
+    follower = TimedFollower(atlas)
+    follower.follow((5.0, 5.0, 7.0 - atlas.deepest), 0.0, 0.0)
+    kept = follower.snapshot()
+    for now in (0.01, 0.02):
+        assert follower.follow((5.0, 5.0, 5.3), 0.0, now).flags & Flag.FALLBACK
+        follower.restore(kept)
+
+
 def test_a_restarted_follower_is_a_new_one(atlas):
     follower = TimedFollower(atlas)
     follower.follow((5.0, 5.0, 6.5), 0.0, 0.0)
