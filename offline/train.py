@@ -110,7 +110,7 @@ CONTACTS_PER_PATCH = 400
 
 TRIAL_PATCHES = 8
 
-TIP_SAMPLES = 120
+TIP_SAMPLES = 300
 """Full solutions under the tip that validate and calibrate."""
 
 MOST_COURSES = 48

@@ -23,6 +23,7 @@ from online.errors import Refusal
 from online.follower import Follower, Step
 from online.frames import Extras, Flag, FrameError, Output, Request, VersionError
 from online.metrics import Metrics
+from online.realtime import Vigil
 from online.schemas import (
     MOST_SNAPSHOTS,
     is_command,
@@ -73,6 +74,7 @@ class Sessions:
         self._store = store
         self._settings = settings
         self._metrics = metrics
+        self._vigil = Vigil(settings.realtime)
         self._open = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -91,7 +93,9 @@ class Sessions:
         self._metrics.count_session(opened=True)
         follower = model.followers.pop() if model.followers else follower_of(model.atlas)
         try:
-            session = Session(model, follower, self._settings, self._metrics, scope, receive, send)
+            session = Session(
+                model, follower, self._settings, self._metrics, self._vigil, scope, receive, send
+            )
             await session.run()
         finally:
             self._open -= 1
@@ -110,6 +114,8 @@ class Session:
         Fresh or restarted.
     settings : Settings
     metrics : Metrics
+    vigil : Vigil
+        Of the event loop.
     scope, receive, send
         As ASGI gives them; of `online.websocket.Protocol`.
     """
@@ -120,6 +126,7 @@ class Session:
         follower: Follower,
         settings: Settings,
         metrics: Metrics,
+        vigil: Vigil,
         scope: Scope,
         receive: Receive,
         send: Send,
@@ -128,6 +135,7 @@ class Session:
         self._atlas = model.atlas
         self._settings = settings
         self._metrics = metrics
+        self._vigil = vigil
         self._receive = receive
         self._send = send
         self._pending: Callable[[], bool] = scope["extensions"][PENDING]
@@ -181,6 +189,7 @@ class Session:
                 if message["code"] == STOPPING:
                     self._farewell = GOING_AWAY, "the service is stopping"
                 return
+            self._vigil.keep()
             # only now: a message that waits must not grow older for those behind it
             if (excess := self._full_at - perf_counter() - BURST) > 0.0:
                 await asyncio.sleep(excess)

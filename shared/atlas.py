@@ -433,7 +433,7 @@ class State:
             residual_features=np.zeros(RESIDUAL_FEATURES),
             nodal=np.zeros(int(np.diff(patches.node_from).max())),
             distance=np.zeros(patches.centres.shape[1]),
-            surface=np.zeros(clusters + 6),
+            surface=np.zeros(clusters + 3),
         )
         # one array, so that an answer is kept by one copy
         self.record = np.zeros(_SCALARS.start + SCALARS)

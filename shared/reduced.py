@@ -400,24 +400,58 @@ def back_substitute(L, x):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def cholesky(K, shift, L):
-    """Lower Cholesky factor of ``K + shift I``, row by row; False if a pivot is not positive.
+    """Lower Cholesky factor of ``K + shift I``; False if a pivot is not positive.
 
+    K, L (4 k, 4 k); of K only the lower triangle and the squares of 4 on the diagonal are read.
     ``I`` is the rest stiffness: the modes are orthonormal in its energy.
     """
-    m = len(K)
-    for i in range(m):
-        for j in range(i):
-            total = K[i, j]
-            for k in range(j):
-                total -= L[i, k] * L[j, k]
-            L[i, j] = total / L[j, j]
-        pivot = K[i, i] + shift
-        for k in range(i):
-            pivot -= L[i, k] * L[i, k]
-        if not pivot > 0.0:
-            return False
-        L[i, i] = math.sqrt(pivot)
+    for at in range(0, len(K), 4):
+        _reduce_columns(K, at, L)
+        for j in range(at, at + 4):
+            pivot = L[j, j] + shift
+            for k in range(at, j):
+                pivot -= L[j, k] * L[j, k]
+            if not pivot > 0.0:
+                return False
+            L[j, j] = math.sqrt(pivot)
+            for i in range(j + 1, at + 4):
+                total = L[i, j]
+                for k in range(at, j):
+                    total -= L[i, k] * L[j, k]
+                L[i, j] = total / L[j, j]
+        p, q, r, s = L[at], L[at + 1], L[at + 2], L[at + 3]
+        d0, d1, d2, d3 = 1.0 / p[at], 1.0 / q[at + 1], 1.0 / r[at + 2], 1.0 / s[at + 3]
+        for i in range(at + 4, len(K)):
+            row = L[i]
+            w = row[at] * d0
+            x = (row[at + 1] - q[at] * w) * d1
+            y = (row[at + 2] - r[at] * w - r[at + 1] * x) * d2
+            z = (row[at + 3] - s[at] * w - s[at + 1] * x - s[at + 2] * y) * d3
+            row[at], row[at + 1], row[at + 2], row[at + 3] = w, x, y, z
     return True
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def _reduce_columns(K, at, L):
+    """Four columns of K from the diagonal down, less what those of L before them account for."""
+    p, q, r, s = L[at], L[at + 1], L[at + 2], L[at + 3]
+    for i in range(at, len(K), 2):
+        a, b = L[i], L[i + 1]
+        ap = aq = ar = a_s = bp = bq = br = bs = 0.0
+        for k in range(at):
+            x, y = a[k], b[k]
+            ap += x * p[k]
+            aq += x * q[k]
+            ar += x * r[k]
+            a_s += x * s[k]
+            bp += y * p[k]
+            bq += y * q[k]
+            br += y * r[k]
+            bs += y * s[k]
+        a[at], a[at + 1] = K[i, at] - ap, K[i, at + 1] - aq
+        a[at + 2], a[at + 3] = K[i, at + 2] - ar, K[i, at + 3] - a_s
+        b[at], b[at + 1] = K[i + 1, at] - bp, K[i + 1, at + 1] - bq
+        b[at + 2], b[at + 3] = K[i + 1, at + 2] - br, K[i + 1, at + 3] - bs
 
 
 @overload(equilibrium.potential, jit_options={"error_model": "numpy"})
@@ -636,7 +670,7 @@ class Scratch(NamedTuple):
     residual_features: Array  # (RESIDUAL_FEATURES,)
     nodal: Array  # (most nodes of a patch,)
     distance: Array  # (p,)
-    surface: Array  # (clusters of triangles + 6,)
+    surface: Array  # (clusters of triangles + 3,)
 
 
 class Outcome(NamedTuple):

@@ -14,17 +14,22 @@ Array = NDArray[np.float64]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _closest_on_triangle(p, a, b, c, weights):
-    """Barycentric coordinates of the point of triangle abc nearest to p (Ericson 2005, 5.1.5)."""
+def _closest_on_triangle(p, vertices, first, second, third):
+    """Distance of a triangle from p, and the barycentric coordinates of its nearest point.
+
+    Ericson, Real-Time Collision Detection, 2005, 5.1.5.  No array is made of a vertex: that takes
+    longer than the arithmetic.
+    """
     d1 = d2 = d3 = d4 = d5 = d6 = 0.0
     for i in range(3):
-        ab, ac = b[i] - a[i], c[i] - a[i]
-        d1 += ab * (p[i] - a[i])
-        d2 += ac * (p[i] - a[i])
-        d3 += ab * (p[i] - b[i])
-        d4 += ac * (p[i] - b[i])
-        d5 += ab * (p[i] - c[i])
-        d6 += ac * (p[i] - c[i])
+        a, b, c = vertices[first, i], vertices[second, i], vertices[third, i]
+        ab, ac = b - a, c - a
+        d1 += ab * (p[i] - a)
+        d2 += ac * (p[i] - a)
+        d3 += ab * (p[i] - b)
+        d4 += ac * (p[i] - b)
+        d5 += ab * (p[i] - c)
+        d6 += ac * (p[i] - c)
     vc, vb, va = d1 * d4 - d3 * d2, d5 * d2 - d1 * d6, d3 * d6 - d5 * d4
     if d1 <= 0.0 and d2 <= 0.0:
         v, w = 0.0, 0.0
@@ -41,7 +46,12 @@ def _closest_on_triangle(p, a, b, c, weights):
         v = 1.0 - w
     else:
         v, w = vb / (va + vb + vc), vc / (va + vb + vc)
-    weights[0], weights[1], weights[2] = 1.0 - v - w, v, w
+    u = 1.0 - v - w
+    squared = 0.0
+    for i in range(3):
+        x = u * vertices[first, i] + v * vertices[second, i] + w * vertices[third, i]
+        squared += (p[i] - x) ** 2
+    return math.sqrt(squared), u, v, w
 
 
 UPRIGHT = 0.7
@@ -54,6 +64,7 @@ class Ground(NamedTuple):
 
     vertices: Array  # (v, 3) mm
     triangles: NDArray[np.int32]  # (t, 3), neighbours next to each other
+    balls: Array  # (t, 4) mm, centres and radii of balls that hold them
     normals: Array  # (v, 3)
     first: NDArray[np.int64]  # (c + 1,) first triangle of each cluster
     centres: Array  # (3, c) mm, of balls that hold the clusters
@@ -61,13 +72,13 @@ class Ground(NamedTuple):
     values: Array  # (v, k)
 
 
-CLUSTER = 8
+CLUSTER = 32
 """Most triangles of a cluster."""
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _project(ground, p, squared, weights, trial):
-    """Nearest triangle and barycentric ``weights`` there; returns (triangle, distance).
+def _project(ground, p, squared, weights):
+    """Nearest triangle and barycentric ``weights`` (3,) there; returns (triangle, distance).
 
     ``squared`` (c,) is scratch: squared distances of the balls' centres.
     """
@@ -76,59 +87,54 @@ def _project(ground, p, squared, weights, trial):
     for c in range(len(radii)):
         dx, dy, dz = x - centres[0, c], y - centres[1, c], z - centres[2, c]
         squared[c] = dx * dx + dy * dy + dz * dz
-    first = np.argmin(squared[: len(radii)])
-    nearest, best = _nearest_in(ground, p, first, 0, np.inf, weights, trial)
+    first, least = 0, np.inf
+    for c in range(len(radii)):
+        if squared[c] < least:
+            first, least = c, squared[c]
+    nearest, best = _nearest_in(ground, p, first, 0, np.inf, weights)
     for c in range(len(radii)):
         bound = best + radii[c]
         if squared[c] < bound * bound and c != first:
-            nearest, best = _nearest_in(ground, p, c, nearest, best, weights, trial)
+            nearest, best = _nearest_in(ground, p, c, nearest, best, weights)
     return nearest, best
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _nearest_in(ground, p, cluster, nearest, best, weights, trial):
+def _nearest_in(ground, p, cluster, nearest, best, weights):
     """``nearest`` triangle and its distance ``best``, or those of a nearer one in the cluster."""
+    balls, triangles = ground.balls, ground.triangles
     for t in range(ground.first[cluster], ground.first[cluster + 1]):
-        distance = _distance(ground, p, t, trial)
-        if distance < best:
-            nearest, best = t, distance
-            weights[:] = trial
+        dx, dy, dz = p[0] - balls[t, 0], p[1] - balls[t, 1], p[2] - balls[t, 2]
+        bound = best + balls[t, 3]
+        if dx * dx + dy * dy + dz * dz < bound * bound:
+            i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+            distance, u, v, w = _closest_on_triangle(p, ground.vertices, i, j, k)
+            if distance < best:
+                nearest, best = t, distance
+                weights[0], weights[1], weights[2] = u, v, w
     return nearest, best
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _distance(ground, p, t, weights):
-    """Distance of p from triangle t, and the barycentric coordinates of its nearest point."""
-    vertices = ground.vertices
-    a, b, c = ground.triangles[t, 0], ground.triangles[t, 1], ground.triangles[t, 2]
-    _closest_on_triangle(p, vertices[a], vertices[b], vertices[c], weights)
-    distance = 0.0
-    for i in range(3):
-        x = weights[0] * vertices[a, i] + weights[1] * vertices[b, i] + weights[2] * vertices[c, i]
-        distance += (p[i] - x) ** 2
-    return math.sqrt(distance)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def locate(ground, p, scratch, x, normal, at):
     """Write the projection of p, the normal and the values ``at`` it; return the distance.
 
-    ``scratch`` (clusters + 6,) holds one value for each ball of triangles and six more.
+    ``scratch`` (clusters + 3,) holds one value for each ball of triangles and three more.
     """
     count = len(ground.radii)
-    weights, trial = scratch[count : count + 3], scratch[count + 3 :]
-    t, distance = _project(ground, p, scratch[:count], weights, trial)
-    x[:] = 0.0
-    normal[:] = 0.0
-    at[:] = 0.0
-    for corner in range(3):
-        v, w = ground.triangles[t, corner], weights[corner]
-        for k in range(len(at)):
-            at[k] += w * ground.values[v, k]
-        for i in range(3):
-            x[i] += w * ground.vertices[v, i]
-            normal[i] += w * ground.normals[v, i]
-    length = math.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
+    weights = scratch[count:]
+    t, distance = _project(ground, p, scratch, weights)
+    a, b, c = ground.triangles[t, 0], ground.triangles[t, 1], ground.triangles[t, 2]
+    u, v, w = weights[0], weights[1], weights[2]
+    vertices, normals, values = ground.vertices, ground.normals, ground.values
+    for k in range(len(at)):
+        at[k] = u * values[a, k] + v * values[b, k] + w * values[c, k]
+    length = 0.0
+    for i in range(3):
+        x[i] = u * vertices[a, i] + v * vertices[b, i] + w * vertices[c, i]
+        normal[i] = u * normals[a, i] + v * normals[b, i] + w * normals[c, i]
+        length += normal[i] ** 2
+    length = math.sqrt(length)
     for i in range(3):
         normal[i] /= length
     return distance
@@ -151,6 +157,7 @@ class Surface:
     triangles: NDArray[np.int32]
     normals: Array
     _ordered: NDArray[np.int32] = field(init=False, repr=False)
+    _balls: Array = field(init=False, repr=False)
     _first: NDArray[np.int64] = field(init=False, repr=False)
     _centres: Array = field(init=False, repr=False)
     _radii: Array = field(init=False, repr=False)
@@ -163,12 +170,15 @@ class Surface:
         starts = first[:-1]
         ordered = np.ascontiguousarray(self.triangles[np.concatenate(clusters)])
         corners = self.vertices[ordered]
-        low = np.minimum.reduceat(corners.min(axis=1), starts)
-        high = np.maximum.reduceat(corners.max(axis=1), starts)
+        low, high = corners.min(axis=1), corners.max(axis=1)
+        balls = np.column_stack([(low + high) / 2, np.zeros(len(ordered))])
+        balls[:, 3] = np.linalg.norm(corners - balls[:, None, :3], axis=2).max(axis=1)
+        low, high = np.minimum.reduceat(low, starts), np.maximum.reduceat(high, starts)
         centres = (low + high) / 2
         own = np.repeat(centres, np.diff(first), axis=0)
         reach = np.linalg.norm(corners - own[:, None], axis=2).max(axis=1)
         object.__setattr__(self, "_ordered", ordered)
+        object.__setattr__(self, "_balls", balls)
         object.__setattr__(self, "_first", first)
         object.__setattr__(self, "_centres", np.ascontiguousarray(centres.T))
         object.__setattr__(self, "_radii", np.maximum.reduceat(reach, starts))
@@ -180,7 +190,7 @@ class Surface:
     def locate(self, position: Array, values: Array) -> tuple[Array, Array, float, Array]:
         """As ``project``, and the values (k,) there of fields given at the vertices, (v, k)."""
         x, normal, at = np.empty(3), np.empty(3), np.empty(values.shape[1])
-        scratch = np.empty(len(self._radii) + 6)
+        scratch = np.empty(len(self._radii) + 3)
         distance = locate(self.ground(values), position, scratch, x, normal, at)
         return x, normal, distance, at
 
@@ -194,6 +204,7 @@ class Surface:
         return Ground(
             self.vertices,
             self._ordered,
+            self._balls,
             self.normals,
             self._first,
             self._centres,

@@ -79,7 +79,7 @@ state.  Newton's method squares it (to 1e-5, say), which need not be evaluated."
 LEAST_SHARE = 0.1
 """Weight of a model below which its residual may not be larger still: that counts by weight."""
 
-LAG = 0.005
+LAG = 0.03
 """Change of the response, relative to it, up to which the tissue's part of the tangent serves
 again.  The contact's never does: it is far stiffer and changes as fast as the tip moves."""
 
@@ -214,15 +214,17 @@ class TipScratch(NamedTuple):
     factor: Array  # (MAX_ACTIVE, m, m)
     coupling: Array  # (MAX_ACTIVE, 3, m)
     moved: Array  # (n, 3) mm, of the surface's nodes; only those near are written
-    own: Array  # (3 k, m) modes at the nodes of a face
-    folded: Array  # (3 k, m) a face's stiffness times these
+    own: Field  # (3 k f, m) modes at the nodes of touching faces
+    folded: Field  # (3 k f, m) the faces' stiffnesses times these
+    square: Field  # (3 k, 3 k) a face's stiffness
+    product: Field  # (m, m)
     touching: Touching
     distance: Array  # (p,)
     fade: Array  # (MAX_ACTIVE, 3) 1/mm, gradients of the weights
     features: Array  # (TIP_FEATURES,)
     residual_features: Array  # (RESIDUAL_FEATURES,)
     inward: Array  # (3,)
-    ground: Array  # (clusters + 6,)
+    ground: Array  # (clusters + 3,)
 
 
 TIP_ERROR_FEATURES = 10
@@ -295,8 +297,10 @@ class TipSystem(NamedTuple):
     x: Array
     step: Array  # (m,) scratch
     moved: Array
-    own: Array
-    folded: Array
+    own: Field
+    folded: Field
+    square: Field
+    product: Field
     touching: Touching
 
 
@@ -368,8 +372,7 @@ def _factorise(system, u, shift):
             if not known:
                 _form_bulk(system, u)
             system.tangent[:] = system.bulk
-            for c in range(system.touching.touched[0]):
-                add_face(system, c)
+            add_contact(system)
             if cholesky(system.tangent, shift, system.factor):
                 return True
             if not known:
@@ -403,36 +406,35 @@ def _form_bulk(system, u):
     system.formed[:] = u
 
 
-@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def add_face(system, c):
-    """Add a touching face's stiffness to the lower triangle of the tangent."""
-    K, own, folded = system.touching.stiffness[c], system.own, system.folded
-    tangent = system.tangent
-    corners = system.corners[system.touching.face[c]]
-    nodes, m = len(corners), len(tangent)
-    for b in range(nodes):
-        for j in range(3):
-            row, target = system.modes[corners[b], j], own[nodes * j + b]
-            for n in range(m):
-                target[n] = row[n]
+@njit(cache=True, error_model="numpy", nogil=True)
+def add_contact(system):
+    """Add the stiffness of all touching faces to the tangent; ``react`` uses what is left here."""
+    touching, own, folded, square = system.touching, system.own, system.folded, system.square
+    nodes = system.corners.shape[1]
+    rows = 3 * nodes
+    count = touching.touched[0]
+    for c in range(count):
+        _place_face(system, c, square, own[rows * c : rows * (c + 1)])
+        np.dot(square, own[rows * c : rows * (c + 1)], folded[rows * c : rows * (c + 1)])
+    if count > 0:
+        np.dot(own[: rows * count].T, folded[: rows * count], system.product)
+        system.tangent[:] += system.product
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _place_face(system, c, square, own):
+    """A touching face's stiffness (3 k, 3 k), and modes (3 k, m) at its nodes."""
+    K, corners = system.touching.stiffness[c], system.corners[system.touching.face[c]]
+    nodes = len(corners)
     for i in range(3):
         for a in range(nodes):
-            target = folded[nodes * i + a]
-            target[:] = 0.0
+            row, target = system.modes[corners[a], i], own[nodes * i + a]
+            for n in range(len(row)):
+                target[n] = row[n]
             for j in range(3):
-                row = K[min(i, j), max(i, j), a]
-                for b in range(0, nodes, 4):  # a face has 4 or 8 nodes
-                    k, at = row[b : b + 4], nodes * j + b
-                    p, q, r, s = own[at], own[at + 1], own[at + 2], own[at + 3]
-                    for n in range(m):
-                        target[n] += k[0] * p[n] + k[1] * q[n] + k[2] * r[n] + k[3] * s[n]
-    for a in range(0, 3 * nodes, 4):
-        p, q, r, s = folded[a], folded[a + 1], folded[a + 2], folded[a + 3]
-        for j in range(m):
-            w, x, y, z = own[a, j], own[a + 1, j], own[a + 2, j], own[a + 3, j]
-            row = tangent[j]
-            for n in range(j + 1):
-                row[n] += w * p[n] + x * q[n] + y * r[n] + z * s[n]
+                low, high = min(i, j), max(i, j)
+                for b in range(nodes):
+                    square[nodes * i + a, nodes * j + b] = K[low, high, a, b]
 
 
 @overload(equilibrium.correct, jit_options={"error_model": "numpy"})
@@ -517,6 +519,8 @@ def tip_system(models, k, slot, memory, scratch):
             scratch.moved,
             scratch.own,
             scratch.folded,
+            scratch.square,
+            scratch.product,
             scratch.touching,
         )
     )
@@ -648,19 +652,18 @@ def _remember(memory, scratch, outcome, x):
 @njit(cache=True, error_model="numpy", nogil=True)
 def react(system, coupling, force, tangent):
     """Force, its derivative and B of an equilibrium whose tangent has just been factorised."""
-    touching, modes = system.touching, system.modes
-    count = touching.touched[0]
+    touching, folded = system.touching, system.folded
+    count, nodes = touching.touched[0], system.corners.shape[1]
     reaction(touching, count, force)
     coupling[:] = 0.0
+    # a tip that moves by dx does what nodes do that all move by -dx
     for c in range(count):
-        own = system.corners[touching.face[c]]
         for i in range(3):
-            for j in range(3):
-                block = touching.stiffness[c, min(i, j), max(i, j)]
-                for a in range(len(own)):
-                    total, row = block[a].sum(), modes[own[a], j]
-                    for n in range(coupling.shape[1]):
-                        coupling[i, n] += total * row[n]
+            target = coupling[i]
+            for a in range(nodes):
+                row = folded[nodes * (3 * c + i) + a]
+                for n in range(len(row)):
+                    target[n] += row[n]
     step = system.step
     for i in range(3):
         step[:] = coupling[i]
@@ -818,6 +821,7 @@ class TipState:
         count, m, entries = models.points.gradients.shape
         tangent_entries = models.tangent_points.gradients.shape[2]
         points = LANES * (entries // TILE)
+        faces, rows = int(np.diff(models.face_from).max()), 3 * models.corners.shape[1]
         self.memory = TipMemory(
             patch=np.full(MAX_ACTIVE, -1, np.int64),
             q=np.zeros((MAX_ACTIVE, m)),
@@ -842,15 +846,17 @@ class TipState:
             factor=np.zeros((MAX_ACTIVE, m, m)),
             coupling=np.zeros((MAX_ACTIVE, 3, m)),
             moved=np.zeros(models.surface.nodes.shape),
-            own=np.zeros((3 * models.corners.shape[1], m)),
-            folded=np.zeros((3 * models.corners.shape[1], m)),
-            touching=room_for(models.surface, int(np.diff(models.face_from).max())),
+            own=np.zeros((rows * faces, m), np.float32),
+            folded=np.zeros((rows * faces, m), np.float32),
+            square=np.zeros((rows, rows), np.float32),
+            product=np.zeros((m, m), np.float32),
+            touching=room_for(models.surface, faces),
             distance=np.zeros(count),
             fade=np.zeros((MAX_ACTIVE, 3)),
             features=np.zeros(TIP_FEATURES),
             residual_features=np.zeros(RESIDUAL_FEATURES),
             inward=np.zeros(3),
-            ground=np.zeros(len(ground.radii) + 6),
+            ground=np.zeros(len(ground.radii) + 3),
         )
         # one array, so that an answer is kept by one copy
         self.record = record = np.zeros(_SCALARS.stop)

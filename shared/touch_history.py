@@ -66,7 +66,7 @@ from shared.touch import (
     TOLERANCE,
     TOUCHED,
     TipSystem,
-    add_face,
+    add_contact,
     far,
     first_guess,
     form_contact,
@@ -223,8 +223,7 @@ def _factorise(system, u, shift):
             for i in range(len(u)):
                 for j in range(len(u)):
                     tangent[i, j] = tip.bulk[i, j] - loss * D[i, j]
-            for c in range(tip.touching.touched[0]):
-                add_face(tip, c)
+            add_contact(tip)
             if cholesky(tangent, shift, tip.factor):
                 return True
             if not known:

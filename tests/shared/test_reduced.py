@@ -216,7 +216,9 @@ def test_points_and_defect_together_answer_as_all_points(atlas, galerkin):
             assert trainer.solve(centre, inward, share * limit)
         exact, *others = (trainer.wide for trainer in trainers)
         errors.append([norm(wide - exact) / norm(exact) for wide in others])
-    without, fitted = np.mean(errors, axis=0)
+    # not the mean: whether a load that just misses `MISSED_MOST` gets one more mode, and with it a
+    # tenth of the error, hangs on round-off
+    without, fitted = np.median(errors, axis=0)
     assert fitted < 0.5 * without
 
 
