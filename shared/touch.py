@@ -79,7 +79,7 @@ state.  Newton's method squares it (to 1e-5, say), which need not be evaluated."
 LEAST_SHARE = 0.1
 """Weight of a model below which its residual may not be larger still: that counts by weight."""
 
-LAG = 0.03
+LAG = 0.01
 """Change of the response, relative to it, up to which the tissue's part of the tangent serves
 again.  The contact's never does: it is far stiffer and changes as fast as the tip moves."""
 
@@ -214,10 +214,10 @@ class TipScratch(NamedTuple):
     factor: Array  # (MAX_ACTIVE, m, m)
     coupling: Array  # (MAX_ACTIVE, 3, m)
     moved: Array  # (n, 3) mm, of the surface's nodes; only those near are written
-    own: Field  # (3 k f, m) modes at the nodes of touching faces
-    folded: Field  # (3 k f, m) the faces' stiffnesses times these
-    square: Field  # (3 k, 3 k) a face's stiffness
-    product: Field  # (m, m)
+    own: Array  # (3 k f, m) modes at the nodes of touching faces
+    folded: Array  # (3 k f, m) the faces' stiffnesses times these
+    square: Array  # (3 k, 3 k) a face's stiffness
+    product: Array  # (m, m)
     touching: Touching
     distance: Array  # (p,)
     fade: Array  # (MAX_ACTIVE, 3) 1/mm, gradients of the weights
@@ -297,10 +297,10 @@ class TipSystem(NamedTuple):
     x: Array
     step: Array  # (m,) scratch
     moved: Array
-    own: Field
-    folded: Field
-    square: Field
-    product: Field
+    own: Array
+    folded: Array
+    square: Array
+    product: Array
     touching: Touching
 
 
@@ -408,7 +408,10 @@ def _form_bulk(system, u):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def add_contact(system):
-    """Add the stiffness of all touching faces to the tangent; ``react`` uses what is left here."""
+    """Add the stiffness of all touching faces to the tangent; ``react`` uses what is left here.
+
+    It exceeds the tissue's by many orders of magnitude, so single precision would not do.
+    """
     touching, own, folded, square = system.touching, system.own, system.folded, system.square
     nodes = system.corners.shape[1]
     rows = 3 * nodes
@@ -846,10 +849,10 @@ class TipState:
             factor=np.zeros((MAX_ACTIVE, m, m)),
             coupling=np.zeros((MAX_ACTIVE, 3, m)),
             moved=np.zeros(models.surface.nodes.shape),
-            own=np.zeros((rows * faces, m), np.float32),
-            folded=np.zeros((rows * faces, m), np.float32),
-            square=np.zeros((rows, rows), np.float32),
-            product=np.zeros((m, m), np.float32),
+            own=np.zeros((rows * faces, m)),
+            folded=np.zeros((rows * faces, m)),
+            square=np.zeros((rows, rows)),
+            product=np.zeros((m, m)),
             touching=room_for(models.surface, faces),
             distance=np.zeros(count),
             fade=np.zeros((MAX_ACTIVE, 3)),

@@ -1,3 +1,4 @@
+import asyncio
 import os
 import subprocess
 import sys
@@ -39,3 +40,44 @@ def test_a_refusal_is_told_with_what_it_takes(monkeypatch):
     said = realtime._schedule()
     assert "refused (Operation not permitted)" in said
     assert "CAP_SYS_NICE" in said
+
+
+def go_on(vigil, seconds, stride, cost):
+    """Let time pass in strides; return the share of a core spent, `cost` a stride when awake."""
+    now = spent = 0.0
+    vigil._until = seconds
+    while now < seconds:
+        awake = vigil._may_go_on(now, spent)
+        now += stride
+        spent += stride if awake else cost
+    return spent / seconds
+
+
+@pytest.mark.parametrize("cost", [0.0, 5e-5])
+def test_a_worker_that_waits_awake_still_sleeps_enough_not_to_be_halted(cost):
+    share = go_on(realtime.Vigil(True), 2.0, 1e-4, cost)
+    assert 0.85 < share < 0.94  # the system halts at 0.95
+
+
+def test_an_event_loop_is_kept_awake_while_frames_come():
+    async def turns(enabled):
+        vigil, counted = realtime.Vigil(enabled), 0
+        loop = asyncio.get_running_loop()
+        run_once = loop._run_once
+
+        def counting():
+            nonlocal counted
+            counted += 1
+            run_once()
+
+        loop._run_once = counting
+        vigil.keep()
+        await asyncio.sleep(0.2)
+        during = counted
+        await asyncio.sleep(0.1)
+        return during, counted - during
+
+    assert asyncio.run(turns(False))[0] < 20
+    during, after = asyncio.run(turns(True))
+    assert during > 100
+    assert after < 20, "without frames it sleeps again"
