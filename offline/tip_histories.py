@@ -82,6 +82,11 @@ class CourseComparison:
         Relative L2 errors over all nodes (outside the clamped layer) and all moments.
     worst_displacement, worst_von_mises, worst_force : float
         Largest error of a moment, over the largest norm until then.
+    apart : int
+        Moments at which the models rest in different equilibria, as where tissue has slipped off
+        the tip in one and is about to in the other.
+    together_displacement, together_von_mises, together_force : float
+        Errors over all other moments.
     unconverged : int
     moments : list of KnownMoment
     """
@@ -95,6 +100,10 @@ class CourseComparison:
     worst_displacement: float
     worst_von_mises: float
     worst_force: float
+    apart: int
+    together_displacement: float
+    together_von_mises: float
+    together_force: float
     unconverged: int
     moments: list[KnownMoment] = field(repr=False)
 
@@ -121,6 +130,8 @@ def compare_course(
     pairs = list(zip((u, s, f), (full[0], full[1][:, kept], full[2]), strict=True))
     errors = errors_so_far(pairs)
     overall = [relative(a, b.astype(float)) for a, b in pairs]
+    together = ~_apart(u, full[0])
+    rest = [relative(a[together], b[together].astype(float)) for a, b in pairs]
     worst = errors.max(axis=1).tolist()
     return CourseComparison(
         steps=len(answers),
@@ -132,9 +143,19 @@ def compare_course(
         worst_displacement=worst[0],
         worst_von_mises=worst[1],
         worst_force=worst[2],
+        apart=int(np.sum(~together)),
+        together_displacement=rest[0],
+        together_von_mises=rest[1],
+        together_force=rest[2],
         unconverged=sum(not answer.converged for answer in answers),
         moments=known_moments(errors, answers),
     )
+
+
+def _apart(u: Array, exact: NDArray[Any]) -> NDArray[np.bool_]:
+    """Moments (t,) at which displacements (t, n, 3) are those of different equilibria."""
+    away, size = (np.linalg.norm(x.reshape(len(x), -1), axis=1) for x in (u - exact, exact))
+    return np.asarray(away > OTHER_EQUILIBRIUM * np.maximum.accumulate(size))
 
 
 def validate_courses(
@@ -173,16 +194,25 @@ def validate_courses(
 
 
 def summarise_courses(rows: Sequence[CourseComparison]) -> dict[str, Any]:
-    """Statistics over histories, those left out in which the models part.
+    """Statistics over histories, those left out that the models spend in different equilibria.
 
     ``covered``: the share of all converged moments that are within their three estimates.
+    ``apart``: in how many histories the models part for a while, and for how many moments in all;
+    ``together_...``: errors over all other moments of all histories.
     """
     typical = [row for row in rows if row.typical]
     names = [*QUANTITIES, *(f"worst_{name}" for name in QUANTITIES)]
+    together = [f"together_{name}" for name in QUANTITIES]
     return {
         "histories": len(rows),
         "steps": sum(row.steps for row in rows),
         "unconverged": sum(row.unconverged for row in rows),
         "other_equilibrium": len(rows) - len(typical),
         **covered_moments(rows, QUANTITIES),
-    } | {name: statistics([getattr(row, name) for row in typical]) for name in names}
+        "apart": {
+            "histories": sum(row.apart > 0 for row in rows),
+            "moments": sum(row.apart for row in rows),
+        },
+        **{name: statistics([getattr(row, name) for row in typical]) for name in names},
+        **{name: statistics([getattr(row, name) for row in rows]) for name in together},
+    }

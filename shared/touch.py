@@ -93,6 +93,9 @@ SKIN = 0.02
 """Distance from the surface, in radii of the tip, at which contact is looked for: the triangles
 that say where the surface is cut its curves."""
 
+MOST_SADDLES, NUDGE = 3, 0.02
+"""Saddles that one search leaves at most, and by how much of the response."""
+
 RAMP = 8
 """Steps of the way in when an equilibrium cannot be found in one jump."""
 
@@ -485,6 +488,36 @@ def settle(system, tip, q, work, depth, tolerance, most):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def settle_stably(system, tip, q, work, depth, tolerance, most, tangent):
+    """As ``settle``, but never in a saddle, and with the tangent at q factorised.
+
+    ``tangent`` is where the system forms it.  Where tissue snaps, equilibria end in saddles; from
+    one the search goes on the way down.
+    """
+    status, iterations, energy, smallest = settle(system, tip, q, work, depth, tolerance, most)
+    saddles = 0
+    while status == equilibrium.CONVERGED and not equilibrium.factorise(system, q, 0.0):
+        saddles += 1
+        if saddles > MOST_SADDLES or iterations >= most:
+            return equilibrium.STALLED, iterations, energy, smallest
+        _leave_saddle(system, q, work, tangent)
+        status, more, energy, smallest = settle(system, tip, q, work, depth, tolerance, most)
+        iterations += more
+    return status, iterations, energy, smallest
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _leave_saddle(system, q, work, tangent):
+    """Move q, a saddle, along the eigenvector of the least eigenvalue of the tangent."""
+    K = np.tril(tangent)
+    K += np.tril(tangent, -1).T
+    down = NUDGE * math.sqrt(np.dot(q, q)) * np.linalg.eigh(K)[1][:, 0]
+    ahead, _ = equilibrium.potential(system, q + down, work[3])
+    back, _ = equilibrium.potential(system, q - down, work[3])
+    q += down if ahead < back else -down
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def tip_system(models, k, slot, memory, scratch):
     """Local model k under the tip at ``scratch.position``, by reference."""
     nodes = slice(models.node_from[k], models.node_from[k + 1])
@@ -572,8 +605,8 @@ def _take_over(models, k, x, memory, scratch, q):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def settle_on_the_way(system, tip, q, work, depth, normal):
-    """As ``settle``, from rest along the way in, for where a jump fails."""
+def settle_on_the_way(system, tip, q, work, depth, normal, tangent):
+    """As ``settle_stably``, from rest along the way in, for where a jump fails."""
     at = system.x
     away = depth * normal
     at += away
@@ -582,8 +615,8 @@ def settle_on_the_way(system, tip, q, work, depth, normal):
     for _ in range(RAMP):
         if status == equilibrium.CONVERGED:
             at -= away / RAMP
-            status, more, energy, smallest = settle(
-                system, tip, q, work, depth, TOLERANCE, MAX_ITERATIONS
+            status, more, energy, smallest = settle_stably(
+                system, tip, q, work, depth, TOLERANCE, MAX_ITERATIONS, tangent
             )
             iterations += more
     return status, iterations, energy, smallest
@@ -603,16 +636,14 @@ def _solve(models, k, slot, x, normal, depth, most, memory, scratch, outcome):
     scratch.latest[:] = np.inf
     system = tip_system(models, k, slot, memory, scratch)
     tolerance = TOLERANCE / max(outcome.weight[slot], LEAST_SHARE)
-    status, iterations, energy, smallest = settle(
-        system, models.tip, q, scratch.newton, depth, tolerance, most
+    status, iterations, energy, smallest = settle_stably(
+        system, models.tip, q, scratch.newton, depth, tolerance, most, scratch.tangent
     )
     if status != equilibrium.CONVERGED and depth > 0.0 and most == MAX_ITERATIONS:
         status, more, energy, smallest = settle_on_the_way(
-            system, models.tip, q, scratch.newton, depth, normal
+            system, models.tip, q, scratch.newton, depth, normal, scratch.tangent
         )
         iterations += more
-    if status == equilibrium.CONVERGED and not equilibrium.factorise(system, q, 0.0):
-        status = equilibrium.STALLED  # a saddle
     if status == equilibrium.CONVERGED:
         coupling, force = scratch.coupling[slot], outcome.forces[slot]
         react(system, coupling, force, outcome.tangents[slot])

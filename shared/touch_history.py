@@ -71,8 +71,8 @@ from shared.touch import (
     first_guess,
     form_contact,
     react,
-    settle,
     settle_on_the_way,
+    settle_stably,
     tip_system,
     weight_gradients,
 )
@@ -537,17 +537,15 @@ def step_tip(solver, slot, x, deviatoric, time, most, memory, own):
         )
     )  # fmt: skip
     tip, pressed = models.tip, max(depth, 0.0)
-    status, iterations, energy, smallest = settle(
-        system, tip, q, scratch.newton, pressed, TOLERANCE, most
+    status, iterations, energy, smallest = settle_stably(
+        system, tip, q, scratch.newton, pressed, TOLERANCE, most, scratch.tangent
     )
     if status != equilibrium.CONVERGED and depth > 0.0 and most == MAX_ITERATIONS:
         memory.formed[:] = np.inf
         status, more, energy, smallest = settle_on_the_way(
-            system, tip, q, scratch.newton, depth, normal
+            system, tip, q, scratch.newton, depth, normal, scratch.tangent
         )
         iterations += more
-    if status == equilibrium.CONVERGED and not equilibrium.factorise(system, q, 0.0):
-        status = equilibrium.STALLED  # a saddle
     scalars[STATUS] = max(scalars[STATUS], float(status))
     scalars[ITERATIONS] = max(scalars[ITERATIONS], float(iterations))
     scalars[SMALLEST_J] = min(scalars[SMALLEST_J], smallest)

@@ -9,7 +9,9 @@ from click.testing import CliRunner
 
 from offline.moments import errors_so_far
 from offline.studies import steps
-from offline.tip_histories import play_course, random_courses
+from offline.tip_histories import compare_course, play_course, random_courses, summarise_courses
+from offline.workshop import Workshop
+from shared.artifact import read_artifact
 from shared.atlas import Atlas
 from shared.cli import main
 
@@ -50,6 +52,23 @@ def test_validation_over_histories_of_the_tip(visco_artifact, tmp_path):
     assert found["covered"] >= 0.8
     with rows.open(newline="") as file:
         assert [float(row["force"]) for row in csv.DictReader(file)]
+
+
+def test_moments_in_different_equilibria_are_told_apart(atlas, visco_artifact, rng):
+    (course,) = random_courses(atlas.surface, atlas.limits, atlas.scene, 1, rng)
+    answers = play_course(atlas, course)
+    u = np.array([atlas.displacement(answer) for answer in answers], float)
+    full = [u.copy(), np.array([atlas.von_mises(a) for a in answers]), [a.force for a in answers]]
+    at = np.argmax(np.linalg.norm(u.reshape(len(u), -1), axis=1))
+    full[0][at] *= 1.2  # as if it had gone further there
+    workshop = Workshop.of_artifact(read_artifact(visco_artifact))
+    row = compare_course(workshop, atlas, course, [np.array(field) for field in full])
+    assert row.apart == 1
+    assert row.displacement > 0.01
+    assert row.together_displacement <= 1e-6
+    found = summarise_courses([row])
+    assert found["apart"] == {"histories": 1, "moments": 1}
+    assert found["together_displacement"]["max"] <= 1e-6 < found["displacement"]["max"]
 
 
 def test_histories_of_the_tip_want_time(artifact):

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from offline.workshop import Workshop
+from shared import equilibrium, touch
 from shared.artifact import read_artifact
 from shared.atlas import Atlas
 from shared.endoscope import TIP_DEPTH
 from shared.errors import QueryError
+from shared.tip import tip_of
 from shared.touch import TipState
 from shared.touch import answer as answer_touch
 
@@ -211,3 +213,35 @@ def test_an_impatient_caller_gets_an_answer_or_none(atlas):
 def test_a_tip_inside_the_body_is_refused(atlas):
     with pytest.raises(QueryError, match="below the accessible surface"):
         atlas.touch(above(atlas, 2.1))
+
+
+class Ridge:
+    """Two valleys at (-1, 3) and (1, 3), and a saddle between them."""
+
+    def __init__(self):
+        self.tangent = np.zeros((2, 2))
+
+    def potential(self, u, residual):
+        residual[:] = u[0] * (u[0] ** 2 - 1.0), u[1] - 3.0
+        return 0.25 * (u[0] ** 2 - 1.0) ** 2 + 0.5 * (u[1] - 3.0) ** 2, 1.0
+
+    def factorise(self, u, shift):
+        self.tangent[:] = np.diag([3.0 * u[0] ** 2 - 1.0, 1.0])
+        self.shifted = self.tangent + shift * np.eye(2)
+        return np.linalg.eigvalsh(self.shifted)[0] > 0.0
+
+    def correct(self, residual, step):
+        step[:] = -np.linalg.solve(self.shifted, residual)
+
+
+def test_a_search_does_not_end_in_a_saddle(monkeypatch):
+    for name in ("settle", "_leave_saddle", "_response"):
+        monkeypatch.setattr(touch, name, getattr(touch, name).py_func)
+    monkeypatch.setattr(touch, "descend", equilibrium.descend)
+    system, tip, q, work = Ridge(), tip_of(1.0, 1.0), np.array([0.0, 2.0]), np.zeros((4, 2))
+    search = system, tip, q, work, 0.1, 1e-8, 30
+    assert touch.settle(*search)[0] == equilibrium.CONVERGED
+    np.testing.assert_allclose(q, [0.0, 3.0], atol=1e-6)  # by symmetry
+    status, *_ = touch.settle_stably.py_func(*search, system.tangent)
+    assert status == equilibrium.CONVERGED
+    np.testing.assert_allclose(np.abs(q), [1.0, 3.0], atol=1e-6)
