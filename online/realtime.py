@@ -6,7 +6,8 @@ priority it runs at once. Linux grants this to root, to CAP_SYS_NICE, or within 
 the world: a worker that never sleeps is halted for 50 ms every second.
 
 To be woken takes a worker some 80 µs, as long as all the rest of a frame's way through it. While
-frames come, an event loop with a `Vigil` does not sleep, but for a little less than that halts it.
+frames come, an event loop with a `Vigil` does not sleep, but for a little more than would halt it.
+It takes a core that is left over: not the last one, which the client may need.
 """
 
 import asyncio
@@ -57,6 +58,12 @@ def _schedule() -> str:
     return f"real-time scheduling: on (SCHED_FIFO, priority {PRIORITY})"
 
 
+def _cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def _lock_memory() -> str:
     mlockall = getattr(ctypes.CDLL(None, use_errno=True), "mlockall", None)
     if mlockall is None:
@@ -74,11 +81,12 @@ class Vigil:
 
     Parameters
     ----------
-    enabled : bool
+    workers : int
+        That keep one each; if they are as many as this process has cores, none does.
     """
 
-    def __init__(self, enabled: bool) -> None:
-        self._enabled = enabled
+    def __init__(self, workers: int) -> None:
+        self._enabled = 0 < workers < _cores()
         self._awake = False
         self._until = self._looked = self._spent = self._ahead = 0.0
 

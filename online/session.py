@@ -74,7 +74,7 @@ class Sessions:
         self._store = store
         self._settings = settings
         self._metrics = metrics
-        self._vigil = Vigil(settings.realtime)
+        self._vigil = Vigil(settings.workers if settings.realtime else 0)
         self._open = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
