@@ -13,6 +13,7 @@ from online.client import Client
 from online.follower import Follower
 from online.frames import Flag, Output, Request
 from online.metrics import Metrics
+from online.realtime import Vigil
 from online.session_client import ServiceError, Session, SessionClosed
 from online.settings import Settings
 from online.store import Model
@@ -274,6 +275,7 @@ def test_a_session_that_says_goodbye_is_watched_no_more(tmp_path):
             Follower(atlas),
             Settings(tmp_path),
             Metrics(),
+            Vigil(0),
             {"extensions": extensions},
             receive,
             send,
