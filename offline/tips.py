@@ -49,7 +49,7 @@ TIP_MODES, TIP_POINTS = 32, 80
 NODAL = 36
 """Directions that responses to forces at nodes add to the modes of the patch."""
 
-HISTORY_MODES, HISTORY_POINTS, HISTORY_NODAL = 48, 112, 64
+HISTORY_MODES, HISTORY_POINTS, HISTORY_NODAL = 52, 120, 64
 """The same of tissue that remembers."""
 
 NODES = 0.6

@@ -35,7 +35,7 @@ from offline.checkpoint import Checkpoint, content_key
 from offline.choose import Trial, TrialResult, choose, ladder
 from offline.choose_mesh import with_mesh
 from offline.full_model import POINTWISE
-from offline.giving_way import lowered_limits
+from offline.giving_way import lowered_depths, lowered_limits
 from offline.histories import (
     HistoryComparison,
     compare_history,
@@ -419,17 +419,27 @@ class Pipeline:
         return models
 
     def _lowered(self, models: LocalModels, limits: Array) -> Array:
-        """Load range that ends before the tissue gives way."""
-        started = time.perf_counter()
+        """Load range that ends before the tissue gives way, or slips off the tip."""
         rng = np.random.default_rng([self.scene.seed, 8])
-        lowered = lowered_limits(self._untested(models, limits), rng)
-        share = lowered[:, 0] / limits[:, 0]
+        atlas = self._untested(models, limits)
+        limits = self._ending("giving way", limits, 0, lambda: lowered_limits(atlas, rng))
+        if models.tips is None:
+            return limits
+        rng = np.random.default_rng([self.scene.seed, 10])
+        tipped = self._untested(models, limits)
+        return self._ending("slipping off", limits, TIP_DEPTH, lambda: lowered_depths(tipped, rng))
+
+    def _ending(self, title: str, limits: Array, field: int, search: Callable[[], Array]) -> Array:
+        """What a search makes of the limits; say what it lowered."""
+        started = time.perf_counter()
+        lowered = search()
+        share = lowered[:, field] / limits[:, field]
         tqdm.write(
-            f"load range lowered on {np.mean(share < 1):.1%} of the surface, where the tissue "
-            f"gives way: to {share.min():.0%} of what it was",
+            f"{title}: load range lowered on {np.mean(share < 1):.1%} of the surface, "
+            f"to {share.min():.0%} of what it was",
             file=sys.stderr,
         )
-        self.seconds["giving way"] = round(time.perf_counter() - started, 2)
+        self.seconds[title] = round(time.perf_counter() - started, 2)
         return lowered
 
     def _validate_tip(

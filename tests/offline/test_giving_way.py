@@ -5,12 +5,26 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from offline.giving_way import MARGIN, REACH, bearable_share, lowered_limits
+from offline.giving_way import (
+    FAR,
+    MARGIN,
+    REACH,
+    SLIP_REACH,
+    bearable_share,
+    lowered_depths,
+    lowered_limits,
+    unambiguous_share,
+)
 from shared.atlas import Atlas
-from shared.endoscope import LIMIT_FIELDS
+from shared.endoscope import LIMIT_FIELDS, TIP_DEPTH
+from shared.errors import QueryError
 from shared.surface import Surface
 
 LIMIT = 2.0
+
+RADIUS = 2.0
+
+EDGE = 5.0
 
 
 class Plate:
@@ -75,3 +89,65 @@ def test_an_unconverged_answer_is_no_jump():
 def test_a_trained_scene_does_not_give_way_in_its_range(artifact, rng):
     atlas = Atlas.load(artifact)
     assert (lowered_limits(atlas, rng)[:, 0] >= 0.7 * atlas.limits[:, 0]).all()
+
+
+class Side:
+    """On which side of the edge the tissue lies."""
+
+    side = None
+
+    def forget(self):
+        self.side = None
+
+
+class Edge(Plate):
+    """Tissue with an edge across it that a deep tip carries along, 1 mm at most."""
+
+    def __init__(self, slip):
+        super().__init__(np.inf)
+        self.limits[:, TIP_DEPTH] = 1.0
+        self.models = SimpleNamespace(centres=np.zeros((100, 3)))
+        self.scene = SimpleNamespace(endoscope=SimpleNamespace(radius=RADIUS))
+        self.slip = slip
+
+    def new_state(self):
+        return Side()
+
+    def touch(self, position, state=None):
+        depth, beyond = RADIUS - position[2], position[0] - EDGE
+        side = np.sign(beyond) or 1.0
+        if state is not None:
+            carried = state.side is not None and depth > self.slip and abs(beyond) < 1.0
+            side = state.side = state.side if carried else side
+        return SimpleNamespace(converged=True, patches=((3, 1.0, np.array([depth, side])),))
+
+
+def test_the_depth_ends_where_the_way_to_a_contact_matters_and_only_there(rng):
+    plate = Edge(slip=0.5)
+    limits = lowered_depths(plate, rng)
+    lowered = limits[:, TIP_DEPTH] < 1.0
+    away = np.abs(plate.surface.vertices[:, 0] - EDGE)
+    assert lowered[away < 0.5].mean() > 0.9
+    assert not lowered[away > FAR + SLIP_REACH].any()
+    assert (limits[lowered, TIP_DEPTH] <= 0.5).all()
+    assert (limits[lowered, TIP_DEPTH] > 0.3).all()
+    np.testing.assert_array_equal(limits[:, :TIP_DEPTH], plate.limits[:, :TIP_DEPTH])
+    np.testing.assert_array_equal(plate.limits[:, TIP_DEPTH], 1.0)
+
+
+def test_tissue_that_slips_off_nowhere_keeps_its_depth(rng):
+    plate = Edge(slip=np.inf)
+    np.testing.assert_array_equal(lowered_depths(plate, rng), plate.limits)
+
+
+def test_a_way_with_no_answer_tells_nothing():
+    plate = Edge(slip=0.5)
+    sound = plate.touch
+
+    def touch(position, state=None):
+        if state is not None and position[0] < EDGE:
+            raise QueryError("position", "below the surface")
+        return sound(position, state)
+
+    plate.touch = touch
+    assert unambiguous_share(plate, np.array([EDGE + 0.1, 5.0, 0.0])) == 1.0
