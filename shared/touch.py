@@ -73,9 +73,9 @@ Field = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 TOLERANCE = 0.001
-"""Residual before the last correction relative to the response, both in the energy norm of the rest
-state.  Newton's method squares it (to 1e-6, say), which need not be evaluated; but force and tangent
-on the tool are linearised before that correction, and the hard contact makes 1 % of a few um."""
+"""Residual before the last correction relative to the response, both in the energy norm of the
+rest state.  Newton's method squares it (to 1e-6, say), which need not be evaluated; but the tangent
+on the tool is that before the correction: in hard contact 1 % of it is a matter of micrometres."""
 
 LEAST_SHARE = 0.1
 """Weight of a model below which its residual may not be larger still: that counts by weight."""
