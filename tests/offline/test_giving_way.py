@@ -151,3 +151,8 @@ def test_a_way_with_no_answer_tells_nothing():
 
     plate.touch = touch
     assert unambiguous_share(plate, np.array([EDGE + 0.1, 5.0, 0.0])) == 1.0
+
+
+def test_nothing_slips_off_a_trained_slab(artifact, rng):
+    atlas = Atlas.load(artifact)
+    np.testing.assert_array_equal(lowered_depths(atlas, rng), atlas.limits)
