@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from offline.moments import KnownMoment, covered_moments, errors_so_far, known_moments
 from offline.norms import relative, statistics
 from offline.sampling import cone, random_points, tangents
-from offline.validate import ESTIMATED, UNSEEN, judged
+from offline.validate import ESTIMATED, unseen, verdict
 from offline.workshop import Load, Workshop
-from shared.artifact import read_artifact
 from shared.atlas import Atlas, Estimator
 from shared.endoscope import pressure_limit
 from shared.errors import QueryError
@@ -259,19 +258,16 @@ def validate_histories(
         Statistics of what ``HistoryComparison`` holds, and ``without_equilibrium``: histories that
         the full model could not follow, and which count in nothing else.
     """
-    atlas = Atlas.load(artifact)
+    atlas, workshop, rng = unseen(artifact, seed)
     if atlas.models.viscous is None:
         raise QueryError("histories", f"scene {atlas.name!r} is elastic and has none")
-    workshop = Workshop.of_artifact(read_artifact(artifact))
-    rng = np.random.default_rng([atlas.scene.seed, UNSEEN, seed])
     histories = random_histories(atlas, count, rng)
 
     def judge(i: int, found: tuple[Array, Array] | None) -> HistoryComparison | None:
         return None if found is None else compare_history(workshop, atlas, histories[i], *found)
 
     tasks = [(Workshop.follow, *loads_of(presses)) for presses in histories]
-    compared = judged(artifact, tasks, judge, NONE_FOLLOWED, csv)
-    return summarise_histories(compared) | {"without_equilibrium": count - len(compared)}
+    return verdict(artifact, tasks, judge, summarise_histories, NONE_FOLLOWED, csv)
 
 
 def summarise_histories(rows: Sequence[HistoryComparison]) -> dict[str, Any]:

@@ -14,9 +14,8 @@ from offline.histories import NONE_FOLLOWED, Hand, Press, random_course
 from offline.moments import KnownMoment, covered_moments, errors_so_far, known_moments
 from offline.norms import relative, statistics
 from offline.touches import OTHER_EQUILIBRIUM, QUANTITIES
-from offline.validate import UNSEEN, judged
+from offline.validate import unseen, verdict
 from offline.workshop import Workshop
-from shared.artifact import read_artifact
 from shared.atlas import Atlas, Estimator
 from shared.endoscope import TIP_DEPTH
 from shared.errors import QueryError
@@ -178,19 +177,16 @@ def validate_courses(
         As ``summarise_courses``, and ``without_equilibrium``: histories that the full model could
         not follow, and which count in nothing else.
     """
-    atlas = Atlas.load(artifact)
+    atlas, workshop, rng = unseen(artifact, seed)
     if atlas.models.viscous_tips is None:
         raise QueryError("histories", f"scene {atlas.name!r} has no tip that knows of time")
-    workshop = Workshop.of_artifact(read_artifact(artifact))
-    rng = np.random.default_rng([atlas.scene.seed, UNSEEN, seed])
     courses = random_courses(atlas.surface, atlas.limits, atlas.scene, count, rng)
 
     def judge(i: int, found: Sequence[NDArray[Any]] | None) -> CourseComparison | None:
         return None if found is None else compare_course(workshop, atlas, courses[i], found)
 
     tasks = [(Workshop.follow_tip, *course) for course in courses]
-    compared = judged(artifact, tasks, judge, NONE_FOLLOWED, csv)
-    return summarise_courses(compared) | {"without_equilibrium": count - len(compared)}
+    return verdict(artifact, tasks, judge, summarise_courses, NONE_FOLLOWED, csv)
 
 
 def summarise_courses(rows: Sequence[CourseComparison]) -> dict[str, Any]:

@@ -14,9 +14,8 @@ from tqdm import tqdm
 from offline.cubature import damped_fit
 from offline.norms import relative, statistics
 from offline.sampling import random_points_and_rim
-from offline.validate import UNSEEN, calibrate, coverage, judged
+from offline.validate import calibrate, coverage, unseen, verdict
 from offline.workshop import TouchSample, Workshop
-from shared.artifact import read_artifact
 from shared.atlas import Atlas, Estimator
 from shared.endoscope import TIP_DEPTH
 from shared.reduced import RESIDUAL_FEATURES, residual_features
@@ -228,9 +227,7 @@ def validate_touches(
         As ``summarise_touches``, and ``without_equilibrium``: positions at which the full model
         found none, and which count in nothing else.
     """
-    atlas = Atlas.load(artifact)
-    workshop = Workshop.of_artifact(read_artifact(artifact))
-    rng = np.random.default_rng([atlas.scene.seed, UNSEEN, seed])
+    atlas, workshop, rng = unseen(artifact, seed)
     positions = random_positions(atlas.surface, atlas.limits, atlas.scene, queries, rng)
     answers = [atlas.touch(position) for position in positions]
 
@@ -240,5 +237,4 @@ def validate_touches(
 
     tasks = [(Workshop.touch, answer.position, atlas.displacement(answer)) for answer in answers]
     nothing = "the full model has no equilibrium at any position"
-    compared = judged(artifact, tasks, judge, nothing, csv)
-    return summarise_touches(compared) | {"without_equilibrium": queries - len(compared)}
+    return verdict(artifact, tasks, judge, summarise_touches, nothing, csv)

@@ -121,29 +121,36 @@ def validate(artifact: Path, queries: int, seed: int, csv: Path | None = None) -
         As ``summarise``, and ``without_equilibrium``: loads that the full model had no answer to,
         and which count in nothing else.
     """
-    atlas = Atlas.load(artifact)
-    workshop = Workshop.of_artifact(read_artifact(artifact))
-    loads = unseen_loads(atlas, queries, seed)
+    atlas, workshop, rng = unseen(artifact, seed)
+    loads = random_loads(atlas.surface, atlas.limits, atlas.scene, queries, rng)
 
     def judge(i: int, reference: Array | None) -> Comparison | None:
         return None if reference is None else compare(workshop, atlas, loads[i], reference)
 
     tasks = [(Workshop.sample, load) for load in loads]
     nothing = "the full model has no equilibrium under any of the loads"
-    compared = judged(artifact, tasks, judge, nothing, csv)
-    return summarise(compared) | {"without_equilibrium": queries - len(compared)}
+    return verdict(artifact, tasks, judge, summarise, nothing, csv)
 
 
-def judged(
+def unseen(artifact: Path, seed: int) -> tuple[Atlas, Workshop, np.random.Generator]:
+    """An artifact, its full model, and random numbers that training has not seen."""
+    atlas = Atlas.load(artifact)
+    workshop = Workshop.of_artifact(read_artifact(artifact))
+    return atlas, workshop, np.random.default_rng([atlas.scene.seed, UNSEEN, seed])
+
+
+def verdict(
     artifact: Path,
     tasks: Sequence[tuple[Any, ...]],
     judge: Callable[[int, Any], Any | None],
+    summarise: Callable[[Sequence[Any]], dict[str, Any]],
     nothing: str,
     csv: Path | None,
-) -> list[Any]:
-    """What ``judge`` makes of the full model's result of each task (its number comes first).
+) -> dict[str, Any]:
+    """Summary of what ``judge`` makes of the full model's results, each told its task's number.
 
-    None, where the full model has no answer, is left out; ``csv`` gets a row of each other.
+    None, where the full model has no answer, is left out and counted as ``without_equilibrium``;
+    ``csv`` gets a row of each other.
 
     Raises
     ------
@@ -163,7 +170,7 @@ def judged(
     if csv:
         csv.parent.mkdir(parents=True, exist_ok=True)
         write_rows(csv, ordered)
-    return ordered
+    return summarise(ordered) | {"without_equilibrium": len(tasks) - len(ordered)}
 
 
 def unseen_loads(atlas: Atlas, count: int, seed: int) -> list[Load]:
