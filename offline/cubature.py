@@ -155,6 +155,17 @@ def point_forces(
     return (points @ gradients)[:, 0]
 
 
+def linear_forces(
+    gradients: NDArray[np.float32], weights: Array, mu: Array, lam: Array, states: Array
+) -> NDArray[np.float32]:
+    """Linear elasticity's force of every point (c, r k) at states (k, r); see ``point_forces``."""
+    H = (gradients @ states.T.astype(np.float32)).reshape(len(gradients), 3, 3, -1)
+    P = mu[:, None, None, None] * (H + H.swapaxes(1, 2))
+    P += (lam[:, None] * np.trace(H, axis1=1, axis2=2))[:, None, None] * np.eye(3)[..., None]
+    P = (weights[:, None, None, None] * P).reshape(len(gradients), 9, -1).astype(np.float32)
+    return np.asarray((gradients.swapaxes(1, 2) @ P).reshape(len(gradients), -1))
+
+
 def nonlinear_forces(
     rows: NDArray[np.float32], weights: Array, mu: Array, lam: Array, states: Array
 ) -> Array:

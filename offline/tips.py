@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offline.cubature import compress, damped_fit, nonnegative, point_forces
+from offline.cubature import compress, damped_fit, linear_forces, nonnegative, point_forces
 from offline.full_model import FullModel, NoEquilibrium
 from offline.overlaps import neighbours, overlaps
 from offline.sampling import farthest
@@ -70,7 +70,11 @@ STEP = 0.15
 DEPARTURE = 0.03
 """Size of the random departure from equilibrium, relative to each mode's part in the states."""
 
-EQUATIONS = 250
+EQUATIONS = 800
+
+RESPONSES, LINEAR = 40, 0.01
+"""Random displacements in which the points have to do what linear elasticity does, and how much
+that counts beside a training state."""
 
 GUESSED = 240
 """Answers that the first guess is fitted to."""
@@ -285,10 +289,8 @@ def train_tip(
     modes = (space @ V).astype(np.float32)
     gradients = trainer.gradients @ V.astype(np.float32)
     law = trainer.models.points
-    forces = _training_forces(gradients, (law.weights[0], law.mu[0], law.lam[0]), states, rng)[
-        : len(weights)
-    ]
-    A, b = compress(forces, EQUATIONS, rng)
+    forces = _training_forces(gradients, (law.weights[0], law.mu[0], law.lam[0]), states, rng)
+    A, b = compress(forces[: len(weights)], EQUATIONS, rng)
     points, chosen = nonnegative(A, b, most)
     chosen *= weights[points]
     trained = TipTrainer(body, surface, models, _untrained(modes, points, chosen))
@@ -433,6 +435,10 @@ def _training_forces(
     Times the square root of the compliance, an error of the internal force counts by the
     displacement it causes in the energy norm; times the slope, by the change of the force on the
     tool.
+
+    The model adds to linear elasticity what the points have beyond it.  Points of great weight do
+    that well in training states and are far too stiff for linear elasticity in other directions, in
+    which the potential then falls without end.  So the points shall have its stiffness, too.
     """
     columns = []
     for state in states:
@@ -447,7 +453,11 @@ def _training_forces(
             force = point_forces(gradients, *law, q, state.past)
             if force is not None:
                 columns.append(force @ looks.astype(np.float32))
-    return np.hstack(columns)
+    forces = np.hstack(columns)
+    size = np.linalg.norm(forces.sum(axis=0)) / np.sqrt(forces.shape[1])
+    responses = rng.standard_normal((RESPONSES, gradients.shape[2]))
+    responses *= LINEAR * size / np.linalg.norm(responses, axis=1, keepdims=True)
+    return np.hstack([forces, linear_forces(gradients, *law, responses)])
 
 
 def _fit_guess(

@@ -3,7 +3,17 @@
 import numpy as np
 import pytest
 
-from offline.cubature import STATES, compress, nonlinear_forces, nonnegative, point_forces
+from offline.cubature import (
+    STATES,
+    compress,
+    linear_forces,
+    nonlinear_forces,
+    nonnegative,
+    point_forces,
+)
+from offline.full_model import FullModel
+from offline.mesh import build_mesh
+from offline.scenes import find_scene
 from shared.reduced import LANES
 
 POINTS, EQUATIONS = 300, 20
@@ -86,3 +96,17 @@ def test_forces_of_all_points_are_the_sum_of_each_ones(rng):
         else:
             np.testing.assert_allclose(force, each.sum(axis=0), rtol=1e-4, atol=1e-5)
     assert np.isnan(together).any(axis=1).sum() == 1
+
+
+def test_linear_forces_are_those_of_the_rest_stiffness(rng):
+    scene = find_scene("quick")
+    model = FullModel.of(scene, build_mesh(scene))
+    u = np.zeros((3 * len(model.mesh.nodes), 5))
+    u[model.free] = rng.standard_normal((len(model.free), 5))
+    nodal = u.reshape(-1, 3, 5)[model.connectivity]
+    gradients = np.einsum("enim,eqnj->eqijm", nodal, model.gradients).reshape(-1, 9, 5)
+    mu, lam = np.repeat([model.mu, model.lam], model.weights.shape[1], axis=1)
+    states = rng.standard_normal((3, 5))
+    points = linear_forces(gradients.astype(np.float32), model.weights.ravel(), mu, lam, states)
+    exact = u[model.free].T @ (model.rest_stiffness @ u[model.free]) @ states.T
+    np.testing.assert_allclose(points.sum(axis=0).reshape(5, 3), exact, rtol=1e-3)
