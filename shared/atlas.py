@@ -890,7 +890,8 @@ class Atlas:
         found = self._stepper.press(history, active, pressure, radius, self._step_weights(dt))
         main = max(active, key=lambda pair: pair[1])[0]
         point, moved = record[_POINT], math.hypot(*found.displacement.tolist())
-        travelled = 0.0 if history.position is None else math.dist(point, history.position)
+        before = point if history.position is None else history.position
+        travelled = math.dist(point.tolist(), before.tolist())
         after = History(
             time=history.time + dt,
             locals=found.locals,

@@ -410,5 +410,5 @@ class Stepper(Carrier):
 
     def _take_over(self, k: int, new: Memory, old: Memory, overlap: Field | None) -> None:
         if overlap is not None:
-            new.load[:] = overlap @ old.load
+            new.pull[:] = overlap @ old.pull
         recall_points(self._solver, k, new, self._scratch)

@@ -78,7 +78,7 @@ class Memory(NamedTuple):
     """What one local model remembers."""
 
     wide: Array  # (r,) last answer
-    load: Array  # (r,) last load
+    pull: Array  # (r,) of last load and past in linear visco-elasticity, mN
     mean: Array  # (terms, r) of the answers over the past
     points: Field  # (terms + 1, 6 c) histories of the cubature points, in tiles
     knots: Array  # (KNOTS, r)
@@ -112,7 +112,7 @@ def new_memory(terms: int, modes: int, points: int) -> Memory:
     share[-1] = 1.0
     return Memory(
         wide=np.zeros(modes),
-        load=np.zeros(modes),
+        pull=np.zeros(modes),
         mean=np.zeros((terms, modes)),
         points=np.zeros((terms + 1, SYMMETRIC * points), np.float32),
         knots=np.zeros((KNOTS, modes)),
@@ -124,7 +124,7 @@ def new_memory(terms: int, modes: int, points: int) -> Memory:
 def copied(memory: Memory) -> Memory:
     """A memory that can go on without changing this one."""
     return Memory(
-        memory.wide.copy(), memory.load.copy(), memory.mean.copy(), memory.points.copy(),
+        memory.wide.copy(), memory.pull.copy(), memory.mean.copy(), memory.points.copy(),
         memory.knots.copy(), memory.share.copy(), memory.secants.copy(),
     )  # fmt: skip
 
@@ -430,13 +430,18 @@ def step_patch(patches, k, deviatoric, time, load, memory, scratch, accurate=ACC
         memory.secants, scratch.origin, scratch.latest, scratch.change,
     )  # fmt: skip
     start, work = scratch.start, scratch.newton
+    pulled, change = work[0], scratch.change  # their room
+    multiply(deviatoric, wide, change)
+    for i in range(len(wide)):
+        pulled[i] = scratch.load[i] + loss * change[i] - memory.pull[i]
     status, iterations, smallest = equilibrium.STALLED, 0, 0.0
     for attempt in range(2):
         most = MOST_ITERATIONS if attempt == 0 else MOST_ITERATIONS_ANEW
         scratch.origin[:] = np.nan
         for i in range(len(start)):
-            # at once tissue answers about as it does at rest
-            start[i] = wide[i] + (load[i] - memory.load[i] if attempt == 0 else 0.0)
+            start[i] = wide[i]
+            if attempt == 0:  # what is not linear does not change
+                start[i] += np.dot(memory.secants[i], pulled)
         if attempt == 1:
             forget_secants(memory.secants, scratch.origin)
         energy, smallest = equilibrium.potential(system, start, work[0])
@@ -458,7 +463,8 @@ def step_patch(patches, k, deviatoric, time, load, memory, scratch, accurate=ACC
                 time.decay[a] * memory.mean[a, i] + time.old[a] * wide[i] + time.new[a] * start[i]
             )
     wide[:] = start
-    memory.load[:] = load
+    for i in range(len(wide)):  # the last evaluation has left ``D u``
+        memory.pull[i] = scratch.load[i] + loss * change[i]
     add_knot(memory, time)
     return status, iterations, smallest
 

@@ -176,7 +176,7 @@ def step(
         position=history.position if off else position,
         share=max(history.share, depth / limit),
         response=max(history.response, pushed),
-        travel=history.travel + (0.0 if off else math.dist(position, last)),
+        travel=history.travel + (0.0 if off else math.dist(position.tolist(), last.tolist())),
         smallest=min(history.smallest, scalars.item(SMALLEST_J)),
     )
     features = history_features(outcome.upward, after)

@@ -38,6 +38,7 @@ A *history* is an array (terms + 1, 7): of every term ``H - I`` and ``c_a - 1``,
 12, 02, 01; other tensors as in ``shared.tissue``.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -72,13 +73,13 @@ def step_weights(prony: Sequence[tuple[float, float]], dt: float) -> Weights:
     """
     if not dt >= 0.0:
         raise ValueError(f"dt: must be >= 0 s, not {dt}")
-    share, tau = np.array(prony, dtype=float).reshape(-1, 2).T
-    x = dt / tau
-    lost = -np.expm1(-x)  # 1 - decay
-    with np.errstate(invalid="ignore"):
-        mean = np.where(x > 1e-4, lost / x, 1.0 - x / 2 + x * x / 6)
-    mean[np.isinf(x)] = 0.0
-    return Weights(share.copy(), 1.0 - lost, lost - (1.0 - mean), 1.0 - mean)
+    terms = []
+    for share, tau in prony:
+        x = dt / tau
+        lost = -math.expm1(-x)  # 1 - decay
+        mean = lost / x if x > 1e-4 else 1.0 - x / 2 + x * x / 6
+        terms.append((share, 1.0 - lost, lost - (1.0 - mean), 1.0 - mean))
+    return Weights(*np.array(terms, dtype=float).reshape(-1, 4).T.copy())
 
 
 @njit(cache=True, error_model="numpy")
