@@ -78,7 +78,7 @@ class Memory(NamedTuple):
     """What one local model remembers."""
 
     wide: Array  # (r,) last answer
-    pull: Array  # (r,) of last load and past in linear visco-elasticity, mN
+    pull: Array  # (r,) of load and past on linear tissue, at the last answer
     mean: Array  # (terms, r) of the answers over the past
     points: Field  # (terms + 1, 6 c) histories of the cubature points, in tiles
     knots: Array  # (KNOTS, r)
