@@ -7,7 +7,7 @@ from shared.atlas import Atlas
 from shared.reduced import LANES
 
 STIFFEST = 5.0
-"""Largest stiffness of the points over that of the tissue; without ``LINEAR`` 100 and more."""
+"""Largest stiffness of the points over that of the tissue."""
 
 
 def test_points_are_not_much_stiffer_than_the_tissue_in_any_direction(artifact):
