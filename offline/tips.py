@@ -174,7 +174,7 @@ class TipClock:
         if not touch.converged:
             return None
         self._history = history
-        memory: TipMemory = history.locals[0].memory
+        memory = self._stepper.opened(history.locals[0].record)
         size, pushed = float(np.linalg.norm(memory.wide)), float(np.linalg.norm(touch.force))
         self._most = max(self._most[0], size), max(self._most[1], pushed)
         return _State(
@@ -191,10 +191,8 @@ class TipClock:
     def _past(self, memory: TipMemory) -> Past:
         """What the points remember now."""
         now = step_weights(self._prony, 0.0)
-        mean = (now.share @ memory.mean).astype(np.float32)
-        rows = self.trainer.models.points.gradients[0]
-        L, (B, S) = mean @ rows, np.zeros((2, SYMMETRIC * self._points), np.float32)
-        predict_points(L, memory.points, now, self._mu, B, S)
+        B, S = np.zeros((2, SYMMETRIC * self._points), np.float32)
+        predict_points(memory.points, memory.linear, now, self._mu, B, S)
         return B, S
 
 

@@ -144,11 +144,15 @@ class Follower:
         if share > 0.0:
             return share, steps
         self._lost += 1
-        if self._lost % PATIENCE:
+        self._search_on(self._lost % PATIENCE != 0)
+        return share, steps
+
+    def _search_on(self, where_it_ended: bool) -> None:
+        """Let the search for a position go on with the next, or start anew."""
+        if where_it_ended:
             self._state.go_on()
         else:
             self._state.forget()
-        return share, steps
 
     def _walk(self, target: Array, may_go_on: Callable[[int], bool]) -> tuple[float, int]:
         """Go towards the target from the last good position: share of the way, steps tried."""

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from online.follower import MOST_ITERATIONS, PATIENCE, Follower, Step, is_finite
+from online.follower import MOST_ITERATIONS, Follower, Step, is_finite
 from online.frames import Flag
 from shared.atlas import Atlas
 from shared.history import History
@@ -56,6 +56,7 @@ class TimedFollower(Follower):
         self._history = History()
         self._clock: float | None = None
         self._span = self._share = 0.0
+        self._begun: Touch | None = None
 
     def snapshot(self) -> Snapshot:
         """Keep the state of the tissue, for `restore`."""
@@ -65,6 +66,7 @@ class TimedFollower(Follower):
         """Go back to a snapshot; the client's time goes on from its last frame."""
         self._history, self._good = snapshot
         self._lost = 0
+        self._begun = None
 
     def _follow(
         self, position: Sequence[float], may_go_on: Callable[[int], bool], now: float
@@ -81,14 +83,18 @@ class TimedFollower(Follower):
 
     def _solve(self, position: Array, share: float) -> bool:
         dt = (share - self._share) * self._span
-        # Where tissue snaps, a search must end with its frame: the next starts from the past, too.
-        most = MOST_ITERATIONS * (PATIENCE if self._lost else 1)
-        touch, history = self._atlas.touch_step(self._history, dt, position, most)
+        begun = self._begun if self._lost else None
+        touch, history = self._atlas.touch_step(self._history, dt, position, MOST_ITERATIONS, begun)
         if not (touch.converged and is_finite(touch)):
+            self._begun = None if touch.converged else touch
             return False
         self._history, self._good, self._share = history, touch, share
         self._lost = 0
         return True
+
+    def _search_on(self, where_it_ended: bool) -> None:
+        if not where_it_ended:
+            self._begun = None
 
 
 def follower_of(atlas: Atlas) -> Follower:

@@ -988,6 +988,7 @@ class Atlas:
         dt: float,
         position: ArrayLike,
         most: int = MAX_ITERATIONS,
+        begun: Touch | None = None,
     ) -> tuple[Touch, History]:
         """Answer a position of the rigid tip on visco-elastic tissue.
 
@@ -1001,6 +1002,8 @@ class Atlas:
             Centre of the tip, outside the body.
         most : int
             As in ``touch``.
+        begun : Touch, optional
+            Without an answer, from the same history: the search goes on where that ended.
 
         Returns
         -------
@@ -1020,7 +1023,7 @@ class Atlas:
         at = _vector("position", position)
         return tip_history.step(
             self._tip_state(self._state), self._tip_stepper, history, dt, self._step_weights(dt),
-            at, self.estimators.courses.coefficients, started, most,
+            at, self.estimators.courses.coefficients, started, most, begun,
         )  # fmt: skip
 
     def _tip_state(self, state: State) -> TipState:

@@ -8,18 +8,19 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shared import equilibrium
+from shared.bound import bind
 from shared.reduced_history import (
     Memory,
-    copied,
-    new_memory,
+    new_record,
     new_scratch,
+    opened,
     recall_points,
     step_at,
 )
@@ -69,16 +70,14 @@ class Remains(NamedTuple):
     time: float  # s
 
 
-@dataclass(frozen=True)
-class Local:
+class Local(NamedTuple):
     """History of a patch in use, and what each move of the tool left in the spaces of others."""
 
-    memory: Any  # reduced_history.Memory, or touch_history.TipMemory under the tip
+    record: Array  # (n,) of reduced_history.Memory, or touch_history.TipMemory under the tip
     remains: tuple[Mapping[int, Remains], ...]
 
 
-@dataclass(frozen=True)
-class History:
+class History(NamedTuple):
     """All that the tissue remembers; it never changes, so that it is its own snapshot.
 
     Attributes
@@ -102,7 +101,7 @@ class History:
     """
 
     time: float = 0.0
-    locals: Mapping[int, Local] = field(default_factory=dict)
+    locals: Mapping[int, Local] = {}
     main: int = -1
     position: Array | None = None
     share: float = 0.0
@@ -225,8 +224,12 @@ class Carrier(ABC):
         self._rates, self._coupled = np.linalg.eigh(coupled)
 
     @abstractmethod
-    def _new_memory(self) -> Any:
-        """Of a patch that nothing has happened to; a named tuple as ``reduced_history.Memory``."""
+    def _new_record(self) -> Array:
+        """Of a patch that nothing has happened to."""
+
+    @abstractmethod
+    def opened(self, record: Array) -> Any:
+        """Memory in a record: a named tuple as ``reduced_history.Memory``."""
 
     @abstractmethod
     def _take_over(self, k: int, new: Any, old: Any, overlap: Field | None) -> None:
@@ -237,7 +240,7 @@ class Carrier(ABC):
 
     def at_rest(self) -> Local:
         """A patch that nothing has happened to."""
-        return Local(self._new_memory(), ())
+        return Local(self._new_record(), ())
 
     def follow(self, history: History, k: int) -> Local:
         """Local history of patch k, which does not have one yet.
@@ -248,8 +251,9 @@ class Carrier(ABC):
         if history.main < 0:
             return self.at_rest()
         source, time = history.locals[history.main], history.time
-        new = self._new_memory()
-        old, move = source.memory, {history.main: Remains(source.memory.mean, time)}
+        record = self._new_record()
+        new, old = self.opened(record), self.opened(source.record)
+        move = {history.main: Remains(old.mean.copy(), time)}
         T = self._overlap(k, history.main)
         if T is not None:
             new.knots[:] = old.knots @ T.T
@@ -268,7 +272,7 @@ class Carrier(ABC):
             remains.append(left)
         new.wide[:] = new.knots[-1]
         self._take_over(k, new, old, T)
-        return Local(new, self._largest(remains, time))
+        return Local(record, self._largest(remains, time))
 
     def _projected(
         self, k: int, left: Mapping[int, Remains], time: float
@@ -290,7 +294,7 @@ class Carrier(ABC):
 
     def answers(self, moment: Remembered) -> Answers:
         """Displacements of a moment: patch, weight and (r,) in the wide space of each part."""
-        found = [(k, weight, local.memory.wide) for k, weight, local in moment.active]
+        found = [(k, weight, local.record[: self.modes]) for k, weight, local in moment.active]
         return found + [
             (k, weight, self._models.deviatoric[k] @ mean)
             for k, weight, mean in self.lasting(moment)
@@ -298,12 +302,11 @@ class Carrier(ABC):
 
     def knots(self, moment: Remembered) -> Answers:
         """Displacements of the past, likewise, each with its share in the stress."""
+        opened = [(k, weight, self.opened(local.record)) for k, weight, local in moment.active]
         return [
             (k, weight * float(share), knot)
-            for k, weight, local in moment.active
-            for knot, share in zip(
-                local.memory.knots, local.memory.share @ self._share, strict=True
-            )
+            for k, weight, memory in opened
+            for knot, share in zip(memory.knots, memory.share @ self._share, strict=True)
             if share > 0.0
         ]
 
@@ -378,7 +381,7 @@ class Stepper(Carrier):
     ) -> None:
         super().__init__(models, prony, points)
         self._solver = solver
-        self._scratch = new_scratch(self.modes, points)
+        self._scratch = bind(new_scratch(self.modes, points))
 
     def press(
         self,
@@ -394,19 +397,24 @@ class Stepper(Carrier):
         iterations, smallest, converged, area = 0, math.inf, True, 0.0
         for k, share in active:
             local = history.locals.get(k) or self.follow(history, k)
-            memory = copied(local.memory)
+            record = local.record.copy()
             status, count, least, area = step_at(
                 self._solver, k, pressure, radius, self._models.deviatoric[k], weights,
-                memory, self._scratch, part,
+                record, self._scratch, part,
             )  # fmt: skip
-            found[k] = Local(memory, local.remains)
+            found[k] = Local(record, local.remains)
             moved += share * part
             iterations, smallest = max(iterations, count), min(smallest, least)
             converged = converged and status == equilibrium.CONVERGED
         return Pressed(found, moved, area, converged, iterations, smallest)
 
-    def _new_memory(self) -> Memory:
-        return new_memory(len(self._tau), self.modes, self._points)
+    def _new_record(self) -> Array:
+        return new_record(len(self._tau), self.modes, self._points)
+
+    def opened(self, record: Array) -> Memory:
+        """See ``Carrier``."""
+        memory: Memory = opened(record, len(self._tau), self.modes, self._points)
+        return memory
 
     def _take_over(self, k: int, new: Memory, old: Memory, overlap: Field | None) -> None:
         if overlap is not None:

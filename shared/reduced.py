@@ -141,6 +141,18 @@ def project(rows, vector, out):
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def multiply(A, x, out):
+    """``out = A x``: A (4 k, 4 k), symmetric; x, out (4 k,)."""
+    for i in range(len(out)):
+        out[i] = 0.0
+    for j in range(0, len(A), 4):
+        a, b, c, d = x[j], x[j + 1], x[j + 2], x[j + 3]
+        p, q, r, s = A[j], A[j + 1], A[j + 2], A[j + 3]
+        for i in range(len(out)):
+            out[i] += a * p[i] + b * q[i] + c * r[i] + d * s[i]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
 def _narrow_gradients(rows, steps, vectors, out):
     """Gradients of the narrow modes but the last: ``out[:LEADING + 3]``, in one pass over ``rows``.
 
@@ -252,10 +264,10 @@ def increments(state, gradients, out):
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
 def lower_products(A, B, K):
     """Lower triangle of ``K = A B^T``: A, B (4 k, n) float32; some entries above it as well."""
-    for i in range(0, len(A), 2):
-        a, b = A[i], A[i + 1]
-        for k in range(0, i + 2, 4):
-            p, q, r, s = B[k], B[k + 1], B[k + 2], B[k + 3]
+    for k in range(0, len(A), 4):
+        p, q, r, s = B[k], B[k + 1], B[k + 2], B[k + 3]  # these stay in the first-level cache
+        for i in range(k, len(A), 2):
+            a, b = A[i], A[i + 1]
             ap = aq = ar = a_s = bp = bq = br = bs = np.float32(0.0)
             for n in range(len(a)):
                 x, y = a[n], b[n]
@@ -500,8 +512,9 @@ def _wide_correct(system, residual, step):
 def correct_by_secants(system, residual, step):
     """Newton step of a system with the inverse tangent that its secants make up."""
     learn_secant(system.secants, system.origin, system.latest, residual, system.load, system.change)
+    multiply(system.secants, residual, step)
     for i in range(len(step)):
-        step[i] = -np.dot(system.secants[i], residual)
+        step[i] = -step[i]
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
@@ -521,9 +534,9 @@ def learn_secant(inverse, origin, state, residual, load, product):
         force += change[i] * change[i]
     if curvature > LEAST_CURVATURE * math.sqrt(length * force):
         scale = 1.0 / curvature
+        multiply(inverse, change, product)
         whole = 0.0
         for i in range(len(step)):
-            product[i] = np.dot(inverse[i], change)
             whole += product[i] * change[i]
         whole = (1.0 + whole * scale) * scale
         for i in range(len(step)):

@@ -47,6 +47,7 @@ from shared.reduced import (
     forget_secants,
     is_system,
     load_patch,
+    multiply,
     nonlinear_stress,
     project,
     superpose,
@@ -75,15 +76,47 @@ MOST_ITERATIONS_ANEW = 200
 
 
 class Memory(NamedTuple):
-    """What one local model remembers."""
+    """What one local model remembers: views of a record, which is copied and passed as one."""
 
     wide: Array  # (r,) last answer
     pull: Array  # (r,) of load and past on linear tissue, at the last answer
     mean: Array  # (terms, r) of the answers over the past
     points: Field  # (terms + 1, 6 c) histories of the cubature points, in tiles
+    linear: Field  # (terms + 1, 6 c) minus their linear part: of 2 dev sym H
     knots: Array  # (KNOTS, r)
     share: Array  # (KNOTS, terms) weight of a knot in each mean; sums to 1
     secants: Array  # (r, r) inverse tangent, see shared.reduced.WideSystem
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def cut(record, start, rows, columns):
+    """Part of a record (n,) as (rows, columns), and where it ends."""
+    stop = start + rows * columns
+    return record[start:stop].reshape(rows, columns), stop
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def opened(record, terms, modes, points):
+    """Memory in a record (n,) of ``new_record``, which starts with the last answer."""
+    answers, at = cut(record, 0, 2, modes)
+    mean, at = cut(record, at, terms, modes)
+    knots, at = cut(record, at, KNOTS, modes)
+    share, at = cut(record, at, KNOTS, terms)
+    secants, at = cut(record, at, modes, modes)
+    histories = record[at:].view(np.float32).reshape(2, terms + 1, SYMMETRIC * points)
+    return Memory(
+        answers[0], answers[1], mean, histories[0], histories[1], knots, share, secants
+    )  # fmt: skip
+
+
+def new_record(terms: int, modes: int, points: int) -> Array:
+    """Record of a local model that nothing has happened to."""
+    size = modes * (2 + terms + KNOTS + modes) + KNOTS * terms
+    record = np.zeros(size + (terms + 1) * SYMMETRIC * points)
+    memory = opened(record, terms, modes, points)
+    memory.share[-1] = 1.0
+    memory.secants[:] = np.eye(modes)
+    return record
 
 
 class Scratch(NamedTuple):
@@ -104,29 +137,6 @@ class Scratch(NamedTuple):
     past: Array  # (r,)
     newton: Array  # (4, r)
     start: Array  # (r,)
-
-
-def new_memory(terms: int, modes: int, points: int) -> Memory:
-    """Of a local model that nothing has happened to."""
-    share = np.zeros((KNOTS, terms))
-    share[-1] = 1.0
-    return Memory(
-        wide=np.zeros(modes),
-        pull=np.zeros(modes),
-        mean=np.zeros((terms, modes)),
-        points=np.zeros((terms + 1, SYMMETRIC * points), np.float32),
-        knots=np.zeros((KNOTS, modes)),
-        share=share,
-        secants=np.eye(modes),
-    )
-
-
-def copied(memory: Memory) -> Memory:
-    """A memory that can go on without changing this one."""
-    return Memory(
-        memory.wide.copy(), memory.pull.copy(), memory.mean.copy(), memory.points.copy(),
-        memory.knots.copy(), memory.share.copy(), memory.secants.copy(),
-    )  # fmt: skip
 
 
 def new_scratch(modes: int, points: int) -> Scratch:
@@ -163,47 +173,48 @@ def inverse_cube_root(J):
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def predict_points(L, history, weights, mu, B, S):
+def predict_points(history, linear, weights, mu, B, S):
     """What is known of the end of a step before it is solved.
 
     Parameters
     ----------
-    L : ndarray, shape (9 c,)
-        Gradient of ``sum g (decay z + old c_n)``, in tiles.
-    history : ndarray, shape (terms + 1, 6 c)
+    history, linear : ndarray, shape (terms + 1, 6 c)
+        See ``Memory``.
     weights : Weights
     mu : ndarray, shape (c,), kPa
     B, S : ndarray, shape (6 c,), out
-        ``B`` of ``shared.viscosity``, and minus the stress (kPa) that ``L`` leads to if linear.
+        ``B`` of ``shared.viscosity``, and minus the stress (kPa) that it leads to if linear.
     """
     terms = len(history) - 1
     loss = 0.0
     for a in range(terms):
         loss += weights.share[a] * weights.new[a]
-    B[:] = np.float32(0.0)
+    _recall_mean(history, weights, B)
+    _recall_mean(linear, weights, S)
+    for tile in range(len(mu) // LANES):
+        b = B[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
+        s = S[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
+        m = mu[LANES * tile : LANES * (tile + 1)]
+        for c in range(3 * LANES):
+            b[c] -= np.float32(loss)
+        for i in range(SYMMETRIC):
+            for c in range(LANES):
+                s[LANES * i + c] *= m[c]
+    return loss
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def _recall_mean(history, weights, out):
+    """``sum g (decay z + old last)`` of a history (terms + 1, n)."""
+    terms = len(history) - 1
     last = history[terms]
+    out[:] = np.float32(0.0)
     for a in range(terms):
         row = history[a]
         kept = np.float32(weights.share[a] * weights.decay[a])
         old = np.float32(weights.share[a] * weights.old[a])
-        for i in range(len(B)):
-            B[i] += kept * row[i] + old * last[i]
-    for tile in range(len(mu) // LANES):
-        b = B[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
-        s = S[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
-        h = L[TILE * tile : TILE * (tile + 1)]
-        m = mu[LANES * tile : LANES * (tile + 1)]
-        for c in range(3 * LANES):
-            b[c] -= np.float32(loss)
-        for c in range(LANES):
-            h0, h4, h8 = h[c], h[4 * LANES + c], h[8 * LANES + c]
-            third = (h0 + h4 + h8) / 3.0
-            s[c], s[LANES + c] = 2.0 * m[c] * (h0 - third), 2.0 * m[c] * (h4 - third)
-            s[2 * LANES + c] = 2.0 * m[c] * (h8 - third)
-            s[3 * LANES + c] = m[c] * (h[5 * LANES + c] + h[7 * LANES + c])
-            s[4 * LANES + c] = m[c] * (h[2 * LANES + c] + h[6 * LANES + c])
-            s[5 * LANES + c] = m[c] * (h[LANES + c] + h[3 * LANES + c])
-    return loss
+        for i in range(len(out)):
+            out[i] += kept * row[i] + old * last[i]
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
@@ -263,11 +274,15 @@ def add_past_stress(H, weights, mu, J, B, S, loss, energy, P):
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def drive_points(H, m):
-    """``m - I`` of ``shared.viscosity`` (6 c,) in tiles, of displacement gradients (9 c,)."""
+def drive_points(H, m, linear):
+    """``m - I`` of ``shared.viscosity`` (6 c,) in tiles, of displacement gradients (9 c,).
+
+    ``linear`` (6 c,) is ``2 dev sym H``, minus its linear part.
+    """
     for tile in range(len(H) // TILE):
         h = H[TILE * tile : TILE * (tile + 1)]
         d = m[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
+        e = linear[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
         for c in range(LANES):
             m0, m1, m2, m3, m4, m5 = viscosity.driven(
                 1.0 + h[c], float(h[LANES + c]), float(h[2 * LANES + c]),
@@ -276,6 +291,13 @@ def drive_points(H, m):
             )  # fmt: skip
             d[c], d[LANES + c], d[2 * LANES + c] = m0, m1, m2
             d[3 * LANES + c], d[4 * LANES + c], d[5 * LANES + c] = m3, m4, m5
+            third = (h[c] + h[4 * LANES + c] + h[8 * LANES + c]) / np.float32(3.0)
+            e[c] = np.float32(2.0) * (h[c] - third)
+            e[LANES + c] = np.float32(2.0) * (h[4 * LANES + c] - third)
+            e[2 * LANES + c] = np.float32(2.0) * (h[8 * LANES + c] - third)
+            e[3 * LANES + c] = h[5 * LANES + c] + h[7 * LANES + c]
+            e[4 * LANES + c] = h[2 * LANES + c] + h[6 * LANES + c]
+            e[5 * LANES + c] = h[LANES + c] + h[3 * LANES + c]
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
@@ -292,18 +314,6 @@ def advance_points(m, weights, history):
             row[i] = decay * row[i] + old * last[i] + new * m[i]
     for i in range(len(last)):
         last[i] = m[i]
-
-
-@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def multiply(A, x, out):
-    """``out = A x``: A (4 k, 4 k) float32, symmetric; x, out (4 k,)."""
-    for i in range(len(out)):
-        out[i] = 0.0
-    for j in range(0, len(A), 4):
-        a, b, c, d = x[j], x[j + 1], x[j + 2], x[j + 3]
-        p, q, r, s = A[j], A[j + 1], A[j + 2], A[j + 3]
-        for i in range(len(out)):
-            out[i] += a * p[i] + b * q[i] + c * r[i] + d * s[i]
 
 
 # --- a step of one local model as a system for shared.equilibrium --------------------------------
@@ -408,24 +418,22 @@ def step_patch(patches, k, deviatoric, time, load, memory, scratch, accurate=ACC
     """
     gradients, steps, weights = patches.gradients[k], patches.steps[k], patches.weights[k]
     mu, lam = patches.mu[k], patches.lam[k]
-    past, wide, terms = scratch.past, memory.wide, len(memory.mean)
+    wide, mean, pull, terms = memory.wide, memory.mean, memory.pull, len(memory.mean)
+    past, exerted, pressed = scratch.past, scratch.change, scratch.load
     past[:] = 0.0
     for a in range(terms):
         g = time.share[a]
         for i in range(len(past)):
-            past[i] += g * (time.decay[a] * memory.mean[a, i] + time.old[a] * wide[i])
-    for i in range(len(past)):
-        scratch.stepped[i] = past[i] * steps[i]
-    superpose(gradients, scratch.stepped, scratch.H)
-    loss = predict_points(scratch.H, memory.points, time, mu, scratch.B, scratch.S)
-    exerted, size = scratch.change, 0.0
+            past[i] += g * (time.decay[a] * mean[a, i] + time.old[a] * wide[i])
+    loss = predict_points(memory.points, memory.linear, time, mu, scratch.B, scratch.S)
+    size = 0.0
     multiply(deviatoric, past, exerted)
     for i in range(len(past)):
-        scratch.load[i] = load[i] + exerted[i]
+        pressed[i] = load[i] + exerted[i]
         size += max(load[i] ** 2, exerted[i] ** 2)
     target = max(accurate * math.sqrt(size), AT_REST)
     system = PastSystem(
-        gradients, steps, weights, mu, lam, deviatoric, scratch.load, loss, scratch.B, scratch.S,
+        gradients, steps, weights, mu, lam, deviatoric, pressed, loss, scratch.B, scratch.S,
         scratch.H, scratch.P, scratch.J, scratch.trace, scratch.linear, scratch.stepped,
         memory.secants, scratch.origin, scratch.latest, scratch.change,
     )  # fmt: skip
@@ -433,17 +441,16 @@ def step_patch(patches, k, deviatoric, time, load, memory, scratch, accurate=ACC
     pulled, change = work[0], scratch.change  # their room
     multiply(deviatoric, wide, change)
     for i in range(len(wide)):
-        pulled[i] = scratch.load[i] + loss * change[i] - memory.pull[i]
+        pulled[i] = pressed[i] + loss * change[i] - pull[i]
     status, iterations, smallest = equilibrium.STALLED, 0, 0.0
+    multiply(memory.secants, pulled, start)  # what is not linear does not change
     for attempt in range(2):
         most = MOST_ITERATIONS if attempt == 0 else MOST_ITERATIONS_ANEW
         scratch.origin[:] = np.nan
-        for i in range(len(start)):
-            start[i] = wide[i]
-            if attempt == 0:  # what is not linear does not change
-                start[i] += np.dot(memory.secants[i], pulled)
         if attempt == 1:
             forget_secants(memory.secants, scratch.origin)
+            start[:] = 0.0
+        start += wide
         energy, smallest = equilibrium.potential(system, start, work[0])
         status, more, energy, smallest = descend(
             system, start, work, energy, smallest, target, np.inf, most, True, ROUND_OFF
@@ -455,16 +462,15 @@ def step_patch(patches, k, deviatoric, time, load, memory, scratch, accurate=ACC
         forget_secants(memory.secants, scratch.origin)
         return status, iterations, smallest
     # the last evaluation was of the answer
-    drive_points(scratch.H, scratch.B)
+    drive_points(scratch.H, scratch.B, scratch.S)
     advance_points(scratch.B, time, memory.points)
+    advance_points(scratch.S, time, memory.linear)
     for a in range(terms):
         for i in range(len(start)):
-            memory.mean[a, i] = (
-                time.decay[a] * memory.mean[a, i] + time.old[a] * wide[i] + time.new[a] * start[i]
-            )
+            mean[a, i] = time.decay[a] * mean[a, i] + time.old[a] * wide[i] + time.new[a] * start[i]
     wide[:] = start
     for i in range(len(wide)):  # the last evaluation has left ``D u``
-        memory.pull[i] = scratch.load[i] + loss * change[i]
+        pull[i] = pressed[i] + loss * change[i]
     add_knot(memory, time)
     return status, iterations, smallest
 
@@ -514,42 +520,29 @@ def recall_points(solver, k, memory, scratch):
 @njit(cache=True, error_model="numpy", nogil=True)
 def recall(gradients, steps, memory, scratch):
     """``recall_points`` of a local model with gradients (r, 9 c) in units of ``steps`` (r,)."""
-    points = memory.points
-    terms, last = len(memory.mean), len(memory.knots) - 1
+    points, linear, mean = memory.points, memory.linear, memory.mean
+    knots, share = memory.knots, memory.share
+    stepped, driven, straight = scratch.stepped, scratch.B, scratch.S
+    terms, last = len(mean), len(knots) - 1
     points[:] = np.float32(0.0)
+    linear[:] = np.float32(0.0)
     for j in range(last + 1):
         for i in range(len(steps)):
-            scratch.stepped[i] = memory.knots[j, i] * steps[i]
-        superpose(gradients, scratch.stepped, scratch.H)
-        drive_points(scratch.H, scratch.B)
+            stepped[i] = knots[j, i] * steps[i]
+        superpose(gradients, stepped, scratch.H)
+        drive_points(scratch.H, driven, straight)
         for a in range(terms):
-            points[a] += np.float32(memory.share[j, a]) * scratch.B
-        if j == last:
-            points[terms] = scratch.B
+            points[a] += np.float32(share[j, a]) * driven
+            linear[a] += np.float32(share[j, a]) * straight
+    points[terms] = driven
+    linear[terms] = straight
     for a in range(terms):
         for i in range(len(steps)):
-            missed = memory.mean[a, i]
-            for j in range(last + 1):
-                missed -= memory.share[j, a] * memory.knots[j, i]
-            scratch.stepped[i] = missed * steps[i]
-        superpose(gradients, scratch.stepped, scratch.H)
-        _add_linear(scratch.H, points[a])
-
-
-@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def _add_linear(H, m):
-    """Add ``-2 dev sym H`` to ``m`` (6 c,): what a small gradient (9 c,) drives points to."""
-    for tile in range(len(H) // TILE):
-        h = H[TILE * tile : TILE * (tile + 1)]
-        d = m[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
-        for c in range(LANES):
-            third = (h[c] + h[4 * LANES + c] + h[8 * LANES + c]) / np.float32(3.0)
-            d[c] -= np.float32(2.0) * (h[c] - third)
-            d[LANES + c] -= np.float32(2.0) * (h[4 * LANES + c] - third)
-            d[2 * LANES + c] -= np.float32(2.0) * (h[8 * LANES + c] - third)
-            d[3 * LANES + c] -= h[5 * LANES + c] + h[7 * LANES + c]
-            d[4 * LANES + c] -= h[2 * LANES + c] + h[6 * LANES + c]
-            d[5 * LANES + c] -= h[LANES + c] + h[3 * LANES + c]
+            stepped[i] = mean[a, i] * steps[i]
+        superpose(gradients, stepped, scratch.H)
+        drive_points(scratch.H, driven, straight)
+        points[a] -= straight - linear[a]
+        linear[a] = straight
 
 
 # --- the atlas -----------------------------------------------------------------------------------
@@ -570,8 +563,10 @@ def place(terms, solver, position, direction):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def step_at(solver, k, pressure, radius, deviatoric, time, memory, scratch, moved):
-    """Press local model k where ``place`` has found; ``moved`` (3,) is the contact's displacement.
+def step_at(solver, k, pressure, radius, deviatoric, time, record, scratch, moved):
+    """Press local model k where ``place`` has found; its record goes to the end of the step.
+
+    ``moved`` (3,) is the contact's displacement.
 
     Returns status, iterations, smallest det F and force over pressure (mm^2).
     """
@@ -579,13 +574,14 @@ def step_at(solver, k, pressure, radius, deviatoric, time, memory, scratch, move
     area = load_patch(
         solver.patches, k, outcome.point, outcome.normal, outcome.direction, pressure, radius, own
     )
+    memory = opened(record, len(time.share), len(deviatoric), solver.patches.weights.shape[1])
     status, iterations, smallest = step_patch(
         solver.patches, k, deviatoric, time, own.wide_load, memory, scratch
     )
-    r = len(memory.wide)
+    wide, unit = memory.wide, own.unit_loads
     for i in range(3):
         moved[i] = 0.0
         if area > 0.0:
-            for j in range(r):
-                moved[i] += own.unit_loads[r * i + j] * memory.wide[j] / area
+            for j in range(len(wide)):
+                moved[i] += unit[len(wide) * i + j] * wide[j] / area
     return status, iterations, smallest, area

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,8 +34,9 @@ from shared.touch_history import (
     SHAPE,
     TipMemory,
     conclude,
-    new_memory,
+    new_record,
     new_scratch,
+    opened,
     place_tip,
     recall_tip_points,
     step_tip,
@@ -44,6 +45,9 @@ from shared.viscosity import Weights
 
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
+
+
+_NOWHERE = np.zeros(0)
 
 
 class TipStepper(Carrier):
@@ -75,28 +79,38 @@ class TipStepper(Carrier):
         position: Array,
         weights: Weights,
         most: int,
-    ) -> dict[int, Local] | None:
-        """Step patches (slot and number) where ``place_tip`` has found; None without an answer."""
+        begun: Mapping[int, Array],
+    ) -> tuple[dict[int, Local], dict[int, Array]]:
+        """Step patches (slot and number) where ``place_tip`` has found.
+
+        ``begun`` (m,) are where searches that have begun go on.  Returns what the patches remember
+        then, and where the search of one that has no answer has ended.
+        """
         found: dict[int, Local] = {}
         for slot, k in active:
             local = history.locals.get(k) or self.follow(history, k)
-            memory = TipMemory(*[part.copy() for part in local.memory])
+            record = local.record.copy()
             status = step_tip(
                 self._solver, slot, position, self._models.deviatoric[k], weights, most,
-                memory, self._bound,
+                begun.get(k, _NOWHERE), record, self._bound,
             )  # fmt: skip
             if status != equilibrium.CONVERGED:
-                return None
-            found[k] = Local(memory, local.remains)
-        return found
+                return {}, {k: self._scratch.q.copy()}
+            found[k] = Local(record, local.remains)
+        return found, {}
 
     def conclude(self, position: Array) -> float:
         """Write where the force acts on the tip; return its size, mN."""
         size: float = conclude(self._solver, position)
         return size
 
-    def _new_memory(self) -> TipMemory:
-        return new_memory(len(self._tau), self.modes, self._points)
+    def _new_record(self) -> Array:
+        return new_record(len(self._tau), self.modes, self._points)
+
+    def opened(self, record: Array) -> TipMemory:
+        """See ``Carrier``."""
+        memory: TipMemory = opened(record, len(self._tau), self.modes, self._points)
+        return memory
 
     def _take_over(self, k: int, new: Any, old: Any, overlap: Field | None) -> None:
         new.known[0] = SHAPE
@@ -113,6 +127,7 @@ def step(
     coefficients: Array,
     started: float,
     most: int = MAX_ITERATIONS,
+    begun: Touch | None = None,
 ) -> tuple[Touch, History]:
     """Answer a finite position of the tip ``dt`` (s) after the end of a history.
 
@@ -133,12 +148,14 @@ def step(
         When the clock began to run.
     most : int
         Iterations in one local model; see ``shared.touch.query``.
+    begun : Touch, optional
+        Without an answer, from the same history: the search goes on where that ended.
 
     Returns
     -------
     touch : Touch
         Its estimated errors are the largest until now of displacement, stress and force, relative
-        to the largest of these until now.
+        to the largest of these until now.  Without an answer its patches are where the search is.
     history : History
         To go on from; the old one if the answer did not converge.
 
@@ -163,15 +180,16 @@ def step(
     if not (off and history.main < 0):
         numbers = state.outcome.patch.tolist()
         active = [(slot, -2 - numbers[slot]) for slot, share in enumerate(shares) if share > 0.0]
-    found = stepper.press(history, active, position, weights, most)
-    converged = found is not None
+    starts = {} if begun is None else {k: q for k, _, q in begun.patches}
+    found, ended = stepper.press(history, active, position, weights, most, starts)
+    converged = not ended
     if not converged:  # not even in part
         outcome.force[:] = 0.0
         outcome.tangent[:] = 0.0
     pushed = stepper.conclude(position)
     after = History(
         time=history.time + dt,
-        locals=found or {},
+        locals=found,
         main=max(active, key=lambda pair: shares[pair[0]])[1] if active else -1,
         position=history.position if off else position,
         share=max(history.share, depth / limit),
@@ -187,7 +205,7 @@ def step(
         out_of_range += ("position",)
     if depth > limit * (1 + 1e-9):
         out_of_range += ("depth",)
-    parts = tuple((k, shares[slot], found[k]) for slot, k in active) if found else ()
+    parts = tuple((k, shares[slot], found[k]) for slot, k in active if k in found)
     touch = Touch(
         position=position,
         contact=contact,
@@ -208,7 +226,8 @@ def step(
         error_force=errors[2],
         min_jacobian=scalars.item(SMALLEST_J),
         features=features,
-        patches=tuple((k, share, local.memory.wide) for k, share, local in parts),
+        patches=tuple((k, share, local.record[: stepper.modes]) for k, share, local in parts)
+        + tuple((k, 0.0, q) for k, q in ended.items()),
         solve_seconds=time.perf_counter() - started,
         time=after.time,
         active=parts,

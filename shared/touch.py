@@ -327,34 +327,46 @@ def form_contact(system, q, wanted):
     return touch(system.tip, system.surface, system.faces, system.x, moved, system.touching, wanted)
 
 
+@njit(cache=True, error_model="numpy", nogil=True)
+def stress_points(system, u):
+    """Stress beyond linear elasticity at the points; what energy that is, and smallest det F."""
+    superpose(system.gradients, u, system.H)
+    J, trace, linear = system.J, system.trace, system.linear
+    weights, mu, lam = system.weights, system.mu, system.lam
+    nonlinear_stress(system.H, weights, mu, lam, J, trace, linear, system.P)
+    smallest = J.min()
+    return (added_energy(weights, mu, lam, J, trace, linear) if smallest > 0.0 else 0.0), smallest
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def balance(system, u, residual):
+    """Residual of the stress at the points, linear elasticity and contact; energy of these two."""
+    project(system.gradients, system.P, residual)
+    count, energy, _ = form_contact(system, u, STIFFNESS)
+    system.latest[:] = u
+    for j in range(len(u)):
+        residual[j] += u[j]
+        energy += 0.5 * u[j] * u[j]
+    for c in range(count):
+        own, force = system.corners[system.touching.face[c]], system.touching.force[c]
+        for k in range(len(own)):
+            for i in range(3):
+                row, f = system.modes[own[k], i], force[k, i]
+                for j in range(len(u)):
+                    residual[j] -= f * row[j]
+    return energy
+
+
 @overload(equilibrium.potential, jit_options={"error_model": "numpy"})
 def _potential(system, u, residual):
     if not is_system(TipSystem, system):
         return None
 
     def potential(system, u, residual):
-        superpose(system.gradients, u, system.H)
-        J, trace, linear = system.J, system.trace, system.linear
-        weights, mu, lam = system.weights, system.mu, system.lam
-        nonlinear_stress(system.H, weights, mu, lam, J, trace, linear, system.P)
-        smallest = J.min()
+        energy, smallest = stress_points(system, u)
         if not smallest > 0.0:
             return tissue.INVERTED, smallest
-        project(system.gradients, system.P, residual)
-        count, energy, _ = form_contact(system, u, STIFFNESS)
-        system.latest[:] = u
-        energy += added_energy(weights, mu, lam, J, trace, linear)
-        for j in range(len(u)):
-            residual[j] += u[j]
-            energy += 0.5 * u[j] * u[j]
-        for c in range(count):
-            own, force = system.corners[system.touching.face[c]], system.touching.force[c]
-            for k in range(len(own)):
-                for i in range(3):
-                    row, f = system.modes[own[k], i], force[k, i]
-                    for j in range(len(u)):
-                        residual[j] -= f * row[j]
-        return energy, smallest
+        return energy + balance(system, u, residual), smallest
 
     return potential
 

@@ -34,7 +34,7 @@ from shared.reduced import (
     is_system,
     linearise,
     lower_products,
-    project,
+    multiply,
     superpose,
 )
 from shared.reduced_history import (
@@ -43,9 +43,9 @@ from shared.reduced_history import (
     add_knot,
     add_past_stress,
     advance_points,
+    cut,
     drive_points,
     inverse_cube_root,
-    multiply,
     predict_points,
     recall,
 )
@@ -57,7 +57,7 @@ from shared.touch import (
     DISTANCE,
     ENERGY,
     ITERATIONS,
-    LAG,
+    LEAST_SHARE,
     MAX_ITERATIONS,
     PENETRATION,
     SKIN,
@@ -67,18 +67,25 @@ from shared.touch import (
     TOUCHED,
     TipSystem,
     add_contact,
+    balance,
     far,
     first_guess,
     form_contact,
     react,
     settle_on_the_way,
     settle_stably,
+    stress_points,
     tip_system,
     weight_gradients,
 )
 
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
+
+LAG = 0.03
+"""As ``shared.touch.LAG``, of the answer and of its past: under a moving tip both change at every
+step.  It costs no iteration; the tangent on the tool is then off by .9 % in one of twenty steps of
+a session (with .01, by .5)."""
 
 NOTHING, SHAPE, EVERYTHING = 0, 1, 2
 """What a memory knows of the last answer: that it was rest, its shape, its derivatives too."""
@@ -88,10 +95,13 @@ STATE = 26
 
 
 class TipMemory(NamedTuple):
-    """What one local model remembers; see ``shared.touch.TipMemory`` and ``reduced_history``."""
+    """What one local model remembers: views of a record, as ``reduced_history.Memory``.
 
-    known: NDArray[np.int64]  # (1,)
+    See ``shared.touch.TipMemory`` for what is of the last answer.
+    """
+
     wide: Array  # (m,) last answer
+    known: Array  # (1,)
     bulk: Array  # (1, m, m) part of the tangent, and
     formed: Array  # (1, m) state and
     formed_past: Array  # (m + 1,) past and loss at which that was formed
@@ -100,28 +110,40 @@ class TipMemory(NamedTuple):
     position: Array  # (3,) mm
     mean: Array  # (terms, m)
     points: Field  # (terms + 1, 6 c)
+    linear: Field  # (terms + 1, 6 c)
     knots: Array  # (KNOTS, m)
     share: Array  # (KNOTS, terms)
 
 
-def new_memory(terms: int, modes: int, points: int) -> TipMemory:
-    """Of a local model that nothing has happened to."""
-    share = np.zeros((KNOTS, terms))
-    share[-1] = 1.0
+@njit(cache=True, error_model="numpy", nogil=True)
+def opened(record, terms, modes, points):
+    """Memory in a record (n,) of ``new_record``, which starts with the last answer."""
+    answers, at = cut(record, 0, 2, modes)
+    bulk, at = cut(record, at, modes, modes)
+    factor, at = cut(record, at, modes, modes)
+    coupling, at = cut(record, at, 3, modes)
+    mean, at = cut(record, at, terms, modes)
+    knots, at = cut(record, at, KNOTS, modes)
+    share, at = cut(record, at, KNOTS, terms)
+    past, at = cut(record, at, 1, modes + 1)
+    position, at = cut(record, at, 1, 3)
+    known, at = cut(record, at, 1, 1)
+    histories = record[at:].view(np.float32).reshape(2, terms + 1, SYMMETRIC * points)
     return TipMemory(
-        known=np.zeros(1, np.int64),
-        wide=np.zeros(modes),
-        bulk=np.zeros((1, modes, modes)),
-        formed=np.full((1, modes), np.inf),
-        formed_past=np.zeros(modes + 1),
-        factor=np.zeros((1, modes, modes)),
-        coupling=np.zeros((1, 3, modes)),
-        position=np.zeros(3),
-        mean=np.zeros((terms, modes)),
-        points=np.zeros((terms + 1, SYMMETRIC * points), np.float32),
-        knots=np.zeros((KNOTS, modes)),
-        share=share,
-    )
+        answers[0], known[0], bulk.reshape(1, modes, modes), answers[1:], past[0],
+        factor.reshape(1, modes, modes), coupling.reshape(1, 3, modes), position[0], mean,
+        histories[0], histories[1], knots, share,
+    )  # fmt: skip
+
+
+def new_record(terms: int, modes: int, points: int) -> Array:
+    """Record of a local model that nothing has happened to."""
+    size = modes * (2 * modes + terms + KNOTS + 6) + KNOTS * terms + 5
+    record = np.zeros(size + (terms + 1) * SYMMETRIC * points)
+    memory = opened(record, terms, modes, points)
+    memory.share[-1] = 1.0
+    memory.formed[:] = np.inf
+    return record
 
 
 class TipScratch(NamedTuple):
@@ -131,12 +153,13 @@ class TipScratch(NamedTuple):
     B: Field  # (6 c,) in tiles, what the past drives the points to
     S: Field  # (6 c,) in tiles, kPa, the linear part of it
     state: Field  # (STATE LANES,)
+    units: Field  # (9, 9 c) in tiles, gradients with one component
+    moduli: Field  # (9, 9 c) in tiles
     steps: Field  # (m,) ones
     stepped: Field  # (m,)
     past: Array  # (m + 1,) mean of the answers over the past, and the loss of the step
     exerted: Array  # (m,)
     softer: Array  # (m,)
-    pull: Array  # (m,)
     q: Array  # (m,)
 
 
@@ -147,12 +170,13 @@ def new_scratch(modes: int, points: int) -> TipScratch:
         B=np.zeros(SYMMETRIC * points, np.float32),
         S=np.zeros(SYMMETRIC * points, np.float32),
         state=np.zeros(STATE * LANES, np.float32),
+        units=np.tile(np.repeat(np.eye(9, dtype=np.float32), LANES, axis=1), points // LANES),
+        moduli=np.zeros((9, 9 * points), np.float32),
         steps=np.ones(modes, np.float32),
         stepped=np.zeros(modes, np.float32),
         past=np.zeros(modes + 1),
         exerted=np.zeros(modes),
         softer=np.zeros(modes),
-        pull=np.zeros(modes),
         q=np.zeros(modes),
     )
 
@@ -170,8 +194,9 @@ class PastTipSystem(NamedTuple):
     B: Field
     S: Field
     state: Field
+    units: Field
+    moduli: Field
     softer: Array
-    pull: Array
 
 
 @overload(equilibrium.potential, jit_options={"error_model": "numpy"})
@@ -181,22 +206,20 @@ def _potential(system, u, residual):
 
     def potential(system, u, residual):
         tip = system.tip
-        energy, smallest = equilibrium.potential(tip, u, residual)
+        energy, smallest = stress_points(tip, u)
         if not smallest > 0.0:
             return tissue.INVERTED, smallest
-        tip.P[:] = np.float32(0.0)
         # trace has served; its room is that of the energies
         add_past_stress(
             tip.H, tip.weights, tip.mu, tip.J, system.B, system.S, system.loss, tip.trace, tip.P
         )
-        energy += np.dot(tip.weights, tip.trace)
-        pull, softer = system.pull, system.softer
-        project(tip.gradients, tip.P, pull)
+        energy += np.dot(tip.weights, tip.trace) + balance(tip, u, residual)
+        loss, softer, exerted = system.loss, system.softer, system.exerted
         multiply(system.deviatoric, u, softer)
         for j in range(len(u)):
-            lost = system.loss * softer[j]
-            residual[j] += pull[j] - lost - system.exerted[j]
-            energy -= (0.5 * lost + system.exerted[j]) * u[j]
+            lost = loss * softer[j]
+            residual[j] -= lost + exerted[j]
+            energy -= (0.5 * lost + exerted[j]) * u[j]
         return energy, smallest
 
     return potential
@@ -219,12 +242,9 @@ def _factorise(system, u, shift):
         while True:
             if not known:
                 _form_bulk(system, u)
-            loss, tangent, D = system.loss, tip.tangent, system.deviatoric
-            for i in range(len(u)):
-                for j in range(len(u)):
-                    tangent[i, j] = tip.bulk[i, j] - loss * D[i, j]
+            _soften(tip.bulk, system.loss, system.deviatoric, tip.tangent)
             add_contact(tip)
-            if cholesky(tangent, shift, tip.factor):
+            if cholesky(tip.tangent, shift, tip.factor):
                 return True
             if not known:
                 return False
@@ -253,6 +273,15 @@ def _still_known(system, u):
     return near and far(u, system.tip.formed) <= LAG * LAG
 
 
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def _soften(bulk, loss, D, tangent):
+    """``tangent = bulk - loss D``."""
+    for i in range(len(bulk)):
+        b, d, t = bulk[i], D[i], tangent[i]
+        for j in range(len(b)):
+            t[j] = b[j] - loss * d[j]
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
 def _form_bulk(system, u):
     """The part of the tissue in the tangent at u but for the linear part of its past.
@@ -264,16 +293,45 @@ def _form_bulk(system, u):
     H = tip.H[: gradients.shape[1]]
     superpose(gradients, u, H)
     linearise(H, tip.tangent_weights, tip.tangent_mu, tip.tangent_lam, tip.state)
-    increments(tip.state, gradients, tip.increments)
     if gradients.shape[1] == tip.gradients.shape[1]:
+        # there are more modes than components of a gradient
+        units, moduli = system.units, system.moduli
+        increments(tip.state, units, moduli)
         _add_past_increments(
-            H, system.B, tip.weights, tip.mu, system.loss, gradients, system.state, tip.increments
+            H, system.B, tip.weights, tip.mu, system.loss, units, system.state, moduli
         )
+        _contract(moduli, gradients, tip.increments)
+    else:
+        increments(tip.state, gradients, tip.increments)
     lower_products(gradients, tip.increments, bulk)
     for j in range(len(u)):
         bulk[j, j] += 1.0
     tip.formed[:] = u
     system.formed_past[:] = system.past
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def _contract(moduli, gradients, out):
+    """``out = moduli : gradients``, (m, 9 c) in tiles; row i of ``moduli`` is of component i."""
+    n = LANES
+    for tile in range(gradients.shape[1] // TILE):
+        at = TILE * tile
+        m0, m1, m2 = moduli[0, at : at + TILE], moduli[1, at : at + TILE], moduli[2, at : at + TILE]
+        m3, m4, m5 = moduli[3, at : at + TILE], moduli[4, at : at + TILE], moduli[5, at : at + TILE]
+        m6, m7, m8 = moduli[6, at : at + TILE], moduli[7, at : at + TILE], moduli[8, at : at + TILE]
+        for mode in range(len(gradients)):
+            h, d = gradients[mode, at : at + TILE], out[mode, at : at + TILE]
+            for c in range(LANES):
+                h0, h1, h2 = h[c], h[n + c], h[2 * n + c]
+                h3, h4, h5 = h[3 * n + c], h[4 * n + c], h[5 * n + c]
+                h6, h7, h8 = h[6 * n + c], h[7 * n + c], h[8 * n + c]
+                for i in range(9):
+                    k = n * i + c
+                    d[k] = (
+                        h0 * m0[k] + h1 * m1[k] + h2 * m2[k]
+                        + h3 * m3[k] + h4 * m4[k] + h5 * m5[k]
+                        + h6 * m6[k] + h7 * m7[k] + h8 * m8[k]
+                    )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
@@ -494,7 +552,7 @@ def place_tip(solver, x, at):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def step_tip(solver, slot, x, deviatoric, time, most, memory, own):
+def step_tip(solver, slot, x, deviatoric, time, most, start, record, own):
     """Equilibrium of the local model in a slot with the tip at ``x`` at the end of a time step.
 
     Parameters
@@ -508,22 +566,28 @@ def step_tip(solver, slot, x, deviatoric, time, most, memory, own):
         Of the step.
     most : int
         Iterations; the way in is tried only with ``MAX_ITERATIONS``, as in ``shared.touch.query``.
-    memory : TipMemory
-        Of the model; goes to the end of the step if that has an answer.
+    start : ndarray, shape (m,) or (0,)
+        Where to begin the search, if not at the last answer.
+    record : ndarray, shape (n,)
+        Of the model, see ``opened``; goes to the end of the step if that has an answer.
     own : TipScratch
 
     Returns
     -------
     status : int
+        Without an answer ``own.q`` is where the search ended.
     """
     models, scratch, outcome = solver.models, solver.scratch, solver.outcome
     k = -2 - outcome.patch[slot]
     scalars, normal = outcome.scalars, outcome.upward
     depth = scalars[DEPTH]
-    loss = _remember(models.points.gradients[k], models.points.mu[k], deviatoric, time, memory, own)
+    memory = opened(record, len(time.share), len(deviatoric), models.points.weights.shape[1])
+    loss = _remember(models.points.mu[k], deviatoric, time, memory, own)
     q, at = own.q, scratch.position
     q[:] = memory.wide
-    if memory.known[0] == EVERYTHING:
+    if len(start) > 0:
+        q[:] = start
+    elif memory.known[0] == EVERYTHING:
         _follow(memory, x, q, scratch.newton[1])
     elif memory.known[0] == NOTHING and depth > 0.0:
         first_guess(models, k, x, depth, scratch.features, q)
@@ -533,12 +597,13 @@ def step_tip(solver, slot, x, deviatoric, time, most, memory, own):
         PastTipSystem(
             tip_system(models, k, 0, memory, scratch),
             at, deviatoric, own.past, memory.formed_past, own.exerted, loss, own.B, own.S,
-            own.state, own.softer, own.pull,
+            own.state, own.units, own.moduli, own.softer,
         )
     )  # fmt: skip
     tip, pressed = models.tip, max(depth, 0.0)
+    tolerance = TOLERANCE / max(outcome.weight[slot], LEAST_SHARE)
     status, iterations, energy, smallest = settle_stably(
-        system, tip, q, scratch.newton, pressed, TOLERANCE, most, scratch.tangent
+        system, tip, q, scratch.newton, pressed, tolerance, most, scratch.tangent
     )
     if status != equilibrium.CONVERGED and depth > 0.0 and most == MAX_ITERATIONS:
         memory.formed[:] = np.inf
@@ -587,17 +652,16 @@ def _follow(memory, x, q, step):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _remember(gradients, mu, deviatoric, time, memory, own):
+def _remember(mu, deviatoric, time, memory, own):
     """What is known of the end of a step before it is solved, into ``own``; returns the loss."""
-    m, past = len(memory.wide), own.past
+    m, past, mean, wide = len(memory.wide), own.past, memory.mean, memory.wide
     past[:] = 0.0
-    for a in range(len(memory.mean)):
+    for a in range(len(mean)):
         g = time.share[a]
         past[m] += g * time.new[a]
         for i in range(m):
-            past[i] += g * (time.decay[a] * memory.mean[a, i] + time.old[a] * memory.wide[i])
-    superpose(gradients, past[:m], own.H)
-    loss = predict_points(own.H, memory.points, time, mu, own.B, own.S)
+            past[i] += g * (time.decay[a] * mean[a, i] + time.old[a] * wide[i])
+    loss = predict_points(memory.points, memory.linear, time, mu, own.B, own.S)
     multiply(deviatoric, past[:m], own.exerted)
     return loss
 
@@ -605,15 +669,14 @@ def _remember(gradients, mu, deviatoric, time, memory, own):
 @njit(cache=True, error_model="numpy", nogil=True)
 def _advance(gradients, time, memory, own):
     """Go to the end of a step that ``own.q`` is the answer of."""
-    q, wide = own.q, memory.wide
+    q, wide, mean = own.q, memory.wide, memory.mean
     superpose(gradients, q, own.H)
-    drive_points(own.H, own.B)
+    drive_points(own.H, own.B, own.S)
     advance_points(own.B, time, memory.points)
-    for a in range(len(memory.mean)):
+    advance_points(own.S, time, memory.linear)
+    for a in range(len(mean)):
         for i in range(len(q)):
-            memory.mean[a, i] = (
-                time.decay[a] * memory.mean[a, i] + time.old[a] * wide[i] + time.new[a] * q[i]
-            )
+            mean[a, i] = time.decay[a] * mean[a, i] + time.old[a] * wide[i] + time.new[a] * q[i]
     wide[:] = q
     memory.known[0] = EVERYTHING
     add_knot(memory, time)

@@ -18,7 +18,7 @@ from offline.viscous import deviatoric_stiffness
 from offline.workshop import Workshop
 from shared import equilibrium
 from shared.reduced import LANES
-from shared.reduced_history import SYMMETRIC, Memory, copied, new_memory, new_scratch, step_patch
+from shared.reduced_history import SYMMETRIC, Memory, new_record, new_scratch, opened, step_patch
 from shared.viscosity import COMPONENTS, step_weights
 
 Array = NDArray[np.float64]
@@ -72,42 +72,49 @@ class GalerkinInTime:
         )
         self._deviatoric = np.zeros((rows, rows), np.float32)
         self._deviatoric[:m, :m] = basis.T @ (deviatoric_stiffness(model) @ basis)
-        self._load, self._points = np.zeros(rows), points
+        self._load = np.zeros(rows)
+        self._sizes = len(workshop.model.prony), rows, points
         self._scratch = new_scratch(rows, points)
 
-    def at_rest(self) -> Memory:
+    def at_rest(self) -> Array:
         """See ``InTime``."""
-        return new_memory(len(self._workshop.model.prony), len(self._load), self._points)
+        return new_record(*self._sizes)
 
-    def step(self, past: Memory, case: Case, dt: float) -> tuple[bool, Memory]:
+    def step(self, past: Array, case: Case, dt: float) -> tuple[bool, Array]:
         """See ``InTime``."""
         weights = step_weights(self._workshop.model.prony, dt)
-        after = copied(past)
+        after = past.copy()
         reduce_load(self._modes, case.nodes, case.forces, self._load)
         status, _, _ = step_patch(
-            self._body, 0, self._deviatoric, weights, self._load, after, self._scratch,
+            self._body, 0, self._deviatoric, weights, self._load, self.opened(after), self._scratch,
             self._accurate,
         )  # fmt: skip
         converged = status == equilibrium.CONVERGED
         return converged, after if converged else past
 
-    def trusted(self, past: Memory) -> bool:
+    def trusted(self, past: Array) -> bool:
         """See ``InTime``."""
         return True
 
-    def displacement(self, past: Memory) -> Array:
+    def displacement(self, past: Array) -> Array:
         """See ``InTime``."""
-        return (self._modes @ past.wide).reshape(-1, 3)
+        return (self._modes @ self.opened(past).wide).reshape(-1, 3)
 
-    def von_mises(self, past: Memory) -> Array:
+    def von_mises(self, past: Array) -> Array:
         """See ``InTime``."""
         return self._workshop.von_mises_after(self.history(past))
 
-    def history(self, past: Memory) -> History:
+    def opened(self, past: Array) -> Memory:
+        """What the past is to ``step_patch``."""
+        memory: Memory = opened(past, *self._sizes)
+        return memory
+
+    def history(self, past: Array) -> History:
         """The past as the full model remembers it, but for the means that only energies need."""
         elements, own = self._workshop.model.weights.shape
-        terms = len(past.points)
-        tiles = past.points.reshape(terms, -1, SYMMETRIC, LANES).transpose(1, 3, 0, 2)
+        histories = self.opened(past).points
+        terms = len(histories)
+        tiles = histories.reshape(terms, -1, SYMMETRIC, LANES).transpose(1, 3, 0, 2)
         points = np.zeros((elements * own, terms, COMPONENTS))
         points[:, :, :SYMMETRIC] = tiles.reshape(-1, terms, SYMMETRIC)[: elements * own]
         return History(self.displacement(past), points.reshape(elements, own, terms, COMPONENTS))

@@ -179,7 +179,7 @@ def _answer(
             seconds[i] = min(seconds[i], time.perf_counter() - started)
             pasts.append(past if converged else None)
     pressed = [press.pressure > 0.0 for press in question.presses]
-    if None in pasts:
+    if any(past is None for past in pasts):
         return (1.0, 1.0), seconds[pressed].tolist()
     exact = question.displacements, question.stresses
     if isinstance(method, ElasticTwin):

@@ -1,12 +1,10 @@
 """Sessions over tissue that remembers: its time, what stalls, snapshots, replays."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from online.client import AsyncClient, Client
-from online.follower import MOST_ITERATIONS, Follower
+from online.follower import PATIENCE, Follower
 from online.frames import Flag
 from online.recording import read_recording
 from online.replay import replay
@@ -27,15 +25,15 @@ class Slow(FakeAtlas):
         self.scene = self.scene.model_copy(update={"tissue": tissue})
         self.steps = []
 
-    def touch_step(self, history, dt, position, most=40):
+    def touch_step(self, history, dt, position, most=40, begun=None):
         self.steps.append(dt)
         state = Memory()
         state.last = history.position
-        state.gone_on = most - MOST_ITERATIONS
+        state.gone_on = 0 if begun is None else begun.iterations
         touch = self.touch(position, state, most)
         if not touch.converged:
-            return touch, history
-        after = replace(history, time=history.time + dt, position=touch.position)
+            return touch._replace(iterations=state.gone_on + 1), history
+        after = history._replace(time=history.time + dt, position=touch.position)
         return touch._replace(force=(1.0 + after.time) * touch.force, time=after.time), after
 
 
@@ -92,17 +90,25 @@ def test_without_an_answer_time_stands_still(atlas):
     assert follower.follow((5.0, 5.0, 6.5), 0.0, 0.06).touch.time == pytest.approx(0.06)
 
 
-def test_where_tissue_snaps_the_second_frame_is_searched_for_long(atlas):
-    atlas.snap = 1
+def test_where_tissue_snaps_the_search_goes_on_from_frame_to_frame(atlas):
+    atlas.snap = 3
     follower = TimedFollower(atlas)
     good = follower.follow((5.0, 5.0, 7.0 - atlas.deepest), 0.0, 0.0)
-    step = follower.follow((5.0, 5.0, 5.3), 0.0, 0.01)
-    assert step.flags & Flag.FALLBACK
-    assert step.touch is good.touch
-    step = follower.follow((5.0, 5.0, 5.2), 0.0, 0.02)
-    assert step.flags == GOOD & ~Flag.IN_RANGE
-    assert step.touch.time == pytest.approx(0.02)
-    assert follower.follow((5.0, 5.0, 5.1), 0.0, 0.03).flags & Flag.FALLBACK
+    steps = [follower.follow((5.0, 5.0, 5.4 - z), 0.0, z) for z in (0.01, 0.02, 0.03, 0.04)]
+    for step in steps[:3]:
+        assert step.flags & Flag.FALLBACK
+        assert step.touch is good.touch
+    assert steps[3].flags == GOOD & ~Flag.IN_RANGE
+    assert steps[3].touch.time == pytest.approx(0.04)
+    assert follower.follow((5.0, 5.0, 5.1), 0.0, 0.05).flags & Flag.FALLBACK
+
+
+def test_a_search_that_finds_nothing_starts_anew(atlas):
+    atlas.snap = PATIENCE
+    follower = TimedFollower(atlas)
+    follower.follow((5.0, 5.0, 7.0 - atlas.deepest), 0.0, 0.0)
+    for _ in range(2 * PATIENCE):
+        assert follower.follow((5.0, 5.0, 5.3), 0.0, 0.01).flags & Flag.FALLBACK
 
 
 def test_a_snapshot_brings_back_the_state(atlas):

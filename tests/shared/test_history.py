@@ -15,9 +15,9 @@ from shared.reduced import load_patch
 from shared.reduced_history import (
     ACCURATE,
     KNOTS,
-    copied,
-    new_memory,
+    new_record,
     new_scratch,
+    opened,
     recall_points,
     step_patch,
 )
@@ -56,7 +56,9 @@ class OnePatch:
         self.state = State(self.patches, atlas.surface.clusters)
         _, r, _ = self.patches.gradients.shape
         points = self.patches.weights.shape[1]
-        self.memory = new_memory(len(prony), r, points)
+        self.sizes = len(prony), r, points
+        self.record = new_record(*self.sizes)
+        self.memory = opened(self.record, *self.sizes)
         self.scratch = new_scratch(r, points)
         self.D = models.viscous.deviatoric[0]
         self.prony, self.x, self.limit = prony, x, limit
@@ -191,7 +193,7 @@ def test_points_recalled_from_the_knots_are_about_those_that_were_there(one_patc
     patch = one_patch(every_point=False)
     for number in range(60):
         patch.step(0.5 + 0.4 * np.sin(0.3 * number), 0.03)
-    recalled = copied(patch.memory)
+    recalled = opened(patch.record.copy(), *patch.sizes)
     recall_points(patch.state.bound, 0, recalled, patch.scratch)
     exact = patch.memory.points
     assert np.linalg.norm(recalled.points - exact) <= 0.02 * np.linalg.norm(exact)

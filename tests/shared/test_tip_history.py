@@ -95,6 +95,22 @@ def test_the_tangent_is_the_derivative_of_the_force_of_a_step(atlas):
         assert np.abs(tangent[:, axis] - slope).max() <= 0.015 * np.abs(tangent).max()
 
 
+def test_a_search_cut_short_goes_on_where_it_ended(atlas):
+    _, history = follow(atlas, HOLD)
+    x = place(atlas, 0.2, 1.0)
+    whole, _ = atlas.touch_step(history, 0.01, x)
+    assert whole.iterations > 1
+    answer, after = atlas.touch_step(history, 0.01, x, 1)
+    assert not answer.converged
+    assert after is history
+    for _ in range(whole.iterations):
+        if not answer.converged:
+            answer, after = atlas.touch_step(history, 0.01, x, 1, answer)
+    assert answer.converged
+    assert after.time == history.time + 0.01
+    np.testing.assert_allclose(answer.force, whole.force, atol=1e-3 * np.abs(whole.force).max())
+
+
 def test_a_history_is_its_own_snapshot(atlas):
     _, history = follow(atlas, HOLD)
     onward = [(0.3, 0.4, 0.01), (0.6, 2.0, 0.05), (-0.1, 2.0, 0.02)]
