@@ -26,7 +26,7 @@ from shared.history import (
     Remembered,
     Stepper,
     ViscousModels,
-    history_features,
+    judge,
 )
 from shared.quadrature import stress_recovery, surface_quadrature, volume_quadrature
 from shared.reduced import (
@@ -902,8 +902,11 @@ class Atlas:
             travel=history.travel + travelled,
             smallest=min(history.smallest, found.min_jacobian),
         )
-        features = history_features(record[_NORMAL], after)
-        errors = self.estimators.histories(features)
+        features, estimates = judge(
+            self.estimators.histories.coefficients, record[_NORMAL], after.share, after.response,
+            after.travel, after.smallest,
+        )  # fmt: skip
+        errors = estimates.tolist()
         out_of_range = self._out_of_range(at, record, scalars, pressure, radius)
         moment = Moment(
             time=after.time,

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from shared import equilibrium
@@ -39,7 +40,7 @@ MOST_PARTS = 4
 """Patches among which a move is shared out."""
 
 HISTORY_FEATURES = 9
-"""Of the error estimate; see ``history_features``."""
+"""Of the error estimate; see ``judge``."""
 
 Answers = list[tuple[int, float, Array]]
 
@@ -110,17 +111,25 @@ class History(NamedTuple):
     smallest: float = 1.0
 
 
-def history_features(normal: Array, history: History) -> Array:
-    """What the error estimate is made of: ``log error = c . features``.
+@njit(cache=True, error_model="numpy", nogil=True)
+def judge(coefficients, normal, share, response, travel, smallest):
+    """Features of a history and its estimated errors, ``log error = c . features``.
 
-    1; the largest share of the limit so far and its log; smallest det F so far; the normal (where
-    on the body); the way over the surface; the log of the largest response over the largest share.
+    The features: 1; the largest share of the limit so far and its log; smallest det F so far; the
+    normal (where on the body); the way over the surface; the log of the largest response over the
+    largest share.
     """
-    share = max(history.share, 1e-6)
-    return np.array([
-        1.0, share, math.log(share), history.smallest, *normal.tolist(),
-        math.log1p(history.travel), math.log(max(history.response / share, 1e-6)),
-    ])  # fmt: skip
+    features, errors = np.empty(HISTORY_FEATURES), np.empty(len(coefficients))
+    share = max(share, 1e-6)
+    features[0], features[1], features[2], features[3] = 1.0, share, math.log(share), smallest
+    features[4:7] = normal
+    features[7], features[8] = math.log1p(travel), math.log(max(response / share, 1e-6))
+    for i in range(len(errors)):
+        logarithm = 0.0
+        for j in range(HISTORY_FEATURES):
+            logarithm += coefficients[i, j] * features[j]
+        errors[i] = math.exp(logarithm)
+    return features, errors
 
 
 class Moment(NamedTuple):
@@ -393,17 +402,16 @@ class Stepper(Carrier):
     ) -> Pressed:
         """Press patches (number and weight) where ``place`` has found, at the end of a step."""
         found: dict[int, Local] = {}
-        moved, part = np.zeros(3), np.zeros(3)
+        moved = np.zeros(3)
         iterations, smallest, converged, area = 0, math.inf, True, 0.0
         for k, share in active:
             local = history.locals.get(k) or self.follow(history, k)
             record = local.record.copy()
             status, count, least, area = step_at(
                 self._solver, k, pressure, radius, self._models.deviatoric[k], weights,
-                record, self._scratch, part,
+                record, self._scratch, share, moved,
             )  # fmt: skip
             found[k] = Local(record, local.remains)
-            moved += share * part
             iterations, smallest = max(iterations, count), min(smallest, least)
             converged = converged and status == equilibrium.CONVERGED
         return Pressed(found, moved, area, converged, iterations, smallest)
@@ -419,4 +427,6 @@ class Stepper(Carrier):
     def _take_over(self, k: int, new: Memory, old: Memory, overlap: Field | None) -> None:
         if overlap is not None:
             new.pull[:] = overlap @ old.pull
+            rest = np.eye(self.modes)  # what nothing is known of
+            new.secants[:] = rest + overlap @ (old.secants - rest) @ overlap.T
         recall_points(self._solver, k, new, self._scratch)

@@ -563,12 +563,11 @@ def place(terms, solver, position, direction):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def step_at(solver, k, pressure, radius, deviatoric, time, record, scratch, moved):
+def step_at(solver, k, pressure, radius, deviatoric, time, record, scratch, share, moved):
     """Press local model k where ``place`` has found; its record goes to the end of the step.
 
-    ``moved`` (3,) is the contact's displacement.
-
-    Returns status, iterations, smallest det F and force over pressure (mm^2).
+    Of the contact's displacement its share is added to ``moved`` (3,). Returns status, iterations,
+    smallest det F and force over pressure (mm^2).
     """
     outcome, own = solver.outcome, solver.scratch
     area = load_patch(
@@ -579,9 +578,10 @@ def step_at(solver, k, pressure, radius, deviatoric, time, record, scratch, move
         solver.patches, k, deviatoric, time, own.wide_load, memory, scratch
     )
     wide, unit = memory.wide, own.unit_loads
-    for i in range(3):
-        moved[i] = 0.0
-        if area > 0.0:
+    if area > 0.0:
+        for i in range(3):
+            total = 0.0
             for j in range(len(wide)):
-                moved[i] += unit[len(wide) * i + j] * wide[j] / area
+                total += unit[len(wide) * i + j] * wide[j]
+            moved[i] += share * total / area
     return status, iterations, smallest, area

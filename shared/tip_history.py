@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from shared import equilibrium
 from shared.bound import Bound, bind
 from shared.errors import QueryError
-from shared.history import Carrier, History, Local, ViscousModels, history_features
+from shared.history import Carrier, History, Local, ViscousModels, judge
 from shared.touch import (
     BESIDE,
     DEPTH,
@@ -197,8 +197,10 @@ def step(
         travel=history.travel + (0.0 if off else math.dist(position.tolist(), last.tolist())),
         smallest=min(history.smallest, scalars.item(SMALLEST_J)),
     )
-    features = history_features(outcome.upward, after)
-    errors = np.exp(coefficients @ features).tolist()
+    features, estimates = judge(
+        coefficients, outcome.upward, after.share, after.response, after.travel, after.smallest
+    )
+    errors = estimates.tolist()
     contact = scalars.item(TOUCHED) > 0
     out_of_range: tuple[str, ...] = ()
     if contact and scalars.item(BESIDE):
