@@ -69,6 +69,12 @@ class Remains(NamedTuple):
 
     mean: Array  # (terms, r), as Memory.mean, at
     time: float  # s
+    size: float  # its norm
+
+    @classmethod
+    def of(cls, mean: Array, time: float) -> Remains:
+        """What a mean leaves at a time."""
+        return cls(mean, time, math.sqrt(np.vdot(mean, mean)))
 
 
 class Local(NamedTuple):
@@ -262,7 +268,7 @@ class Carrier(ABC):
         source, time = history.locals[history.main], history.time
         record = self._new_record()
         new, old = self.opened(record), self.opened(source.record)
-        move = {history.main: Remains(old.mean.copy(), time)}
+        move = {history.main: Remains.of(old.mean.copy(), time)}
         T = self._overlap(k, history.main)
         if T is not None:
             new.knots[:] = old.knots @ T.T
@@ -290,12 +296,16 @@ class Carrier(ABC):
 
         None where one of its parts, which nearly make up for each other, does not meet that space.
         """
-        overlaps = {n: self._overlap(k, n) for n in left}
-        if len(left) > MOST_PARTS or any(T is None for T in overlaps.values()):
+        if len(left) > MOST_PARTS:
             return None
+        overlaps = {}
+        for n in left:
+            T = self._overlap(k, n)
+            if T is None:
+                return None
+            overlaps[n] = T
         mean, moved = np.zeros((len(self._tau), self.modes)), np.zeros(self.modes)
         for n, T in overlaps.items():
-            assert T is not None
             own = self._recover(n, left[n], time)
             mean += own @ T.T
             moved += T @ (self._models.deviatoric[n] @ (self._share @ own))
@@ -342,17 +352,14 @@ class Carrier(ABC):
         """Add a mean (terms, r) to what remains in patch k."""
         if k in remains:
             mean = mean + self._recover(k, remains[k], time)
-        remains[k] = Remains(mean, time)
+        remains[k] = Remains.of(mean, time)
 
     def _largest(
         self, remains: Sequence[dict[int, Remains]], time: float
     ) -> tuple[dict[int, Remains], ...]:
         """What is worth keeping, the latest first."""
         sizes = [
-            max(
-                float(np.linalg.norm(r.mean)) * math.exp((r.time - time) / self._slowest)
-                for r in left.values()
-            )
+            max(r.size * math.exp((r.time - time) / self._slowest) for r in left.values())
             for left in remains
         ]
         least = FORGOTTEN * max(sizes)

@@ -83,9 +83,9 @@ Array = NDArray[np.float64]
 Field = NDArray[np.float32]
 
 LAG = 0.03
-"""As ``shared.touch.LAG``, of the answer and of its past: under a moving tip both change at every
-step.  It costs no iteration; the tangent on the tool is then off by .9 % in one of twenty steps of
-a session (with .01, by .5)."""
+"""As ``shared.touch.LAG``, of the answer and of its past: both change at every step, and forming
+the tangent takes as long as all the rest.  Iterations stay as few; the price is the tangent on the
+tool."""
 
 NOTHING, SHAPE, EVERYTHING = 0, 1, 2
 """What a memory knows of the last answer: that it was rest, its shape, its derivatives too."""

@@ -206,7 +206,7 @@ def test_what_remains_recovers_like_a_patch_under_small_loads(one_patch, atlas):
         patch.step(share, dt)
     load, _ = patch.step(0.0, 0.0)
     assert not load.any()
-    start = Remains(patch.memory.mean.copy(), 0.0)
+    start = Remains.of(patch.memory.mean.copy(), 0.0)
     for _ in range(200):
         patch.step(0.0, 0.005)
     k = int(np.argmin(np.linalg.norm(atlas.models.centres - patch.x, axis=1)))
