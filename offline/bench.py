@@ -1,7 +1,7 @@
 """How long queries take, beside the full model: all kinds in turns, so that they share the weather.
 
-A query's time is that of ``Atlas.solve`` as a caller sees it, from a position in space to an answer
-with its error estimate; fields are recovered after a cold query of their own.
+A query's time is that of ``ReducedModel.solve`` as a caller sees it, from a position in space to an
+answer with its error estimate; fields are recovered after a cold query of their own.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offline.sampling import tangents
-from offline.validate import unseen_loads
-from offline.workshop import Load, Workshop
-from shared.artifact import read_artifact
-from shared.atlas import Atlas, Region
-from shared.endoscope import TIP_DEPTH, pressure_limit
+from palpate.offline.reduce.sampling import tangents
+from palpate.offline.run.workshop import Load, Workshop
+from palpate.offline.validate.loads import unseen_loads
+from palpate.shared.artifact import read_artifact
+from palpate.shared.mechanics.footprint import TIP_DEPTH, pressure_limit
+from palpate.shared.model import ReducedModel, Region
 
 Array = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ def bench(artifact: Path) -> dict[str, Any]:
         nodes; ``full_us``, the full model in a single jump from rest. ``p95``: their 95th
         percentiles. ``ratio``: full over cold.
     """
-    atlas = Atlas.load(artifact)
+    atlas = ReducedModel.load(artifact)
     workshop = Workshop.of_artifact(read_artifact(artifact))
     state, walker = atlas.new_state(), atlas.new_state()
     rng = np.random.default_rng(atlas.scene.seed)
@@ -98,7 +98,7 @@ def bench(artifact: Path) -> dict[str, Any]:
     }
 
 
-def walk(atlas: Atlas, start: Load, count: int, rng: np.random.Generator) -> list[Load]:
+def walk(atlas: ReducedModel, start: Load, count: int, rng: np.random.Generator) -> list[Load]:
     """Loads that glide over the surface in steps of ``STEP``, turning where it ends.
 
     Tilt and share of the local pressure limit are those of ``start``.
@@ -122,7 +122,7 @@ def walk(atlas: Atlas, start: Load, count: int, rng: np.random.Generator) -> lis
     return loads
 
 
-def tip_at(atlas: Atlas, load: Load) -> Array:
+def tip_at(atlas: ReducedModel, load: Load) -> Array:
     """Centre of a tip at a load's contact, half as deep as may be."""
     x, normal, _, fields = atlas.surface.locate(load.position, atlas.limits)
     return x + (atlas.scene.endoscope.radius - fields[TIP_DEPTH] / 2) * normal

@@ -49,7 +49,7 @@ def train(scene: str, out: Path | None, workers: int | None) -> None:
     SCENE is one that comes along, such as turbinate, or a TOML file. A run that was killed goes on
     where it stopped.
     """
-    from offline.train import train
+    from palpate.offline.train import train
 
     train(scene, out, workers)
 
@@ -63,9 +63,9 @@ def info(artifact: Path, as_json: bool) -> None:
     How it was made, how accurate it is, its range of loads (kPa, degrees, mm) and the quality of
     its mesh.
     """
-    from shared.atlas import Atlas
+    from palpate.shared.model import ReducedModel
 
-    atlas = Atlas.load(artifact)
+    atlas = ReducedModel.load(artifact)
     endoscope = atlas.scene.endoscope
     loads = {
         "largest_pressure": atlas.pressure_max,
@@ -97,7 +97,7 @@ def solve(
     load (mN) and clamped (0 or 1). With --full-model they are the full model's, beside them stand
     displacement_error and von_mises_error of the reduced one, and its relative errors are printed.
     """
-    from offline.solve import solve
+    from palpate.offline.solve import solve
 
     _show(solve(artifact, position, pressure, direction, full_model, vtu), as_json)
 
@@ -117,7 +117,7 @@ def picture(
 
     Needs PyVista: pip install -e '.[pictures]'.
     """
-    from offline.pictures import picture
+    from palpate.offline.pictures import picture
 
     picture(artifact, position, pressure, direction, out)
 
@@ -161,10 +161,10 @@ def validate(
     Both solve new random loads, positions of the tip, or histories of either, over the artifact's
     whole range. Errors are relative L2 norms, as fractions; of histories, over all moments too.
     """
-    from offline.histories import validate_histories
-    from offline.tip_histories import validate_courses
-    from offline.touches import validate_touches
-    from offline.validate import validate
+    from palpate.offline.validate.histories import validate_histories
+    from palpate.offline.validate.loads import validate
+    from palpate.offline.validate.tip import validate_touches
+    from palpate.offline.validate.tip_histories import validate_courses
 
     if histories is not None:
         follow = validate_courses if tip else validate_histories
@@ -182,7 +182,7 @@ def bench(artifact: Path, as_json: bool) -> None:
     Median µs of a cold query, on a warm path of small steps, of the rigid tip on that path, with
     the fields on the surface, with all fields, and of the full model.
     """
-    from offline.bench import bench
+    from palpate.offline.bench import bench
 
     _show(bench(artifact), as_json)
 
@@ -207,7 +207,7 @@ def mesh_error(report: Path, as_json: bool) -> None:
     Errors are fractions of the displacement that the turbinate shows in the reference mesh; takes
     a few minutes.
     """
-    from offline.studies.mesh_error import mesh_error
+    from palpate.offline.studies.mesh_error import mesh_error
 
     _show(mesh_error(report), as_json)
 
@@ -229,8 +229,8 @@ def baselines(
     table goes to NAME/report/baselines.csv beside the artifact. A killed run goes on where it
     stopped.
     """
-    from offline.scenes import default_artifact, find_scene
-    from offline.studies.baselines import baselines
+    from palpate.offline.scenes import default_artifact, find_scene
+    from palpate.offline.studies.baselines import baselines
 
     path = artifact or default_artifact(find_scene(scene))
     _show(baselines(path, snapshots, queries, seed), as_json)
@@ -253,8 +253,8 @@ def chart(
     NAME/report/chart.csv, .png and .html beside the artifact. Takes half an hour; a killed run
     goes on where it stopped.
     """
-    from offline.scenes import default_artifact, find_scene
-    from offline.studies.chart import chart
+    from palpate.offline.scenes import default_artifact, find_scene
+    from palpate.offline.studies.chart import chart
 
     found = find_scene(scene)
     path = artifact or default_artifact(found)
@@ -274,7 +274,7 @@ def continuity(artifact: Path, paths: int, steps: int, seed: int, tip: bool, as_
     Largest change of the displacement field over steps of 0.05 mm that the full model does not
     show, in mm.
     """
-    from offline.studies.continuity import continuity, tip_continuity
+    from palpate.offline.studies.continuity import continuity, tip_continuity
 
     measure = tip_continuity if tip else continuity
     _show(measure(artifact, paths, steps, seed), as_json)
@@ -291,7 +291,7 @@ def mesh_independence(queries: int, seed: int, as_json: bool) -> None:
     """
     import tempfile
 
-    from offline.studies.mesh_independence import compare
+    from palpate.offline.studies.mesh_independence import compare
 
     with tempfile.TemporaryDirectory() as folder:
         _show(compare(queries, seed, Path(folder)), as_json)
@@ -315,7 +315,7 @@ def cube(scene: str, report: Path | None, as_json: bool) -> None:
     CPU times against the number of bases, and which of the paper's claims hold. SCENE cube-visco is
     of tissue that knows time: pressed, held and let go.
     """
-    from offline.studies import paper, paper_in_time
+    from palpate.offline.studies import paper, paper_in_time
 
     study = paper_in_time if scene == "cube-visco" else paper
     _show(study.cube(report or Path("artifacts", scene, "report")), as_json)
@@ -332,7 +332,7 @@ def turbinate(scene: str, report: Path | None, as_json: bool) -> None:
     errors in five POD bases, for which PyVista is needed: pip install -e '.[pictures]'. SCENE
     turbinate-visco is of tissue that knows time, pressed, held and let go; without contours.
     """
-    from offline.studies import paper, paper_in_time
+    from palpate.offline.studies import paper, paper_in_time
 
     study = paper_in_time if scene == "turbinate-visco" else paper
     _show(study.turbinate(report or Path("artifacts", scene, "report")), as_json)
@@ -348,7 +348,7 @@ def newton_step(element: str, repeats: int, as_json: bool) -> None:
     Medians in ms on one thread; ratio is FElupe with its default solver over palpate, ratio_best
     with the fastest solver at hand.
     """
-    from offline.studies.newton_step import compare
+    from palpate.offline.studies.newton_step import compare
 
     _show(compare(element, repeats), as_json)
 
@@ -367,8 +367,8 @@ def stability(scene: str, artifact: Path | None, cases: int, seed: int, as_json:
     NAME/report/stability.csv and .png beside the artifact, the artifact's silent errors to
     stability_silent.csv. A killed run goes on where it stopped.
     """
-    from offline.scenes import default_artifact, find_scene
-    from offline.studies.stability import stability
+    from palpate.offline.scenes import default_artifact, find_scene
+    from palpate.offline.studies.stability import stability
 
     path = artifact or default_artifact(find_scene(scene))
     _show(stability(path, cases, seed), as_json)
@@ -400,7 +400,7 @@ def chart_in_time(artifact: Path, histories: int, lessons: int, seed: int, as_js
     asks with this seed. Table and picture go to NAME/report/chart_in_time.csv and .png beside the
     artifact.
     """
-    from offline.studies.chart_in_time import chart_in_time
+    from palpate.offline.studies.chart_in_time import chart_in_time
 
     _show(chart_in_time(artifact, histories, lessons, seed), as_json)
 
@@ -425,7 +425,7 @@ def stability_in_time(artifact: Path, cases: int, seed: int, many: int, as_json:
     that teleport and more. The map goes to NAME/report/stability_in_time.csv and .png beside the
     artifact.
     """
-    from offline.studies.stability_in_time import stability_in_time
+    from palpate.offline.studies.stability_in_time import stability_in_time
 
     _show(stability_in_time(artifact, cases, seed, many), as_json)
 
@@ -442,7 +442,7 @@ def relaxation(artifact: Path, position: tuple[float, float, float] | None, as_j
     """
     import numpy as np
 
-    from offline.studies.relaxation import relaxation
+    from palpate.offline.studies.relaxation import relaxation
 
     at = None if position is None else np.array(position)
     _show(relaxation(artifact, at), as_json)
@@ -464,7 +464,7 @@ def steps(artifact: Path, many: int, as_json: bool) -> None:
     Very small and large steps, long holds, sudden reversals and more, against the full model, go to
     NAME/report/steps.csv and .png beside the artifact.
     """
-    from offline.studies.steps import steps
+    from palpate.offline.studies.steps import steps
 
     _show(steps(artifact, many - many % 50), as_json)
 

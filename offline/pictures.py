@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offline.vtu import CELL_TYPES
-from shared.atlas import Atlas, Solution
-from shared.errors import PalpateError
+from palpate.offline.vtu import CELL_TYPES
+from palpate.shared.errors import PalpateError
+from palpate.shared.model import ReducedModel, Solution
 
 Array = NDArray[np.float64]
 
@@ -70,7 +70,7 @@ def picture(
         import pyvista as pv
     except ImportError as error:
         raise PalpateError("pictures need PyVista: pip install -e '.[pictures]'") from error
-    atlas = Atlas.load(artifact)
+    atlas = ReducedModel.load(artifact)
     solution = atlas.solve(position, pressure, direction)
     displacement = atlas.displacement(solution).astype(float)
     elements = atlas.body.elements

@@ -10,13 +10,13 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from offline.full_model import NoEquilibrium
-from offline.norms import relative
-from offline.vtu import write_vtu
-from offline.workshop import Load, Workshop
-from shared.answer import describe
-from shared.artifact import read_artifact
-from shared.atlas import Atlas
+from palpate.offline.fem.model import NoEquilibrium
+from palpate.offline.run.workshop import Load, Workshop
+from palpate.offline.validate.norms import relative
+from palpate.offline.vtu import write_vtu
+from palpate.shared.answer import describe
+from palpate.shared.artifact import read_artifact
+from palpate.shared.model import ReducedModel
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -60,7 +60,7 @@ def solve(
         If the artifact is unusable, the load makes no sense or either model finds no equilibrium
         under it.
     """
-    atlas = Atlas.load(artifact)
+    atlas = ReducedModel.load(artifact)
     solution, solve_us = _timed(lambda: atlas.solve(position, pressure, direction))
     if not solution.converged:
         raise NoEquilibrium(

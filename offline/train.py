@@ -6,7 +6,7 @@
 4. The reduced model, pressed everywhere, lowers the range where the tissue gives way.
 5. Full solutions of random loads, which calibrate the error estimate, and others, which validate.
 
-Every finished task is on disk before it counts; see ``offline.checkpoint``.
+Every finished task is on disk before it counts; see ``run.checkpoint``.
 """
 
 from __future__ import annotations
@@ -31,23 +31,14 @@ from scipy.spatial import cKDTree
 from scipy.special import betaincinv
 from tqdm import tqdm
 
-from offline.checkpoint import Checkpoint, content_key
-from offline.choose import Trial, TrialResult, choose, ladder
-from offline.choose_mesh import with_mesh
-from offline.full_model import POINTWISE
-from offline.giving_way import lowered_depths, lowered_limits
-from offline.histories import (
-    HistoryComparison,
-    compare_history,
-    loads_of,
-    random_histories,
-    summarise_histories,
-)
-from offline.mesh import mesh_quality
-from offline.moments import calibrate_moments
-from offline.patches import PatchResult, PatchTask, RegionResult
-from offline.refinement import MOST_DOFS, mesh_error_document
-from offline.sampling import (
+from palpate.offline.fem.choose_mesh import with_mesh
+from palpate.offline.fem.mesh import mesh_quality
+from palpate.offline.fem.model import POINTWISE
+from palpate.offline.fem.refine import MOST_DOFS, mesh_error_document
+from palpate.offline.reduce.footprint_models import PatchResult, PatchTask, RegionResult
+from palpate.offline.reduce.limit_points import lowered_depths, lowered_limits
+from palpate.offline.reduce.ritz import Footprint
+from palpate.offline.reduce.sampling import (
     area,
     centred_points,
     fewer,
@@ -56,25 +47,21 @@ from offline.sampling import (
     spacing_count,
     spread_points,
 )
-from offline.scenes import default_artifact, find_scene
-from offline.spaces import Footprint
-from offline.tip_histories import (
-    CourseComparison,
-    compare_course,
-    random_courses,
-    summarise_courses,
+from palpate.offline.reduce.size import Trial, TrialResult, choose, ladder
+from palpate.offline.reduce.tip_models import local_tips
+from palpate.offline.reduce.viscous import viscous_models
+from palpate.offline.run.checkpoint import Checkpoint, content_key
+from palpate.offline.run.workers import Tasks, resume, worker_pool
+from palpate.offline.run.workshop import Load, TouchSample, Workshop, open_workshop, run
+from palpate.offline.scenes import default_artifact, find_scene
+from palpate.offline.validate.histories import (
+    HistoryComparison,
+    compare_history,
+    loads_of,
+    random_histories,
+    summarise_histories,
 )
-from offline.tips import local_tips
-from offline.touches import (
-    QUANTITIES,
-    TouchComparison,
-    calibrate_touches,
-    compare_touch,
-    fit_residuals,
-    random_positions,
-    summarise_touches,
-)
-from offline.validate import (
+from palpate.offline.validate.loads import (
     ESTIMATED,
     Comparison,
     calibrate,
@@ -84,14 +71,27 @@ from offline.validate import (
     summarise,
     write_rows,
 )
-from offline.viscous import viscous_models
-from offline.workers import Tasks, resume, worker_pool
-from offline.workshop import Load, TouchSample, Workshop, open_workshop, run
-from shared.artifact import Dataset, write_artifact
-from shared.atlas import ESTIMATORS, Atlas, Estimator, Estimators, LocalModels
-from shared.endoscope import TIP_DEPTH
-from shared.reduced import NARROW
-from shared.scene import Scene, SceneError, Size, Tolerance
+from palpate.offline.validate.moments import calibrate_moments
+from palpate.offline.validate.tip import (
+    QUANTITIES,
+    TouchComparison,
+    calibrate_touches,
+    compare_touch,
+    fit_residuals,
+    random_positions,
+    summarise_touches,
+)
+from palpate.offline.validate.tip_histories import (
+    CourseComparison,
+    compare_course,
+    random_courses,
+    summarise_courses,
+)
+from palpate.shared.artifact import Dataset, write_artifact
+from palpate.shared.mechanics.footprint import TIP_DEPTH
+from palpate.shared.model import ESTIMATORS, Estimator, Estimators, LocalModels, ReducedModel
+from palpate.shared.reduced.press import NARROW
+from palpate.shared.scene import Scene, SceneError, Size, Tolerance
 
 Array = NDArray[np.float64]
 
@@ -254,7 +254,7 @@ class Pipeline:
         if tip_rows:
             write_rows(report / "validation_tip.csv", tip_rows)
 
-    def untested_atlas(self, limits: Array, layout: Layout) -> Atlas:
+    def untested_atlas(self, limits: Array, layout: Layout) -> ReducedModel:
         """An atlas without error estimate: stages 2 and 3 only."""
         models = self.local_models(layout, limits)
         return self._untested(models, limits)
@@ -606,9 +606,9 @@ class Pipeline:
             "content_key": content_key(self.scene),
         }
 
-    def _untested(self, models: LocalModels, limits: Array) -> Atlas:
+    def _untested(self, models: LocalModels, limits: Array) -> ReducedModel:
         """An atlas without error estimates."""
-        return Atlas(
+        return ReducedModel(
             self.scene.name, self.scene, {}, self.workshop.body, self.surface, limits, models,
             Estimators(),
         )  # fmt: skip

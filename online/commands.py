@@ -10,8 +10,8 @@ from typing import Any
 
 import click
 
-from online.logs import FORMATS, LEVELS
-from online.settings import Settings
+from palpate.online.serve.logs import FORMATS, LEVELS
+from palpate.online.serve.settings import Settings
 
 _option = partial(click.option, show_default=True, show_envvar=True)
 
@@ -114,7 +114,7 @@ def serve(host: str, port: int, public: bool, **settings: Any) -> None:
       palpate serve --artifacts artifacts --realtime
       PALPATE_TOKEN=$(openssl rand -hex 32) palpate serve --host 0.0.0.0 --workers 2
     """
-    from online.serving import serve
+    from palpate.online.serve.process import serve
 
     serve(Settings(**settings), host, port, public)
 
@@ -139,7 +139,7 @@ def latency(
     which a service started with --echo gives. The ratio is what is left of a step without its
     solve, over the echo.
     """
-    from online.latency import measure, measure_session
+    from palpate.online.loadtest.latency import measure, measure_session
 
     report = (measure_session if session else measure)(url, scene, rounds, token)
     if as_json:
@@ -229,14 +229,14 @@ def loadtest(outputs: tuple[str, ...], out: Path | None, as_json: bool, **plan: 
       palpate loadtest http://127.0.0.1:8000 --sessions 0 --queries-per-second 200 --region none
       palpate loadtest http://127.0.0.1:8000 --sessions 4 --overload 10 --out overload.png
     """
-    from online.frames import Output
-    from online.loadtest.report import table
-    from online.loadtest.run import Plan, run
+    from palpate.online.loadtest.report import table
+    from palpate.online.loadtest.run import Plan, run
+    from palpate.online.session.frames import Output
 
     outcome = run(Plan(**plan, outputs=sum(Output[name.upper()] for name in outputs)))
     click.echo(json.dumps(outcome.summary) if as_json else table(outcome.summary))
     if out is not None:
-        from online.loadtest.picture import draw
+        from palpate.online.loadtest.picture import draw
 
         draw(outcome, out)
 
@@ -248,15 +248,15 @@ def loadtest(outputs: tuple[str, ...], out: Path | None, as_json: bool, **plan: 
 def replay(recording: Path, artifact: Path, as_json: bool) -> None:
     """Answer a recorded session anew and compare, bit for bit.
 
-    RECORDING is what a client of a session wrote (`record=` of online.client); ARTIFACT the one
+    RECORDING is what a client of a session wrote (`record=` of client.http); ARTIFACT the one
     that was served. The exit code is 1 if any reply differs. The same answers to the bit need the
     same kind of processor and the same versions of the libraries.
     """
-    from online.recording import read_recording
-    from online.replay import replay
-    from shared.atlas import Atlas
+    from palpate.online.session.recording import read_recording
+    from palpate.online.session.replay import replay
+    from palpate.shared.model import ReducedModel
 
-    report = replay(read_recording(recording), Atlas.load(artifact))._asdict()
+    report = replay(read_recording(recording), ReducedModel.load(artifact))._asdict()
     if as_json:
         click.echo(json.dumps(report))
     else:

@@ -2,24 +2,44 @@
 
 import hashlib
 import os
+import re
 import sys
 from pathlib import Path
 
-KERNELS = ("shared", "offline", "offline/methods", "online")
-"""Folders of sources with kernels, or with constants that are compiled into them."""
+PACKAGES = Path(__file__).parents[1]
+
+_IMPORT = re.compile(r"^ *from palpate\.([\w.]+) import (\([^)]*\)|.*)", re.MULTILINE)
+
+
+def kernel_sources() -> list[Path]:
+    """Sources with kernels, and those they import from: constants of theirs are compiled too."""
+    texts = {
+        source: source.read_text()
+        for package in ("shared", "offline", "online")
+        for source in (PACKAGES / package).rglob("*.py")
+    }
+    pending = [source for source, text in texts.items() if "from numba" in text]
+    found = set(pending)
+    while pending:
+        for module, names in _IMPORT.findall(texts[pending.pop()]):
+            place = PACKAGES.joinpath(*module.split("."))
+            candidates = [place, *(place / name for name in re.findall(r"\w+", names))]
+            for candidate in candidates:
+                source = candidate.with_suffix(".py")
+                if source in texts and source not in found:
+                    found.add(source)
+                    pending.append(source)
+    return sorted(found)
 
 
 def _kernel_cache() -> None:
-    """Give compiled kernels a cache of their own for every state of the sources.
+    """Give compiled kernels a cache of their own for every state of their sources.
 
     Numba renews a cached kernel when the file that defines it changes, but not when a kernel of
     another file that was compiled into it does: after an update it would go on running old physics.
     """
-    packages = Path(__file__).parents[1]
     digest = hashlib.sha256()
-    for source in sorted(
-        source for folder in KERNELS for source in (packages / folder).glob("*.py")
-    ):
+    for source in kernel_sources():
         digest.update(source.read_bytes())
     cache = Path(__file__).parent / "__pycache__"
     if os.access(cache if cache.exists() else cache.parent, os.W_OK):
@@ -30,7 +50,7 @@ def _kernel_cache() -> None:
 
 
 def _one_thread_of_blas() -> None:
-    """Keep BLAS to one thread, if NumPy has not come in yet.
+    """Keep BLAS to one thread, if NumPy is not imported yet.
 
     The products of a query are too small to share, and a BLAS thread that waits for a busy core
     turns 0.3 ms into 100; shared or not, they differ in the last bit. Long work runs in processes.

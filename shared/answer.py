@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from shared.atlas import Solution
-from shared.history import Moment
+from palpate.shared.model import Solution
+from palpate.shared.reduced.history import Moment
 
 
 def describe(scene: str, solution: Solution) -> dict[str, Any]:

@@ -25,7 +25,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.errors import PalpateError
+from palpate.shared.errors import PalpateError
 
 FORMAT = "palpate-artifact"
 FORMAT_VERSION = 6

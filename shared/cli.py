@@ -9,7 +9,7 @@ from importlib.metadata import entry_points
 
 import click
 
-from shared.errors import PalpateError
+from palpate.shared.errors import PalpateError
 
 EXAMPLE = """\b
 Example, from a scene to an answer:

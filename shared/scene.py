@@ -22,7 +22,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from shared.errors import PalpateError
+from palpate.shared.errors import PalpateError
 
 ElementName = Literal["hex8", "hex8-mean-dilatation", "hex8-fbar", "hex20"]
 

@@ -19,7 +19,7 @@ def rng():
 def trained(scene, folder):
     """Train a scene in a process of its own."""
     path = folder / f"{scene}.h5"
-    train = "from shared.cli import main; main()", "train", scene, "--out", str(path)
+    train = "from palpate.shared.cli import main; main()", "train", scene, "--out", str(path)
     subprocess.run([sys.executable, "-c", *train], check=True, capture_output=True)
     return path
 

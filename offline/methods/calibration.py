@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from offline.methods.relaxation import Elastic
-from offline.methods.tetrahedra import Tetrahedra
-from offline.sampling import random_points
-from offline.workshop import Workshop
+from palpate.offline.methods.relaxation import Elastic
+from palpate.offline.methods.tetrahedra import Tetrahedra
+from palpate.offline.reduce.sampling import random_points
+from palpate.offline.run.workshop import Workshop
 
 LOADS = 24
 """Small loads, at points all over the surface and normal to it."""

@@ -14,20 +14,20 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from offline.full_model import FullModel
-from offline.methods.cubatures import PointForces, point_forces
-from offline.methods.deim import Deim, force_modes, sample
-from offline.methods.full import Full
-from offline.methods.galerkin import Cubature, Galerkin, GalerkinAtHand, ReducedModel
-from offline.methods.method import Case, Method
-from offline.methods.regression import Linear, Regression, compliance
-from offline.methods.shipped import Shipped
-from offline.methods.spaces import Inner, krylov, mass, modal, pod, static_derivatives
-from offline.sampling import spread_points, tangents
-from offline.spaces import TANGENTIAL
-from offline.workshop import Load, Workshop
-from shared.atlas import Atlas
-from shared.errors import PalpateError
+from palpate.offline.fem.model import FullModel
+from palpate.offline.methods.cubatures import PointForces, point_forces
+from palpate.offline.methods.deim import Deim, force_modes, sample
+from palpate.offline.methods.full import Full
+from palpate.offline.methods.galerkin import Cubature, Galerkin, GalerkinAtHand, GalerkinModel
+from palpate.offline.methods.method import Case, Method
+from palpate.offline.methods.regression import Linear, Regression, compliance
+from palpate.offline.methods.shipped import Shipped
+from palpate.offline.methods.spaces import Inner, krylov, mass, modal, pod, static_derivatives
+from palpate.offline.reduce.ritz import TANGENTIAL
+from palpate.offline.reduce.sampling import spread_points, tangents
+from palpate.offline.run.workshop import Load, Workshop
+from palpate.shared.errors import PalpateError
+from palpate.shared.model import ReducedModel
 
 Array = NDArray[np.float64]
 
@@ -63,14 +63,14 @@ class Training:
     ----------
     workshop : Workshop
     snapshots : Snapshots
-    atlas : Atlas, optional
+    atlas : ReducedModel, optional
         The artifact of the same mesh, for the method that is it.
     seed : int
     """
 
     workshop: Workshop
     snapshots: Snapshots
-    atlas: Atlas | None = None
+    atlas: ReducedModel | None = None
     seed: int = 0
 
     @property
@@ -118,7 +118,7 @@ class Training:
 
     def point_forces(self, basis: Array) -> PointForces:
         """What a cubature of a basis is fitted to."""
-        reduced = ReducedModel(self.model, basis.shape[1], Cubature.full(self.model))
+        reduced = GalerkinModel(self.model, basis.shape[1], Cubature.full(self.model))
         reduced.adopt(basis)
         per_element = self.model.weights.shape[1]
         return point_forces(reduced, per_element, self.cases, self.rng(basis.shape[1]))

@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from offline.cubature import compress, nonnegative
-from offline.methods.galerkin import Cubature, ReducedModel
-from offline.methods.method import Case
-from shared.reduced import LANES, nonlinear_stress
+from palpate.offline.methods.galerkin import Cubature, GalerkinModel
+from palpate.offline.methods.method import Case
+from palpate.offline.reduce.cubature import compress, nonnegative
+from palpate.shared.reduced.press import LANES, nonlinear_stress
 
 Array = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ class PointForces:
 
 
 def point_forces(
-    reduced: ReducedModel, per_element: int, cases: Iterable[Case], rng: np.random.Generator
+    reduced: GalerkinModel, per_element: int, cases: Iterable[Case], rng: np.random.Generator
 ) -> PointForces:
     """Forces at every point in and off the equilibria of cases.
 
@@ -74,7 +74,7 @@ def point_forces(
 
     Parameters
     ----------
-    reduced : ReducedModel
+    reduced : GalerkinModel
         With its basis and the full cubature.
     per_element : int
         Quadrature points of an element.
@@ -101,7 +101,7 @@ def point_forces(
 
 
 def _contributions(
-    reduced: ReducedModel, q: Array, looks: NDArray[np.floating]
+    reduced: GalerkinModel, q: Array, looks: NDArray[np.floating]
 ) -> NDArray[np.float32] | None:
     """Nonlinear forces (c, k) along ``looks`` (m, k) at coordinates q; None beyond inversion."""
     system = reduced.content.system

@@ -26,19 +26,19 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from offline.full_model import FullModel
-from offline.methods.galerkin import (
+from palpate.offline.fem.model import FullModel
+from palpate.offline.methods.galerkin import (
     MAX_ITERATIONS,
     TOLERANCE,
     Content,
     Cubature,
-    ReducedModel,
+    GalerkinModel,
     point_gradients,
     reduce_load,
 )
-from offline.methods.method import Answer, Case
-from shared.bound import bind
-from shared.reduced import increments, linearise, nonlinear_stress, project, superpose
+from palpate.offline.methods.method import Answer, Case
+from palpate.shared.compiled import bind
+from palpate.shared.reduced.press import increments, linearise, nonlinear_stress, project, superpose
 
 Array = NDArray[np.float64]
 
@@ -136,7 +136,7 @@ class PlainNewton:
     ----------
     family, label : str
     unknowns : int
-    reduced : ReducedModel
+    reduced : GalerkinModel
     test : ndarray, shape (>= m, 9 c), float32
         Gradients of the test functions, as those of the modes.
     """
@@ -146,7 +146,7 @@ class PlainNewton:
         family: str,
         label: str,
         unknowns: int,
-        reduced: ReducedModel,
+        reduced: GalerkinModel,
         test: NDArray[np.float32],
     ) -> None:
         self.family, self.label, self.unknowns = family, label, unknowns
@@ -192,7 +192,7 @@ class Deim(PlainNewton):
         unknowns = basis.shape[1]
         self.points = _points_touched(model, samples.dofs)
         weights = model.weights.ravel()[self.points]
-        reduced = ReducedModel(model, unknowns, Cubature(self.points, weights))
+        reduced = GalerkinModel(model, unknowns, Cubature(self.points, weights))
         reduced.adopt(basis)
         functions = np.zeros((3 * len(model.mesh.nodes), unknowns))
         functions[model.free[samples.dofs]] = (basis.T @ modes @ samples.fit).T

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from offline.full_model import FullModel, NoEquilibrium
-from offline.methods.method import Answer, Case
+from palpate.offline.fem.model import FullModel, NoEquilibrium
+from palpate.offline.methods.method import Answer, Case
 
 Array = NDArray[np.float64]
 

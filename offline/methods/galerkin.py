@@ -1,6 +1,6 @@
 """Galerkin models: a basis and a cubature, solved from rest in compiled code.
 
-The mechanics are those of the artifact's local models, ``shared.reduced.LocalSystem``, with other
+The mechanics are those of the artifact's local models, ``reduced.press.LocalSystem``, with other
 modes and points: linear elasticity is exact, for the modes are orthonormal in its energy, and only
 what the tissue law adds to it is summed over the points.
 """
@@ -16,11 +16,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from offline.full_model import POINTWISE, FullModel
-from offline.methods.method import Answer, Case
-from shared import equilibrium
-from shared.bound import bind
-from shared.reduced import LANES, ROUND_OFF, STATE, TILE, LocalSystem, descend
+from palpate.offline.fem.model import POINTWISE, FullModel
+from palpate.offline.methods.method import Answer, Case
+from palpate.shared.compiled import bind
+from palpate.shared.mechanics import newton
+from palpate.shared.reduced.press import LANES, ROUND_OFF, STATE, TILE, LocalSystem, descend
 
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
@@ -29,7 +29,7 @@ TOLERANCE = 1e-4
 """Residual at equilibrium relative to the load, in the energy norm: the solver's share of the
 error, small beside that of any basis here."""
 
-REUSE = 0.3
+KEEP_TANGENT = 0.3
 """A factorised tangent serves while it contracts the residual by this factor."""
 
 MAX_ITERATIONS = 60
@@ -37,7 +37,7 @@ MAX_ITERATIONS = 60
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc"})
 def point_gradients(connectivity, gradients, points, modes, out):
-    """Displacement gradients of modes at quadrature points, in the tiles of ``shared.reduced``.
+    """Displacement gradients of modes at quadrature points, in the tiles of ``reduced.press``.
 
     Parameters
     ----------
@@ -114,12 +114,12 @@ def _solve(content, nodes, forces):
         system.factor[i, i] = 1.0
     target = max(TOLERANCE * math.sqrt(np.dot(system.load, system.load)), 1e-12)
     status, iterations, _, _ = descend(
-        system, q, work, 0.0, 1.0, target, REUSE, MAX_ITERATIONS, True, ROUND_OFF
+        system, q, work, 0.0, 1.0, target, KEEP_TANGENT, MAX_ITERATIONS, True, ROUND_OFF
     )
     return status, iterations
 
 
-class ReducedModel:
+class GalerkinModel:
     """The full model in the span of modes that can be exchanged; not to be shared by threads.
 
     Parameters
@@ -181,7 +181,7 @@ class ReducedModel:
     def solve(self, case: Case) -> tuple[bool, int]:
         """Whether there is an equilibrium, left in ``content.q``, and the iterations made."""
         status, iterations = _solve(self._bound, case.nodes, case.forces)
-        return status == equilibrium.CONVERGED, iterations
+        return status == newton.CONVERGED, iterations
 
 
 class Galerkin:
@@ -199,7 +199,7 @@ class Galerkin:
         self, family: str, label: str, model: FullModel, basis: Array, cubature: Cubature
     ) -> None:
         self.family, self.label, self.unknowns = family, label, basis.shape[1]
-        self.reduced = ReducedModel(model, self.unknowns, cubature)
+        self.reduced = GalerkinModel(model, self.unknowns, cubature)
         self.reduced.adopt(basis)
 
     def solve(self, case: Case) -> Answer:
@@ -235,7 +235,7 @@ class GalerkinAtHand:
         space: Callable[[Case], Array],
     ) -> None:
         self.family, self.label, self.unknowns = family, label, size
-        self.reduced = ReducedModel(model, size, Cubature.full(model))
+        self.reduced = GalerkinModel(model, size, Cubature.full(model))
         self._space, self._free = space, model.free
 
     def solve(self, case: Case) -> Answer:

@@ -1,6 +1,6 @@
 """Galerkin models in time: a basis for the whole body and every quadrature point.
 
-A step is that of the artifact's local models, ``shared.reduced_history.step_patch``, with other
+A step is that of the artifact's local models, ``reduced.press_in_time.step_patch``, with other
 modes and points; what the tissue remembers is kept at every quadrature point.
 """
 
@@ -11,15 +11,22 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from offline.full_model import History
-from offline.methods.galerkin import TOLERANCE, Cubature, ReducedModel, reduce_load
-from offline.methods.method import Case
-from offline.viscous import deviatoric_stiffness
-from offline.workshop import Workshop
-from shared import equilibrium
-from shared.reduced import LANES
-from shared.reduced_history import SYMMETRIC, Memory, new_record, new_scratch, opened, step_patch
-from shared.viscosity import COMPONENTS, step_weights
+from palpate.offline.fem.model import History
+from palpate.offline.methods.galerkin import TOLERANCE, Cubature, GalerkinModel, reduce_load
+from palpate.offline.methods.method import Case
+from palpate.offline.reduce.viscous import deviatoric_stiffness
+from palpate.offline.run.workshop import Workshop
+from palpate.shared.mechanics import newton
+from palpate.shared.mechanics.viscosity import COMPONENTS, step_weights
+from palpate.shared.reduced.press import LANES
+from palpate.shared.reduced.press_in_time import (
+    SYMMETRIC,
+    Memory,
+    new_record,
+    new_scratch,
+    opened,
+    step_patch,
+)
 
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
@@ -59,7 +66,7 @@ class GalerkinInTime:
         model, m = workshop.model, basis.shape[1]
         self.family, self.label, self.unknowns = family, label, m
         self._workshop, self._accurate = workshop, accurate
-        reduced = ReducedModel(model, m, Cubature.full(model))
+        reduced = GalerkinModel(model, m, Cubature.full(model))
         reduced.adopt(basis)
         system, self._modes = reduced.content.system, reduced.content.modes
         rows, points = len(system.gradients), len(system.weights)
@@ -89,7 +96,7 @@ class GalerkinInTime:
             self._body, 0, self._deviatoric, weights, self._load, self.opened(after), self._scratch,
             self._accurate,
         )  # fmt: skip
-        converged = status == equilibrium.CONVERGED
+        converged = status == newton.CONVERGED
         return converged, after if converged else past
 
     def trusted(self, past: Array) -> bool:

@@ -7,9 +7,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from offline.full_model import History, NoEquilibrium
-from offline.methods.method import Case
-from offline.workshop import Workshop
+from palpate.offline.fem.model import History, NoEquilibrium
+from palpate.offline.methods.method import Case
+from palpate.offline.run.workshop import Workshop
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from offline.workshop import Load, Workshop
+from palpate.offline.run.workshop import Load, Workshop
 
 Array = NDArray[np.float64]
 

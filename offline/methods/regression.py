@@ -9,12 +9,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from offline.full_model import FullModel
-from offline.methods.galerkin import reduce_load
-from offline.methods.method import Answer, Case
-from offline.spaces import energy_pod
-from offline.studies.baselines import HELD_BACK, KERNELS, LENGTHS
-from offline.workshop import Load
+from palpate.offline.fem.model import FullModel
+from palpate.offline.methods.galerkin import reduce_load
+from palpate.offline.methods.method import Answer, Case
+from palpate.offline.reduce.ritz import energy_pod
+from palpate.offline.run.workshop import Load
+from palpate.offline.studies.baselines import HELD_BACK, KERNELS, LENGTHS
 
 Array = NDArray[np.float64]
 

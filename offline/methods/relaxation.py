@@ -21,8 +21,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from offline.methods.method import Answer, Case
-from offline.methods.tetrahedra import Tetrahedra
+from palpate.offline.methods.method import Answer, Case
+from palpate.offline.methods.tetrahedra import Tetrahedra
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]

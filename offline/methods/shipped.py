@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from offline.methods.method import Answer, Case
-from shared.atlas import Atlas, State
-from shared.errors import QueryError
+from palpate.offline.methods.method import Answer, Case
+from palpate.shared.errors import QueryError
+from palpate.shared.model import ReducedModel, State
 
 Array = NDArray[np.float64]
 
@@ -19,14 +19,14 @@ class Shipped:
 
     Parameters
     ----------
-    atlas : Atlas
+    atlas : ReducedModel
     state : State, optional
         Where every answer starts from the last; without it each is cold.
     """
 
     family = label = "artifact"
 
-    def __init__(self, atlas: Atlas, state: State | None = None) -> None:
+    def __init__(self, atlas: ReducedModel, state: State | None = None) -> None:
         self.unknowns = int(atlas.info["training"]["layout"]["narrow_modes"])
         self._atlas, self._state = atlas, state
 

@@ -11,11 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from offline.methods.method import Case
-from offline.workshop import Load
-from shared.atlas import Atlas, Solution
-from shared.history import History, Moment
-from shared.touch import Touch
+from palpate.offline.methods.method import Case
+from palpate.offline.run.workshop import Load
+from palpate.shared.model import ReducedModel, Solution
+from palpate.shared.reduced.history import History, Moment
+from palpate.shared.reduced.touch import Touch
 
 Array = NDArray[np.float64]
 
@@ -32,12 +32,12 @@ class ShippedInTime:
 
     Parameters
     ----------
-    atlas : Atlas
+    atlas : ReducedModel
     """
 
     family = label = "artifact"
 
-    def __init__(self, atlas: Atlas) -> None:
+    def __init__(self, atlas: ReducedModel) -> None:
         assert atlas.models.viscous is not None, "elastic tissue has no past"
         self.unknowns = atlas.models.viscous.deviatoric.shape[1]
         self._atlas = atlas
@@ -82,7 +82,7 @@ class TipInTime(ShippedInTime):
 
     family = label = "artifact, tip"
 
-    def __init__(self, atlas: Atlas) -> None:
+    def __init__(self, atlas: ReducedModel) -> None:
         super().__init__(atlas)
         assert atlas.models.viscous_tips is not None, "the scene has a tip that knows of time"
         self.unknowns = atlas.models.viscous_tips.deviatoric.shape[1]
@@ -96,12 +96,12 @@ class ElasticTwin:
 
     Parameters
     ----------
-    atlas : Atlas
+    atlas : ReducedModel
     """
 
     family = label = "elastic twin"
 
-    def __init__(self, atlas: Atlas) -> None:
+    def __init__(self, atlas: ReducedModel) -> None:
         self.unknowns = atlas.models.mix.shape[-1]
         self._atlas, self._state = atlas, atlas.new_state()
 

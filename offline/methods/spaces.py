@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from offline.full_model import FullModel
-from offline.spaces import energy_pod, ritz_vectors
-from shared.elements import gauss, hexahedron, shape
-from shared.quadrature import volume_quadrature
+from palpate.offline.fem.model import FullModel
+from palpate.offline.reduce.ritz import energy_pod, ritz_vectors
+from palpate.shared.geometry.elements import gauss, hexahedron, shape
+from palpate.shared.geometry.quadrature import volume_quadrature
 
 Array = NDArray[np.float64]
 Inner = Literal["energy", "euclidean"]
@@ -123,7 +123,7 @@ def static_derivatives(model: FullModel, loads: Array, size: int) -> Array:
     """Ritz vectors of three loads carried to third order: (free dofs, <= min(size, 19)).
 
     First, second and third derivatives at rest of the equilibrium under any combination of the
-    loads (``offline.spaces``); of fewer than 19, those that lead in energy at these loads.
+    loads (``reduce.ritz``); of fewer than 19, those that lead in energy at these loads.
 
     Parameters
     ----------

@@ -25,11 +25,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from offline.methods.calibration import stiffening
-from offline.methods.relaxation import TOLERANCE, Ints, Relaxed, Stencil
-from offline.methods.tetrahedra import Divisions, Tetrahedra, gradients
-from offline.workshop import Workshop
-from shared.tissue import lame
+from palpate.offline.methods.calibration import stiffening
+from palpate.offline.methods.relaxation import TOLERANCE, Ints, Relaxed, Stencil
+from palpate.offline.methods.tetrahedra import Divisions, Tetrahedra, gradients
+from palpate.offline.run.workshop import Workshop
+from palpate.shared.mechanics.tissue import lame
 
 Array = NDArray[np.float64]
 Law = Literal["linear", "st-venant-kirchhoff"]

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, diags
 from scipy.sparse.linalg import splu
 
-from offline.mesh import Mesh
-from offline.methods.method import Case
-from offline.workshop import Workshop
-from shared.elements import HEX_CORNERS, gauss, hexahedron, quadrilateral, shape
-from shared.errors import PalpateError
-from shared.scene import Extrusion, Scene, divisions_of
+from palpate.offline.fem.mesh import Mesh
+from palpate.offline.methods.method import Case
+from palpate.offline.run.workshop import Workshop
+from palpate.shared.errors import PalpateError
+from palpate.shared.geometry.elements import HEX_CORNERS, gauss, hexahedron, quadrilateral, shape
+from palpate.shared.scene import Extrusion, Scene, divisions_of
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -124,7 +124,7 @@ class Tetrahedra:
 
 
 def lattice(scene: Scene) -> Divisions:
-    """Hexahedra of a scene along the axes of its mesh's lattice (see ``offline.mesh``)."""
+    """Hexahedra of a scene along the axes of its mesh's lattice (see ``fem.mesh``)."""
     along, second, third = divisions_of(scene.geometry)
     return (
         (along, third, second) if isinstance(scene.geometry, Extrusion) else (along, second, third)

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from shared.scene import Scene, SceneError, load_scene
+from palpate.shared.scene import Scene, SceneError, load_scene
 
 FOLDER = Path(__file__).parent
 

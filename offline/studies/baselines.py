@@ -25,22 +25,22 @@ from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from offline.checkpoint import Checkpoint, content_key
-from offline.full_model import FullModel
-from offline.norms import statistics
-from offline.spaces import energy_pod
-from offline.validate import random_loads, unseen_loads
-from offline.workers import resume, worker_pool
-from offline.workshop import Load, Workshop, open_artifact
-from shared import equilibrium
-from shared.artifact import read_artifact
-from shared.atlas import Atlas
-from shared.errors import PalpateError
+from palpate.offline.fem.model import FullModel
+from palpate.offline.reduce.ritz import energy_pod
+from palpate.offline.run.checkpoint import Checkpoint, content_key
+from palpate.offline.run.workers import resume, worker_pool
+from palpate.offline.run.workshop import Load, Workshop, open_artifact
+from palpate.offline.validate.loads import random_loads, unseen_loads
+from palpate.offline.validate.norms import statistics
+from palpate.shared.artifact import read_artifact
+from palpate.shared.errors import PalpateError
+from palpate.shared.mechanics import newton
+from palpate.shared.model import ReducedModel
 
 Array = NDArray[np.float64]
 
 SNAPSHOTS = 101
-"""Sets these random numbers apart, as ``offline.validate.UNSEEN`` does those of the queries."""
+"""Sets these random numbers apart, as ``validate.loads.UNSEEN`` does those of the queries."""
 
 GALERKIN_MODES = 80
 """Beside as many as the artifact's local models iterate on and answer with."""
@@ -76,15 +76,15 @@ def baselines(artifact: Path, snapshots: int, queries: int, seed: int) -> dict[s
     snapshots : int
         Full solutions that the baselines learn from.
     queries, seed : int
-        Loads to answer, the same as ``offline.validate.validate`` takes.
+        Loads to answer, the same as ``validate.loads.validate`` takes.
 
     Returns
     -------
     dict
         For each method ``unknowns``, ``unconverged``, ``displacement`` and ``von_mises``:
-        statistics of relative errors as in ``offline.norms``.
+        statistics of relative errors as in ``validate.norms``.
     """
-    atlas = Atlas.load(artifact)
+    atlas = ReducedModel.load(artifact)
     workshop = Workshop.of_artifact(read_artifact(artifact))
     model = workshop.model
     rng = np.random.default_rng([atlas.scene.seed, SNAPSHOTS, seed])
@@ -110,7 +110,7 @@ def baselines(artifact: Path, snapshots: int, queries: int, seed: int) -> dict[s
     return report
 
 
-def _modes(atlas: Atlas) -> tuple[int, int]:
+def _modes(atlas: ReducedModel) -> tuple[int, int]:
     """Modes of a local model: those it iterates on, chosen anew for each load, and all it has."""
     layout = atlas.info["training"]["layout"]
     return layout["narrow_modes"], layout["wide_modes"]
@@ -209,13 +209,13 @@ def solve_galerkin(
     for load, q in zip(loads, coordinates, strict=True):
         system.load = modes.T @ workshop.load_vector(load).ravel()[workshop.model.free]
         target = TOLERANCE * float(np.linalg.norm(system.load))
-        status, *_ = equilibrium.newton(system, q, work, target, 0.0, MAX_ITERATIONS, False)
-        converged.append(status == equilibrium.CONVERGED)
+        status, *_ = newton.newton(system, q, work, target, 0.0, MAX_ITERATIONS, False)
+        converged.append(status == newton.CONVERGED)
     return coordinates, np.array(converged)
 
 
 class _GalerkinSystem:
-    """The full model in the span of modes (free dofs, m); see ``shared.equilibrium``."""
+    """The full model in the span of modes (free dofs, m); see ``mechanics.newton``."""
 
     def __init__(self, model: FullModel, modes: Array) -> None:
         self.load = np.zeros(modes.shape[1])
@@ -245,7 +245,7 @@ class _GalerkinSystem:
         step[:] = -cho_solve(self._factor, residual)
 
 
-def _artifact(atlas: Atlas, loads: Sequence[Load]) -> Answers:
+def _artifact(atlas: ReducedModel, loads: Sequence[Load]) -> Answers:
     solutions = [atlas.solve(load.position, load.pressure, load.direction) for load in loads]
     return Answers(
         _modes(atlas)[0],

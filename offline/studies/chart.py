@@ -26,25 +26,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offline.checkpoint import Checkpoint, content_key
-from offline.methods.catalogue import Snapshots, Training, build
-from offline.methods.mass_spring import MassSpring
-from offline.methods.method import Case, Method
-from offline.methods.shipped import Shipped
-from offline.methods.tensor_mass import TensorMass
-from offline.methods.tetrahedra import scaled
-from offline.norms import relative
-from offline.studies.baselines import SNAPSHOTS, full_solutions
-from offline.studies.chart_drawing import draw, write_page
-from offline.studies.chart_points import FIELDS, SHIPPED, Point, pareto, write_csv
-from offline.studies.remeshed import Remeshed, refined
-from offline.validate import random_loads, unseen_loads
-from offline.workers import resume, worker_pool
-from offline.workshop import Workshop, open_artifact
-from shared.artifact import read_artifact
-from shared.atlas import Atlas
-from shared.errors import PalpateError
-from shared.scene import Scene
+from palpate.offline.methods.catalogue import Snapshots, Training, build
+from palpate.offline.methods.mass_spring import MassSpring
+from palpate.offline.methods.method import Case, Method
+from palpate.offline.methods.shipped import Shipped
+from palpate.offline.methods.tensor_mass import TensorMass
+from palpate.offline.methods.tetrahedra import scaled
+from palpate.offline.run.checkpoint import Checkpoint, content_key
+from palpate.offline.run.workers import resume, worker_pool
+from palpate.offline.run.workshop import Workshop, open_artifact
+from palpate.offline.studies.baselines import SNAPSHOTS, full_solutions
+from palpate.offline.studies.chart_drawing import draw, write_page
+from palpate.offline.studies.chart_points import FIELDS, SHIPPED, Point, pareto, write_csv
+from palpate.offline.studies.remeshed import Remeshed, refined
+from palpate.offline.validate.loads import random_loads, unseen_loads
+from palpate.offline.validate.norms import relative
+from palpate.shared.artifact import read_artifact
+from palpate.shared.errors import PalpateError
+from palpate.shared.model import ReducedModel
+from palpate.shared.scene import Scene
 
 Array = NDArray[np.float64]
 Plan = Mapping[str, Sequence[float]]
@@ -121,7 +121,7 @@ def chart(
     snapshots : int
         Full solutions that methods learn from.
     queries, seed : int
-        Loads to answer, the same as ``offline.validate.validate`` takes.
+        Loads to answer, the same as ``validate.loads.validate`` takes.
     plan : mapping
         Sizes of every method; those of the artifact and the full model are needed.
 
@@ -132,7 +132,7 @@ def chart(
         time and p95 of displacement; ``speed_of_next``: time of the fastest other point that is at
         least as accurate, over the artifact's.
     """
-    atlas = Atlas.load(artifact)
+    atlas = ReducedModel.load(artifact)
     if atlas.scene.text != scene.text:
         raise PalpateError(f"{artifact}: trained on another scene than {scene.name!r}")
     checkpoint = Checkpoint(
@@ -166,7 +166,7 @@ def _key(scene: Scene, artifact: Path, seed: int) -> str:
 
 def _references(
     scene: Scene,
-    atlas: Atlas,
+    atlas: ReducedModel,
     artifact: Path,
     snapshots: int,
     queries: int,
@@ -201,7 +201,7 @@ def open_bench(
     workshop = Workshop.of_artifact(read_artifact(artifact))
     _bench = Bench(
         scene,
-        Training(workshop, known, Atlas.load(artifact), seed),
+        Training(workshop, known, ReducedModel.load(artifact), seed),
         [Case.of(workshop, load) for load in asked.loads],
         asked.displacements.reshape(len(asked.loads), -1, 3),
         finer,
@@ -209,7 +209,7 @@ def open_bench(
 
 
 def measure(workshop: Workshop, name: str, size: float) -> dict[str, Any]:
-    """Build a method and have it answer the loads; a task for ``offline.workers``.
+    """Build a method and have it answer the loads; a task for ``run.workers``.
 
     Returns
     -------

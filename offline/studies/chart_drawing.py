@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from offline.studies.chart_points import FULL, SHIPPED, STATISTICS, Point, pareto
-from shared.scene import Scene
+from palpate.offline.studies.chart_points import FULL, SHIPPED, STATISTICS, Point, pareto
+from palpate.shared.scene import Scene
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -23,23 +23,23 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from offline.histories import NONE_FOLLOWED, Press, loads_of, random_histories
-from offline.methods.catalogue import Snapshots, Training
-from offline.methods.galerkin_in_time import GalerkinInTime
-from offline.methods.in_time import FullInTime, InTime
-from offline.methods.method import Case
-from offline.methods.shipped_in_time import ElasticTwin, ShippedInTime
-from offline.methods.spaces import krylov, modal
-from offline.norms import relative
-from offline.studies.chart_drawing import duration, percent
-from offline.studies.chart_points import Point, pareto, write_csv
-from offline.validate import UNSEEN
-from offline.workers import completed, worker_pool
-from offline.workshop import Workshop, open_artifact
-from shared.artifact import read_artifact
-from shared.atlas import Atlas
-from shared.errors import PalpateError, QueryError
-from shared.scene import Scene
+from palpate.offline.methods.catalogue import Snapshots, Training
+from palpate.offline.methods.galerkin_in_time import GalerkinInTime
+from palpate.offline.methods.in_time import FullInTime, InTime
+from palpate.offline.methods.method import Case
+from palpate.offline.methods.shipped_in_time import ElasticTwin, ShippedInTime
+from palpate.offline.methods.spaces import krylov, modal
+from palpate.offline.run.workers import completed, worker_pool
+from palpate.offline.run.workshop import Workshop, open_artifact
+from palpate.offline.studies.chart_drawing import duration, percent
+from palpate.offline.studies.chart_points import Point, pareto, write_csv
+from palpate.offline.validate.histories import NONE_FOLLOWED, Press, loads_of, random_histories
+from palpate.offline.validate.loads import UNSEEN
+from palpate.offline.validate.norms import relative
+from palpate.shared.artifact import read_artifact
+from palpate.shared.errors import PalpateError, QueryError
+from palpate.shared.model import ReducedModel
+from palpate.shared.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -91,7 +91,7 @@ def chart_in_time(
         that of its elastic twin; ``speed_of_next``: as of ``offline.studies.chart.chart``;
         ``without_equilibrium``: histories that the full model could not follow.
     """
-    atlas = Atlas.load(artifact)
+    atlas = ReducedModel.load(artifact)
     if atlas.models.viscous is None:
         raise QueryError("scene", f"{atlas.name!r} is elastic: it has no histories")
     workshop = Workshop.of_artifact(read_artifact(artifact))
@@ -117,7 +117,7 @@ def chart_in_time(
 
 
 def _histories(
-    artifact: Path, atlas: Atlas, workshop: Workshop, count: int, lessons: int, seed: int
+    artifact: Path, atlas: ReducedModel, workshop: Workshop, count: int, lessons: int, seed: int
 ) -> tuple[list[Question], Array]:
     """Histories to answer, and displacements (k, 3 n) mm of others to learn from."""
     asked = np.random.default_rng([atlas.scene.seed, UNSEEN, seed])

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from offline.bench import STEP, tip_at, walk
-from offline.norms import relative
-from offline.touches import OTHER_EQUILIBRIUM
-from offline.validate import unseen_loads
-from offline.workshop import Workshop
-from shared.artifact import read_artifact
-from shared.atlas import Atlas
+from palpate.offline.bench import STEP, tip_at, walk
+from palpate.offline.run.workshop import Workshop
+from palpate.offline.validate.loads import unseen_loads
+from palpate.offline.validate.norms import relative
+from palpate.offline.validate.tip import OTHER_EQUILIBRIUM
+from palpate.shared.artifact import read_artifact
+from palpate.shared.model import ReducedModel
 
 
 def continuity(artifact: Path, paths: int, steps: int, seed: int) -> dict[str, Any]:
@@ -34,7 +34,7 @@ def continuity(artifact: Path, paths: int, steps: int, seed: int) -> dict[str, A
         all nodes (median, p95 and max over steps); ``change_mm``: the full model's own;
         ``switches``: steps at which the active patches change.
     """
-    atlas = Atlas.load(artifact)
+    atlas = ReducedModel.load(artifact)
     workshop = Workshop.of_artifact(read_artifact(artifact))
     rng = np.random.default_rng([seed, 7])
     excess, change, switches = [], [], 0
@@ -78,7 +78,7 @@ def tip_continuity(artifact: Path, paths: int, steps: int, seed: int) -> dict[st
         own. ``left_out``: steps at which the models rest in different equilibria, or the full model
         in none.
     """
-    atlas = Atlas.load(artifact)
+    atlas = ReducedModel.load(artifact)
     workshop = Workshop.of_artifact(read_artifact(artifact))
     rng = np.random.default_rng([seed, 8])
     excess: list[float] = []

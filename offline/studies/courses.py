@@ -15,12 +15,12 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from offline.histories import Press
-from offline.sampling import random_points_and_rim, tangents
-from offline.studies.relaxation import course
-from offline.tip_histories import OFF
-from shared.atlas import Atlas
-from shared.endoscope import TIP_DEPTH, pressure_limit
+from palpate.offline.reduce.sampling import random_points_and_rim, tangents
+from palpate.offline.studies.relaxation import course
+from palpate.offline.validate.histories import Press
+from palpate.offline.validate.tip_histories import OFF
+from palpate.shared.mechanics.footprint import TIP_DEPTH, pressure_limit
+from palpate.shared.model import ReducedModel
 
 Array = NDArray[np.float64]
 
@@ -70,12 +70,12 @@ class Presser:
 
     Parameters
     ----------
-    atlas : Atlas
+    atlas : ReducedModel
     tip : bool
         Whether by the rigid tip.
     """
 
-    def __init__(self, atlas: Atlas, tip: bool) -> None:
+    def __init__(self, atlas: ReducedModel, tip: bool) -> None:
         self._atlas, self.tip = atlas, tip
 
     def __call__(self, at: Array, level: float, dt: float, tilt: float = 0.0) -> Press:
@@ -91,12 +91,14 @@ class Presser:
         return Press(dt, x, direction, float(level * limit))
 
 
-def trials(atlas: Atlas, tip: bool, cases: int, seed: int, many: int) -> dict[str, list[Trial]]:
+def trials(
+    atlas: ReducedModel, tip: bool, cases: int, seed: int, many: int
+) -> dict[str, list[Trial]]:
     """Trials of every stressor by its name.
 
     Parameters
     ----------
-    atlas : Atlas
+    atlas : ReducedModel
     tip : bool
         With the rigid tip instead of footprints.
     cases : int

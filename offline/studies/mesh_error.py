@@ -22,14 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from offline.full_model import Equilibrium, FullModel
-from offline.mesh import build_mesh, local_thickness
-from offline.sampling import spread_points
-from offline.scenes import find_scene
-from offline.surface_mesh import accessible_surface
-from shared.endoscope import footprint
-from shared.quadrature import surface_quadrature
-from shared.scene import ElementName
+from palpate.offline.fem.mesh import build_mesh, local_thickness
+from palpate.offline.fem.model import Equilibrium, FullModel
+from palpate.offline.fem.surface import accessible_surface
+from palpate.offline.reduce.sampling import spread_points
+from palpate.offline.scenes import find_scene
+from palpate.shared.geometry.quadrature import surface_quadrature
+from palpate.shared.mechanics.footprint import footprint
+from palpate.shared.scene import ElementName
 
 Array = NDArray[np.float64]
 

@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from offline.checkpoint import Checkpoint
-from offline.sampling import random_points
-from offline.scenes import find_scene
-from offline.train import Pipeline
-from offline.workshop import Workshop
-from shared.atlas import Atlas
-from shared.endoscope import LIMIT_FIELDS
-from shared.scene import Size
+from palpate.offline.reduce.sampling import random_points
+from palpate.offline.run.checkpoint import Checkpoint
+from palpate.offline.run.workshop import Workshop
+from palpate.offline.scenes import find_scene
+from palpate.offline.train import Pipeline
+from palpate.shared.mechanics.footprint import LIMIT_FIELDS
+from palpate.shared.model import ReducedModel
+from palpate.shared.scene import Size
 
 SIZE = Size(patch_spacing=9.0, modes=64, cubature_points=128, region_modes=150)
 REGION_SPACING = 30.0  # mm
@@ -37,7 +37,7 @@ class _Inline(ThreadPoolExecutor):
         return super().submit(task, self._workshop, *args)
 
 
-def _sparse_atlas(name: str, checkpoint: Checkpoint) -> Atlas:
+def _sparse_atlas(name: str, checkpoint: Checkpoint) -> ReducedModel:
     scene = find_scene(name)
     training = scene.training.model_copy(update={"region_spacing": REGION_SPACING})
     endoscope = scene.endoscope.model_copy(update={"tip": False})

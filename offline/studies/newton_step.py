@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.linalg import splu, spsolve
 
-from offline.full_model import FullModel
-from offline.mesh import build_mesh
-from offline.scenes import find_scene
-from offline.surface_mesh import accessible_surface
-from shared.endoscope import footprint
-from shared.errors import PalpateError
-from shared.quadrature import surface_quadrature
+from palpate.offline.fem.mesh import build_mesh
+from palpate.offline.fem.model import FullModel
+from palpate.offline.fem.surface import accessible_surface
+from palpate.offline.scenes import find_scene
+from palpate.shared.errors import PalpateError
+from palpate.shared.geometry.quadrature import surface_quadrature
+from palpate.shared.mechanics.footprint import footprint
 
 Array = NDArray[np.float64]
 Step = Callable[[Array], tuple[dict[str, float], Array]]
@@ -156,7 +156,7 @@ def _felupe_step(
 
 
 def _felupe_law(fem: Any, mu: float, lam: float) -> Any:
-    """FEAP's Neo-Hookean law in the tensor algebra of FElupe; see ``shared.tissue``."""
+    """FEAP's Neo-Hookean law in the tensor algebra of FElupe; see ``mechanics.tissue``."""
     m = fem.math
 
     def gradient(x: list[Array]) -> list[Array]:

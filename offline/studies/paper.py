@@ -35,15 +35,15 @@ from numpy.typing import NDArray
 from scipy.stats import spearmanr
 from tqdm import tqdm
 
-from offline.methods.full import Full
-from offline.methods.galerkin import Cubature, Galerkin
-from offline.methods.method import Answer, Case
-from offline.methods.spaces import krylov, mass, modal, pod
-from offline.norms import relative
-from offline.scenes import find_scene
-from offline.studies import paper_pictures
-from offline.workshop import Workshop
-from shared.quadrature import surface_quadrature
+from palpate.offline.methods.full import Full
+from palpate.offline.methods.galerkin import Cubature, Galerkin
+from palpate.offline.methods.method import Answer, Case
+from palpate.offline.methods.spaces import krylov, mass, modal, pod
+from palpate.offline.run.workshop import Workshop
+from palpate.offline.scenes import find_scene
+from palpate.offline.studies import paper_pictures
+from palpate.offline.validate.norms import relative
+from palpate.shared.geometry.quadrature import surface_quadrature
 
 Array = NDArray[np.float64]
 

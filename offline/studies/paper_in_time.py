@@ -24,12 +24,12 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from offline.methods.galerkin_in_time import GalerkinInTime
-from offline.methods.in_time import FullInTime, InTime
-from offline.methods.spaces import pod
-from offline.norms import relative
-from offline.scenes import find_scene
-from offline.studies.paper import (
+from palpate.offline.methods.galerkin_in_time import GalerkinInTime
+from palpate.offline.methods.in_time import FullInTime, InTime
+from palpate.offline.methods.spaces import pod
+from palpate.offline.run.workshop import Workshop
+from palpate.offline.scenes import find_scene
+from palpate.offline.studies.paper import (
     CONTOUR_BASES,
     CUBE_PRESSURE,
     MEDIAL,
@@ -44,8 +44,8 @@ from offline.studies.paper import (
     publish_figure_1,
     spaces,
 )
-from offline.studies.relaxation import Phases, course
-from offline.workshop import Workshop
+from palpate.offline.studies.relaxation import Phases, course
+from palpate.offline.validate.norms import relative
 
 Array = NDArray[np.float64]
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offline.mesh import Mesh
-from offline.methods.galerkin import TOLERANCE
-from offline.vtu import CELL_TYPES
-from shared.errors import PalpateError
+from palpate.offline.fem.mesh import Mesh
+from palpate.offline.methods.galerkin import TOLERANCE
+from palpate.offline.vtu import CELL_TYPES
+from palpate.shared.errors import PalpateError
 
 Array = NDArray[np.float64]
 

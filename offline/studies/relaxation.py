@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from offline.histories import Press, play
-from offline.workshop import Load, Workshop
-from shared.artifact import read_artifact
-from shared.atlas import Atlas
-from shared.errors import QueryError
+from palpate.offline.run.workshop import Load, Workshop
+from palpate.offline.validate.histories import Press, play
+from palpate.shared.artifact import read_artifact
+from palpate.shared.errors import QueryError
+from palpate.shared.model import ReducedModel
 
 Array = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ def relaxation(artifact: Path, position: Array | None = None) -> dict[str, Any]:
         Depths (mm) at once and after the hold, what is left of the dent after the rest, largest
         difference of the two models' depths, and median times of a step (µs).
     """
-    atlas = Atlas.load(artifact)
+    atlas = ReducedModel.load(artifact)
     if atlas.models.viscous is None:
         raise QueryError("scene", f"{atlas.name!r} is elastic: nothing relaxes")
     workshop = Workshop.of_artifact(read_artifact(artifact))

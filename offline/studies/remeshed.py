@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from offline.full_model import NoEquilibrium
-from offline.methods.method import Answer, Case
-from offline.methods.tetrahedra import Divisions, lattice
-from offline.workshop import Load, Workshop
-from shared.elements import hexahedron, shape
-from shared.scene import Scene, divisions_of
+from palpate.offline.fem.model import NoEquilibrium
+from palpate.offline.methods.method import Answer, Case
+from palpate.offline.methods.tetrahedra import Divisions, lattice
+from palpate.offline.run.workshop import Load, Workshop
+from palpate.shared.geometry.elements import hexahedron, shape
+from palpate.shared.scene import Scene, divisions_of
 
 Array = NDArray[np.float64]
 
@@ -107,7 +107,7 @@ _kept: dict[float, Remeshed] = {}
 def refined(workshop: Workshop, scene: Scene, factor: float, load: Load) -> Array:
     """Displacement (n, 3) mm of a scene's nodes in a finer mesh, nan without an equilibrium.
 
-    A task for ``offline.workers``, all of one scene.
+    A task for ``run.workers``, all of one scene.
     """
     if factor not in _kept:
         _kept[factor] = Remeshed(scene, factor)

@@ -26,18 +26,20 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from offline import methods as methods_package
-from offline.checkpoint import Checkpoint, content_key
-from offline.methods.catalogue import Snapshots, Training, build
-from offline.methods.deim import PlainNewton
-from offline.methods.galerkin import Cubature, Galerkin, ReducedModel
-from offline.methods.mass_spring import MassSpring
-from offline.methods.method import Case, Method
-from offline.methods.shipped import Shipped
-from offline.methods.tensor_mass import TensorMass
-from offline.methods.tetrahedra import scaled
-from offline.studies import stressors
-from offline.studies.stressors import (
+from palpate.offline import methods as methods_package
+from palpate.offline.methods.catalogue import Snapshots, Training, build
+from palpate.offline.methods.deim import PlainNewton
+from palpate.offline.methods.galerkin import Cubature, Galerkin, GalerkinModel
+from palpate.offline.methods.mass_spring import MassSpring
+from palpate.offline.methods.method import Case, Method
+from palpate.offline.methods.shipped import Shipped
+from palpate.offline.methods.tensor_mass import TensorMass
+from palpate.offline.methods.tetrahedra import scaled
+from palpate.offline.run.checkpoint import Checkpoint, content_key
+from palpate.offline.run.workers import worker_pool
+from palpate.offline.run.workshop import Workshop, open_artifact
+from palpate.offline.studies import hard_cases
+from palpate.offline.studies.hard_cases import (
     CONTROL,
     HYSTERESIS,
     SEVERAL,
@@ -47,11 +49,9 @@ from offline.studies.stressors import (
     tissue,
     truths,
 )
-from offline.validate import random_loads
-from offline.workers import worker_pool
-from offline.workshop import Workshop, open_artifact
-from shared.artifact import read_artifact
-from shared.atlas import Atlas, Solution
+from palpate.offline.validate.loads import random_loads
+from palpate.shared.artifact import read_artifact
+from palpate.shared.model import ReducedModel, Solution
 
 Array = NDArray[np.float64]
 
@@ -162,7 +162,7 @@ def stability(
         ``with_several_equilibria``, ``with_hysteresis``: cases whose path and jump end apart, of
         loads that are raised and that are lowered again, a column each if there are any.
     """
-    atlas = Atlas.load(artifact)
+    atlas = ReducedModel.load(artifact)
     workshop = Workshop.of_artifact(read_artifact(artifact))
     everything = Stressors(atlas, workshop, cases, seed).trials()
     trials = {name: everything[name] for name in columns or everything}
@@ -193,13 +193,13 @@ def stability(
 def _key(artifact: Path, cases: int, seed: int, snapshots: int) -> str:
     """Of full solutions."""
     settings = f"{cases} {seed} {snapshots}".encode()
-    made = Path(stressors.__file__).read_bytes()
+    made = Path(hard_cases.__file__).read_bytes()
     own = hashlib.sha256(artifact.read_bytes() + made + settings).hexdigest()[:16]
-    return f"{content_key(Atlas.load(artifact).scene)}-{own}"
+    return f"{content_key(ReducedModel.load(artifact).scene)}-{own}"
 
 
 def _lessons(
-    atlas: Atlas, workshop: Workshop, poissons: Iterable[float], count: int
+    atlas: ReducedModel, workshop: Workshop, poissons: Iterable[float], count: int
 ) -> dict[str, list[Trial]]:
     """What methods learn from in each tissue: random loads in range."""
     rng = np.random.default_rng([atlas.scene.seed, LEARNING])
@@ -221,7 +221,7 @@ def _key_of_answers(key: str, columns: Iterable[str]) -> str:
 
 
 def _training(
-    workshop: Workshop, atlas: Atlas, lesson: Sequence[Trial], found: Sequence[Truth]
+    workshop: Workshop, atlas: ReducedModel, lesson: Sequence[Trial], found: Sequence[Truth]
 ) -> Training:
     known = [(t.case.contacts[0], u.jump) for t, u in zip(lesson, found, strict=True)]
     pairs = [(load, jump) for load, jump in known if jump is not None]
@@ -242,7 +242,7 @@ def _several(
     return {name: own[:most] for name, own in followed.items()}
 
 
-def _applies(method: str, trial: Trial, atlas: Atlas) -> bool:
+def _applies(method: str, trial: Trial, atlas: ReducedModel) -> bool:
     """Whether a method can be asked at all."""
     if method in (ARTIFACT, WARM) and trial.poisson != atlas.scene.tissue.poisson:
         return False
@@ -273,7 +273,7 @@ def _sparse(training: Training) -> Method:
 def _whole_steps(training: Training) -> Method:
     """As pod, but by plain Newton's method: no line search, no check of the tangent."""
     basis = training.pod(SIZE)
-    reduced = ReducedModel(training.model, SIZE, Cubature.full(training.model))
+    reduced = GalerkinModel(training.model, SIZE, Cubature.full(training.model))
     reduced.adopt(basis)
     test = reduced.content.system.gradients
     return PlainNewton("pod", "whole steps", basis.shape[1], reduced, test)

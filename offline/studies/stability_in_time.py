@@ -23,17 +23,17 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from offline.checkpoint import Checkpoint, content_key
-from offline.histories import Press, loads_of, random_histories
-from offline.methods.galerkin_in_time import GalerkinInTime
-from offline.methods.in_time import FullInTime, InTime
-from offline.methods.method import Case
-from offline.methods.shipped_in_time import ShippedInTime, TipInTime
-from offline.methods.spaces import modal, pod
-from offline.norms import relative
-from offline.studies import courses
-from offline.studies.courses import Trial
-from offline.studies.stability import (
+from palpate.offline.methods.galerkin_in_time import GalerkinInTime
+from palpate.offline.methods.in_time import FullInTime, InTime
+from palpate.offline.methods.method import Case
+from palpate.offline.methods.shipped_in_time import ShippedInTime, TipInTime
+from palpate.offline.methods.spaces import modal, pod
+from palpate.offline.run.checkpoint import Checkpoint, content_key
+from palpate.offline.run.workers import resume, worker_pool
+from palpate.offline.run.workshop import Load, Workshop, open_artifact
+from palpate.offline.studies import courses
+from palpate.offline.studies.courses import Trial
+from palpate.offline.studies.stability import (
     DIVERGED,
     INVERTED,
     OUTCOMES,
@@ -50,11 +50,11 @@ from offline.studies.stability import (
     table_row,
     write_table,
 )
-from offline.workers import resume, worker_pool
-from offline.workshop import Load, Workshop, open_artifact
-from shared.artifact import read_artifact
-from shared.atlas import Atlas
-from shared.errors import PalpateError, QueryError
+from palpate.offline.validate.histories import Press, loads_of, random_histories
+from palpate.offline.validate.norms import relative
+from palpate.shared.artifact import read_artifact
+from palpate.shared.errors import PalpateError, QueryError
+from palpate.shared.model import ReducedModel
 
 Array = NDArray[np.float64]
 
@@ -132,7 +132,7 @@ def stability_in_time(
         Per method what became of its histories, and of the longest ``drift``: how far their end is
         from the method's own answer in three steps that are long beside all time constants.
     """
-    atlas = Atlas.load(artifact)
+    atlas = ReducedModel.load(artifact)
     if atlas.models.viscous is None:
         raise QueryError("scene", f"{atlas.name!r} is elastic: it has no histories")
     workshop = Workshop.of_artifact(read_artifact(artifact))
@@ -167,12 +167,12 @@ def stability_in_time(
 def _key(artifact: Path, settings: str) -> str:
     sources = b"".join(Path(file).read_bytes() for file in (__file__, courses.__file__))
     own = hashlib.sha256(artifact.read_bytes() + settings.encode() + sources).hexdigest()[:16]
-    return f"{content_key(Atlas.load(artifact).scene)}-{own}"
+    return f"{content_key(ReducedModel.load(artifact).scene)}-{own}"
 
 
 def _followed(
     artifact: Path,
-    atlas: Atlas,
+    atlas: ReducedModel,
     asked: Mapping[bool, Mapping[str, Sequence[Trial]]],
     lessons: int,
     checkpoint: Checkpoint,
@@ -225,7 +225,7 @@ def _truth(found: Mapping[str, NDArray[Any]] | None) -> Truth | None:
 
 # --- methods -------------------------------------------------------------------------------------
 
-Builder = Callable[[Workshop, Atlas, Array], InTime]
+Builder = Callable[[Workshop, ReducedModel, Array], InTime]
 
 METHODS: dict[str, Builder] = {
     ARTIFACT: lambda workshop, atlas, known: ShippedInTime(atlas),

@@ -17,15 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from offline.moments import covered_moments
-from offline.tip_histories import Course, compare_course
-from offline.touches import QUANTITIES
-from offline.workshop import Workshop
-from shared.artifact import read_artifact
-from shared.atlas import Atlas
-from shared.endoscope import TIP_DEPTH
-from shared.errors import QueryError
-from shared.history import History
+from palpate.offline.run.workshop import Workshop
+from palpate.offline.validate.moments import covered_moments
+from palpate.offline.validate.tip import QUANTITIES
+from palpate.offline.validate.tip_histories import Course, compare_course
+from palpate.shared.artifact import read_artifact
+from palpate.shared.errors import QueryError
+from palpate.shared.mechanics.footprint import TIP_DEPTH
+from palpate.shared.model import ReducedModel
+from palpate.shared.reduced.history import History
 
 Array = NDArray[np.float64]
 
@@ -96,7 +96,7 @@ def steps(artifact: Path, many: int = MANY) -> dict[str, Any]:
         By case what ``Outcome`` holds; and ``drift``: how far the force of the last period of
         ``many`` steps is from that of the full model after ten, over its largest.
     """
-    atlas = Atlas.load(artifact)
+    atlas = ReducedModel.load(artifact)
     if atlas.models.viscous_tips is None:
         raise QueryError("scene", f"{atlas.name!r} has no tip that knows of time")
     workshop = Workshop.of_artifact(read_artifact(artifact))
@@ -132,7 +132,7 @@ def _cases() -> Iterator[Case]:
     yield case("half as deep again as the limit", [*np.linspace(0, 1.5, 12), *np.full(8, 1.5)], 0.1)
 
 
-def _course(atlas: Atlas, case: Case) -> Course:
+def _course(atlas: ReducedModel, case: Case) -> Course:
     """Positions of a case amid the surface."""
     vertices = atlas.surface.vertices
     middle = vertices[((vertices - vertices.mean(axis=0)) ** 2).sum(axis=1).argmin()]
@@ -146,7 +146,7 @@ def _course(atlas: Atlas, case: Case) -> Course:
     return Course(np.array(positions), case.times.tolist())
 
 
-def _outcome(atlas: Atlas, workshop: Workshop, case: Case) -> Outcome:
+def _outcome(atlas: ReducedModel, workshop: Workshop, case: Case) -> Outcome:
     course = _course(atlas, case)
     history, answers = History(), []
     for position, dt in zip(*course, strict=True):
@@ -171,7 +171,7 @@ def _outcome(atlas: Atlas, workshop: Workshop, case: Case) -> Outcome:
     )
 
 
-def _drift(atlas: Atlas, workshop: Workshop, many: int) -> float:
+def _drift(atlas: ReducedModel, workshop: Workshop, many: int) -> float:
     """How far the force of the last of many periods is from the full model's."""
     phase = 2 * np.pi * np.arange(PERIOD) / PERIOD
     levels = 0.5 - 0.3 * np.cos(phase)

@@ -49,7 +49,7 @@ class Log:
     solve_us : list of float, µs
         What the server says it took to solve.
     flags : list of int
-        Of sessions' frames: `online.frames.Flag`.
+        Of sessions' frames: `session.frames.Flag`.
     """
 
     def __init__(self, due: NDArray[np.float64]) -> None:

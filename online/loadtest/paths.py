@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-from online.client import Accessible
+from palpate.online.client.http import Accessible
 
 Array = NDArray[np.float64]
 

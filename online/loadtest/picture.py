@@ -7,8 +7,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from online.loadtest.report import Messages, quantiles
-from online.loadtest.run import Outcome
+from palpate.online.loadtest.report import Messages, quantiles
+from palpate.online.loadtest.run import Outcome
 
 KINDS = {"sessions": ("C0", "frames"), "queries": ("C1", "queries")}
 MARKS = {"p50_us": ("50 %", "top"), "p99_us": ("99 %", "top"), "p999_us": ("99.9 %", "bottom")}

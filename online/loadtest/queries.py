@@ -13,9 +13,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from online.loadtest.generator import CHUNK, DROPPED, Log
-from online.loadtest.target import Target
-from online.negotiation import BINARY, JSON
+from palpate.online.loadtest.generator import CHUNK, DROPPED, Log
+from palpate.online.loadtest.target import Target
+from palpate.online.serve.negotiation import BINARY, JSON
 
 PATIENCE = 1.0
 """Seconds that a query waits for a free connection."""

@@ -9,10 +9,18 @@ import numpy as np
 from hdrh.histogram import HdrHistogram
 from numpy.typing import NDArray
 
-from online.frames import Flag
-from online.loadtest.generator import ANSWERED, DROPPED, LOST, SUPERSEDED, WINDOW, Log, Machine
-from online.loadtest.queries import Queries
-from online.loadtest.sessions import Session
+from palpate.online.loadtest.generator import (
+    ANSWERED,
+    DROPPED,
+    LOST,
+    SUPERSEDED,
+    WINDOW,
+    Log,
+    Machine,
+)
+from palpate.online.loadtest.queries import Queries
+from palpate.online.loadtest.sessions import Session
+from palpate.online.session.frames import Flag
 
 ON_TIME = 100.0
 """Latest that a message may be sent in a clean window, µs after it was due."""

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from online.client import Client
-from online.loadtest.generator import Machine, Stream, drive
-from online.loadtest.paths import Tip, tool_path
-from online.loadtest.queries import Queries
-from online.loadtest.report import (
+from palpate.online.client.http import Client
+from palpate.online.loadtest.generator import Machine, Stream, drive
+from palpate.online.loadtest.paths import Tip, tool_path
+from palpate.online.loadtest.queries import Queries
+from palpate.online.loadtest.report import (
     Messages,
     clean_windows,
     gather,
@@ -20,9 +20,9 @@ from online.loadtest.report import (
     summarize_sessions,
     window_of,
 )
-from online.loadtest.sessions import Session
-from online.loadtest.target import Target
-from shared.errors import PalpateError
+from palpate.online.loadtest.sessions import Session
+from palpate.online.loadtest.target import Target
+from palpate.shared.errors import PalpateError
 
 Array = NDArray[np.float64]
 
@@ -56,7 +56,7 @@ class Plan:
     depth : float, mm
         How deep the tools press at most.
     outputs : int
-        Bits of `online.frames.Output` that frames ask for.
+        Bits of `session.frames.Output` that frames ask for.
     token : str, optional
     seed : int
     """

@@ -12,10 +12,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from online.frames import REPLY, REQUEST, VERSION
-from online.loadtest.generator import ANSWERED, CHUNK, SUPERSEDED, Log
-from online.loadtest.target import Target
-from shared.errors import PalpateError
+from palpate.online.loadtest.generator import ANSWERED, CHUNK, SUPERSEDED, Log
+from palpate.online.loadtest.target import Target
+from palpate.online.session.frames import REPLY, REQUEST, VERSION
+from palpate.shared.errors import PalpateError
 
 _TEXT, _BINARY, _CLOSE, _PING, _PONG = 1, 2, 8, 9, 10
 _FINAL, _MASKED = 0x80, 0x80
@@ -42,7 +42,7 @@ class Session:
     due : ndarray, shape (n,), s
     positions : ndarray, shape (n, 3), mm
     outputs : int
-        Bits of `online.frames.Output`.
+        Bits of `session.frames.Output`.
 
     Attributes
     ----------

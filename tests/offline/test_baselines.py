@@ -3,12 +3,12 @@ import csv
 import numpy as np
 import pytest
 
-from offline.spaces import energy_pod
-from offline.studies.baselines import baselines, solve_galerkin
-from offline.validate import unseen_loads, validate
-from offline.workshop import Workshop
-from shared.artifact import read_artifact
-from shared.atlas import Atlas
+from palpate.offline.reduce.ritz import energy_pod
+from palpate.offline.run.workshop import Workshop
+from palpate.offline.studies.baselines import baselines, solve_galerkin
+from palpate.offline.validate.loads import unseen_loads, validate
+from palpate.shared.artifact import read_artifact
+from palpate.shared.model import ReducedModel
 
 QUERIES = 12
 
@@ -48,7 +48,7 @@ def test_the_table_is_on_disk_and_nothing_else(report, artifact):
 
 
 def test_galerkin_in_a_basis_that_holds_the_answer_finds_it(artifact):
-    workshop, atlas = Workshop.of_artifact(read_artifact(artifact)), Atlas.load(artifact)
+    workshop, atlas = Workshop.of_artifact(read_artifact(artifact)), ReducedModel.load(artifact)
     model, load = workshop.model, unseen_loads(atlas, 2, 0)[1]
     exact = workshop.solve(load).displacement.ravel()[model.free]
     rng = np.random.default_rng(0)

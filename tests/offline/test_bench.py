@@ -3,18 +3,18 @@ import json
 import numpy as np
 import pytest
 
-import offline.bench
-from offline.bench import STEP, bench, walk
-from offline.validate import unseen_loads
-from shared.atlas import Atlas
+from palpate.offline import bench as timing
+from palpate.offline.bench import STEP, bench, walk
+from palpate.offline.validate.loads import unseen_loads
+from palpate.shared.model import ReducedModel
 
 KINDS = ["cold_us", "warm_us", "surface_us", "fields_us", "full_us", "tip_us"]
 
 
 @pytest.fixture
 def short(monkeypatch):
-    monkeypatch.setattr(offline.bench, "ROUNDS", 3)
-    monkeypatch.setattr(offline.bench, "QUERIES", 30)
+    monkeypatch.setattr(timing, "ROUNDS", 3)
+    monkeypatch.setattr(timing, "QUERIES", 30)
 
 
 @pytest.mark.usefixtures("short")
@@ -28,7 +28,7 @@ def test_every_kind_of_query_is_timed(artifact):
 
 
 def test_a_walk_stays_on_the_surface_and_in_range(artifact, rng):
-    atlas = Atlas.load(artifact)
+    atlas = ReducedModel.load(artifact)
     for start in unseen_loads(atlas, 5, 0):
         loads = walk(atlas, start, 300, rng)
         assert len(loads) == 300

@@ -3,15 +3,15 @@ import csv
 import numpy as np
 import pytest
 
-from offline.methods.method import Case
-from offline.scenes import find_scene
-from offline.studies import chart as study
-from offline.studies.chart_points import Point, pareto
-from offline.studies.remeshed import Remeshed, divided, interpolation
-from offline.validate import unseen_loads
-from offline.workshop import Workshop
-from shared.atlas import Atlas
-from shared.errors import PalpateError
+from palpate.offline.methods.method import Case
+from palpate.offline.run.workshop import Workshop
+from palpate.offline.scenes import find_scene
+from palpate.offline.studies import chart as study
+from palpate.offline.studies.chart_points import Point, pareto
+from palpate.offline.studies.remeshed import Remeshed, divided, interpolation
+from palpate.offline.validate.loads import unseen_loads
+from palpate.shared.errors import PalpateError
+from palpate.shared.model import ReducedModel
 
 PLAN = {"artifact": (1,), "pod": (5,), "linear": (10, 20), "mass-spring": (0.5,), "full": (0.5, 1)}
 QUERIES = 6
@@ -107,7 +107,7 @@ def test_other_meshes_give_linear_fields_at_the_nodes_of_the_scene(factor):
 
 
 def test_a_mesh_of_its_own_answers_like_the_scene_s(artifact):
-    scene, load = find_scene("quick"), unseen_loads(Atlas.load(artifact), 2, 1)[1]
+    scene, load = find_scene("quick"), unseen_loads(ReducedModel.load(artifact), 2, 1)[1]
     workshop, method = Workshop(scene), Remeshed(scene, 1)
     answer = method.solve(Case.of(workshop, load))
     exact = workshop.solve(load).displacement

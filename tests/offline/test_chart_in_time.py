@@ -4,8 +4,8 @@ import csv
 
 import pytest
 
-from offline.studies.chart_in_time import FULL, SHIPPED, TWIN, chart_in_time
-from shared.errors import QueryError
+from palpate.offline.studies.chart_in_time import FULL, SHIPPED, TWIN, chart_in_time
+from palpate.shared.errors import QueryError
 
 SIZES = (5, 40)
 

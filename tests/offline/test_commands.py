@@ -7,8 +7,8 @@ import meshio
 import pytest
 from click.testing import CliRunner
 
-import offline.bench
-from shared.cli import main
+from palpate.offline import bench as timing
+from palpate.shared.cli import main
 
 CONTACT = ["--at", "4", "5.5", "8", "--pressure", "1.5"]
 STATISTICS = {"mean", "p95", "max"}
@@ -76,8 +76,8 @@ def test_validate(answer, artifact, tmp_path):
 
 
 def test_bench(answer, artifact, monkeypatch):
-    monkeypatch.setattr(offline.bench, "ROUNDS", 2)
-    monkeypatch.setattr(offline.bench, "QUERIES", 10)
+    monkeypatch.setattr(timing, "ROUNDS", 2)
+    monkeypatch.setattr(timing, "QUERIES", 10)
     report = answer("bench", artifact)
     assert list(report)[:5] == ["cold_us", "warm_us", "surface_us", "fields_us", "full_us"]
 

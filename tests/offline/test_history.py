@@ -7,11 +7,11 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import root
 
-from offline.full_model import FullModel
-from offline.mesh import build_mesh
-from offline.scenes import find_scene
-from offline.workshop import Load, Workshop
-from shared.tissue import lame
+from palpate.offline.fem.mesh import build_mesh
+from palpate.offline.fem.model import FullModel
+from palpate.offline.run.workshop import Load, Workshop
+from palpate.offline.scenes import find_scene
+from palpate.shared.mechanics.tissue import lame
 
 YOUNG, POISSON = 15.0, 0.45
 PRONY = ((0.3, 0.1), (0.2, 1.0))

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from offline.mesh import build_mesh
-from offline.scenes import find_scene
-from offline.surface_mesh import accessible_surface
-from shared.endoscope import footprint
-from shared.quadrature import LOAD_SPACING, surface_quadrature
+from palpate.offline.fem.mesh import build_mesh
+from palpate.offline.fem.surface import accessible_surface
+from palpate.offline.scenes import find_scene
+from palpate.shared.geometry.quadrature import LOAD_SPACING, surface_quadrature
+from palpate.shared.mechanics.footprint import footprint
 
 STEP = 0.05  # mm
 RADIUS = 2.0  # mm

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from offline.mesh import local_thickness
-from offline.scenes import find_scene
-from offline.studies import paper, paper_pictures
-from offline.workshop import Workshop
-from shared.cli import main
-from shared.errors import PalpateError
+from palpate.offline.fem.mesh import local_thickness
+from palpate.offline.run.workshop import Workshop
+from palpate.offline.scenes import find_scene
+from palpate.offline.studies import paper, paper_pictures
+from palpate.shared.cli import main
+from palpate.shared.errors import PalpateError
 
 SIZES = (1, 2, 3, 6)
 PNG = b"\x89PNG\r\n\x1a\n"

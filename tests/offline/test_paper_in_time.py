@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from offline.scenes import find_scene
-from offline.studies import paper_in_time
-from offline.workshop import Workshop
-from shared.cli import main
+from palpate.offline.run.workshop import Workshop
+from palpate.offline.scenes import find_scene
+from palpate.offline.studies import paper_in_time
+from palpate.shared.cli import main
 
 PNG = b"\x89PNG\r\n\x1a\n"
 SIZES = (1, 3, 6)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from offline.pictures import _across, _tip_centre
-from shared.atlas import Atlas
-from shared.cli import main
+from palpate.offline.pictures import _across, _tip_centre
+from palpate.shared.cli import main
+from palpate.shared.model import ReducedModel
 
 CONTACT = ["--at", "4", "5.5", "8", "--pressure", "1.5"]
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -38,7 +38,7 @@ def test_missing_pyvista_is_named(artifact, tmp_path, monkeypatch):
 
 
 def test_the_tip_touches_the_surface_and_no_more(artifact):
-    atlas = Atlas.load(artifact)
+    atlas = ReducedModel.load(artifact)
     solution = atlas.solve([4, 5.5, 8], 1.5, [0.3, 0, -1])
     surface = (atlas.nodes + atlas.displacement(solution))[atlas.surface_nodes]
     distance = np.linalg.norm(surface - _tip_centre(surface, solution), axis=1)

@@ -4,12 +4,12 @@ import meshio
 import numpy as np
 import pytest
 
-from offline.full_model import NoEquilibrium
-from offline.scenes import find_scene
-from offline.solve import solve
-from offline.workshop import Workshop
-from shared.artifact import read_artifact
-from shared.atlas import Atlas
+from palpate.offline.fem.model import NoEquilibrium
+from palpate.offline.run.workshop import Workshop
+from palpate.offline.scenes import find_scene
+from palpate.offline.solve import solve
+from palpate.shared.artifact import read_artifact
+from palpate.shared.model import ReducedModel
 
 POSITION = (4.0, 5.5, find_scene("quick").geometry.size[2] + 0.2)
 DIRECTION = (0.2, 0.1, -1.0)
@@ -22,7 +22,7 @@ def workshop(artifact):
 
 @pytest.fixture(scope="module")
 def pressure(artifact):
-    return 0.4 * float(Atlas.load(artifact).limits[:, 0].min())
+    return 0.4 * float(ReducedModel.load(artifact).limits[:, 0].min())
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def solved(artifact, pressure, tmp_path_factory):
 
 def test_the_report_is_that_of_the_atlas(artifact, pressure):
     report = solve(artifact, POSITION, pressure, DIRECTION)
-    solution = Atlas.load(artifact).solve(POSITION, pressure, DIRECTION)
+    solution = ReducedModel.load(artifact).solve(POSITION, pressure, DIRECTION)
     assert report["scene"] == "quick"
     assert report["contact"]["distance"] == pytest.approx(0.2)
     assert report["force"] == pytest.approx(solution.force.tolist())
@@ -79,7 +79,7 @@ def test_the_errors_are_those_of_the_written_fields(workshop, solved):
 
 def test_without_the_full_model_the_fields_are_the_atlas_s(artifact, pressure, tmp_path):
     solve(artifact, POSITION, pressure, vtu=tmp_path / "out.vtu")
-    atlas, fields = Atlas.load(artifact), meshio.read(tmp_path / "out.vtu").point_data
+    atlas, fields = ReducedModel.load(artifact), meshio.read(tmp_path / "out.vtu").point_data
     solution = atlas.solve(POSITION, pressure)
     assert list(fields) == ["displacement", "von_mises", "load", "clamped"]
     np.testing.assert_allclose(fields["displacement"], atlas.displacement(solution), atol=1e-6)

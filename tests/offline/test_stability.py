@@ -6,11 +6,22 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from offline.full_model import NoEquilibrium
-from offline.methods.method import Case
-from offline.scenes import find_scene
-from offline.studies import stability as study
-from offline.studies.stability import (
+from palpate.offline.fem.model import NoEquilibrium
+from palpate.offline.methods.method import Case
+from palpate.offline.run.workshop import Load, Workshop
+from palpate.offline.scenes import find_scene
+from palpate.offline.studies import stability as study
+from palpate.offline.studies.hard_cases import (
+    CONTROL,
+    HYSTERESIS,
+    LOWERED,
+    SEVERAL,
+    TELEPORT,
+    Trial,
+    Truth,
+    press,
+)
+from palpate.offline.studies.stability import (
     ANOTHER,
     ANOTHER_FLAGGED,
     ARTIFACT,
@@ -24,17 +35,6 @@ from offline.studies.stability import (
     WRONG_FLAGGED,
     stability,
 )
-from offline.studies.stressors import (
-    CONTROL,
-    HYSTERESIS,
-    LOWERED,
-    SEVERAL,
-    TELEPORT,
-    Trial,
-    Truth,
-    press,
-)
-from offline.workshop import Load, Workshop
 
 CASES, SNAPSHOTS, SEED = 3, 50, 1
 

@@ -5,12 +5,12 @@ import csv
 import numpy as np
 import pytest
 
-from offline.studies import courses
-from offline.studies.courses import CONTROL, trials
-from offline.studies.stability import OUTCOMES, REFUSED, RIGHT, RIGHT_FLAGGED
-from offline.studies.stability_in_time import ARTIFACT, STEPS, TIP, stability_in_time
-from shared.atlas import Atlas
-from shared.errors import QueryError
+from palpate.offline.studies import courses
+from palpate.offline.studies.courses import CONTROL, trials
+from palpate.offline.studies.stability import OUTCOMES, REFUSED, RIGHT, RIGHT_FLAGGED
+from palpate.offline.studies.stability_in_time import ARTIFACT, STEPS, TIP, stability_in_time
+from palpate.shared.errors import QueryError
+from palpate.shared.model import ReducedModel
 
 CASES, MANY, SEED = 1, 100, 1
 LONGEST = "held for 100 s, 100 steps"
@@ -76,7 +76,7 @@ def test_every_cell_counts_its_cases(rows):
 
 
 def test_brief_histories_end_when_and_where_the_long_ones_do(visco_artifact):
-    atlas = Atlas.load(visco_artifact)
+    atlas = ReducedModel.load(visco_artifact)
     for tip in (False, True):
         found = trials(atlas, tip, CASES, SEED, MANY)
         long = [trial for own in found.values() for trial in own if trial.brief]

@@ -4,9 +4,9 @@ import csv
 
 import pytest
 
-from offline.studies import mesh_error, newton_step
-from offline.studies.continuity import tip_continuity
-from offline.studies.mesh_error import Discretisation
+from palpate.offline.studies import mesh_error, newton_step
+from palpate.offline.studies.continuity import tip_continuity
+from palpate.offline.studies.mesh_error import Discretisation
 
 
 def test_the_force_on_a_gliding_tip_jumps_no_more_than_the_full_models(artifact):

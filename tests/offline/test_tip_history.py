@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from offline.full_model import FullModel, TipContact
-from offline.mesh import build_mesh
-from offline.scenes import find_scene
-from shared.tip import tip_of, tip_surface
+from palpate.offline.fem.mesh import build_mesh
+from palpate.offline.fem.model import FullModel, TipContact
+from palpate.offline.scenes import find_scene
+from palpate.shared.mechanics.sphere import tip_of, tip_surface
 
 PRONY = ((0.25, 0.1), (0.25, 1.0))
 YOUNG, POISSON, RADIUS = 15.0, 0.45, 2.0

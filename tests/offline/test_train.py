@@ -12,20 +12,20 @@ import h5py
 import numpy as np
 import pytest
 
-from offline import scenes
-from offline.train import train
-from offline.workshop import Workshop
-from shared.artifact import read_artifact
-from shared.atlas import Atlas
-from shared.reduced import query
-from shared.scene import SceneError
+from palpate.offline import scenes
+from palpate.offline.run.workshop import Workshop
+from palpate.offline.train import train
+from palpate.shared.artifact import read_artifact
+from palpate.shared.model import ReducedModel
+from palpate.shared.reduced.press import query
+from palpate.shared.scene import SceneError
 
 STAGES = ("load range", "Ritz vectors", "local models", "full solutions")
 
 
 def start(path):
     """Start `palpate train quick` as a group of processes that can be killed together."""
-    code = "from shared.cli import main; main()"
+    code = "from palpate.shared.cli import main; main()"
     return subprocess.Popen(
         [sys.executable, "-c", code, "train", "quick", "--out", path],
         stdout=subprocess.DEVNULL,
@@ -84,7 +84,7 @@ def test_a_resumed_run_makes_the_artifact_of_an_undisturbed_one(resumed, artifac
         for name in ("nodes", "elements", "clamped", "patch_centres", "patch_region"):
             np.testing.assert_array_equal(found[name][()], expected[name][()], err_msg=name)
     # the sparse solver's last digit depends on where its memory lies, and picks other points
-    found, expected = Atlas.load(resumed[0]), Atlas.load(artifact)
+    found, expected = ReducedModel.load(resumed[0]), ReducedModel.load(artifact)
     for x in expected.models.centres[:5]:
         pressure = 0.8 * expected.solve(x, 0.0).pressure_limit
         u = expected.displacement(expected.solve(x, pressure))
@@ -98,12 +98,12 @@ def test_nothing_is_left_beside_the_artifact(resumed):
 
 
 def test_one_compilation_serves_training_and_queries(artifact):
-    atlas = Atlas.load(artifact)
+    atlas = ReducedModel.load(artifact)
     workshop = Workshop.of_artifact(read_artifact(artifact))
     workshop.compile_query()
     atlas.solve(atlas.surface.vertices[0], 0.1)
     by_columns = np.asfortranarray(atlas.limits)
-    other = Atlas(
+    other = ReducedModel(
         atlas.name, atlas.scene, {}, atlas.body, atlas.surface, by_columns, atlas.models,
         atlas.estimators,
     )  # fmt: skip
@@ -112,7 +112,7 @@ def test_one_compilation_serves_training_and_queries(artifact):
 
 
 def test_the_mesh_error_is_that_of_other_meshes(artifact):
-    report = Atlas.load(artifact).info["mesh_error"]
+    report = ReducedModel.load(artifact).info["mesh_error"]
     own, other = report["elements"]["hex20"], report["elements"]["hex8-mean-dilatation"]
     assert report["reference_dofs"] >= 5 * own["dofs"]
     assert other["dofs"] == pytest.approx(own["dofs"], rel=0.3)

@@ -2,8 +2,8 @@ import meshio
 import numpy as np
 import pytest
 
-from offline.vtu import write_vtu
-from shared.elements import HEX20_NODES, HEX_CORNERS
+from palpate.offline.vtu import write_vtu
+from palpate.shared.geometry.elements import HEX20_NODES, HEX_CORNERS
 
 
 @pytest.mark.parametrize(

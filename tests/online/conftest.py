@@ -7,14 +7,14 @@ import pytest
 import uvicorn
 from starlette.testclient import TestClient
 
-from online.app import create_app
-from online.serving import Protocol
-from online.settings import Settings
-from online.store import Store
-from online.websocket import OPTIONS
-from shared.errors import PalpateError
+from palpate.online.serve.app import create_app
+from palpate.online.serve.process import Protocol
+from palpate.online.serve.settings import Settings
+from palpate.online.serve.store import Store
+from palpate.online.session.websocket import OPTIONS
+from palpate.shared.errors import PalpateError
 
-from .fake_atlas import FakeAtlas
+from .fake_model import FakeModel
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def serve(fake_store, tmp_path):
 @pytest.fixture
 def client(serve):
     """Return an in-process client of a service with one toy scene and one refused file."""
-    with serve(toy=FakeAtlas(), broken=PalpateError("broken.h5: truncated")) as client:
+    with serve(toy=FakeModel(), broken=PalpateError("broken.h5: truncated")) as client:
         yield client
 
 
@@ -89,7 +89,7 @@ def serving(fake_store, tmp_path):
 @pytest.fixture
 def url(serving):
     """Return the address of a toy service on a real socket."""
-    with serving(toy=FakeAtlas()) as url:
+    with serving(toy=FakeModel()) as url:
         yield url
 
 

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from online import wire
-from online.negotiation import BINARY
+from palpate.online.serve import wire
+from palpate.online.serve.negotiation import BINARY
 
-from .fake_atlas import FakeAtlas
+from .fake_model import FakeModel
 
 
 def test_served_and_refused_are_listed(client):
@@ -35,7 +35,7 @@ def test_a_scene_gives_an_example_that_it_can_answer(client):
 def test_the_mesh_of_a_region(client, region):
     path = f"/scenes/toy/mesh?region={region}"
     _, arrays = wire.decode(client.get(path, headers={"accept": BINARY}).content)
-    atlas = FakeAtlas()
+    atlas = FakeModel()
     ids = atlas.surface_nodes if region == "surface" else np.arange(len(atlas.nodes))
     np.testing.assert_allclose(arrays["nodes"], atlas.nodes[ids], atol=1e-6)
     np.testing.assert_array_equal(arrays["clamped"], atlas.clamped[ids])

@@ -6,8 +6,8 @@ import schemathesis
 from hypothesis import HealthCheck, settings
 from schemathesis.specs.openapi.checks import positive_data_acceptance
 
-from online.app import create_app
-from online.settings import Settings
+from palpate.online.serve.app import create_app
+from palpate.online.serve.settings import Settings
 
 
 def description():

@@ -13,13 +13,13 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from online import frames, websocket
-from online import session as server_session
-from online.frames import Flag, Output, Request
-from online.session_client import ServiceError, Session, SessionClosed
-from online.settings import Settings
+from palpate.online.client.session import ServiceError, Session, SessionClosed
+from palpate.online.serve.settings import Settings
+from palpate.online.session import frames, websocket
+from palpate.online.session import session as server_session
+from palpate.online.session.frames import Flag, Output, Request
 
-from .fake_atlas import FakeAtlas
+from .fake_model import FakeModel
 
 PRESSED = (5.0, 5.0, 6.5)
 EVERYTHING = sum(Output) - Output.HALF
@@ -141,7 +141,7 @@ def test_a_message_too_long_ends_its_session_only(url):
 
 def test_clients_that_vanish(serving, tmp_path):
     """Half-open, reset, and hung up at once: their places are free again."""
-    with serving(Settings(tmp_path, max_sessions=4, session_idle=0.2), toy=FakeAtlas()) as url:
+    with serving(Settings(tmp_path, max_sessions=4, session_idle=0.2), toy=FakeModel()) as url:
         with witness(url):
             silent = [Session(url, "toy") for _ in range(3)]
             for _ in range(20):
@@ -171,7 +171,7 @@ def places_come_free(url):
 
 def test_a_client_that_does_not_read_is_cut(serving, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(server_session, "PATIENCE", 0.2)
-    atlas = FakeAtlas(divisions=40)  # replies of 27 KB
+    atlas = FakeModel(divisions=40)  # replies of 27 KB
     with serving(Settings(tmp_path, max_sessions=2), toy=atlas) as url, witness(url):
         with Session(url, "toy") as slow:
             slow._socket.settimeout(10.0)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from online import wire
-from online.negotiation import BINARY, MSGPACK
-from online.settings import Settings
+from palpate.online.serve import wire
+from palpate.online.serve.negotiation import BINARY, MSGPACK
+from palpate.online.serve.settings import Settings
 
-from .fake_atlas import FakeAtlas
+from .fake_model import FakeModel
 
 QUERY = {
     "contacts": [{"position": [4.0, 5.0, 6.0], "pressure": 4.0, "direction": [0.0, 1.0, -2.0]}]
@@ -71,7 +71,7 @@ def test_all_formats_hold_the_same_fields_in_the_order_of_the_mesh(client, regio
         ].items()
     }
     mesh = client.get(f"/scenes/toy/mesh?region={region}").json()["fields"]
-    atlas = FakeAtlas()
+    atlas = FakeModel()
     expected = atlas.displacement(atlas.solve(**QUERY["contacts"][0]), region)
     assert len(mesh["nodes"]) == len(expected)
     for fields in (from_json, from_binary, from_msgpack):
@@ -109,7 +109,7 @@ def test_the_header_tells_where_the_time_went(client):
 
 
 def test_a_load_without_equilibrium_is_refused(serve):
-    with serve(toy=FakeAtlas(collapse=5.0)) as client:
+    with serve(toy=FakeModel(collapse=5.0)) as client:
         body = json.dumps({"contacts": [{"position": [5, 5, 5], "pressure": 6}]})
         response = client.post(
             "/scenes/toy/solve", content=body, headers={"content-type": "application/json"}
@@ -127,7 +127,7 @@ def test_a_load_without_equilibrium_is_refused(serve):
 @pytest.mark.parametrize("accept", ["application/json", BINARY, MSGPACK])
 @pytest.mark.parametrize("region", ["none", "surface", "all"])
 def test_nan_never_leaves(serve, accept, region):
-    atlas = FakeAtlas()
+    atlas = FakeModel()
     with serve(toy=atlas) as client:
         atlas.poison = True
         response = client.post(
@@ -138,7 +138,7 @@ def test_nan_never_leaves(serve, accept, region):
 
 
 def test_fields_too_large_for_json_are_refused_in_json_only(serve, tmp_path):
-    with serve(Settings(tmp_path, max_json_numbers=1000), toy=FakeAtlas()) as client:
+    with serve(Settings(tmp_path, max_json_numbers=1000), toy=FakeModel()) as client:
         solve(client, region="surface")
         solve(client, BINARY, region="all")
         response = client.post("/scenes/toy/solve", json={**QUERY, "region": "all"})
@@ -148,7 +148,7 @@ def test_fields_too_large_for_json_are_refused_in_json_only(serve, tmp_path):
 
 
 def test_a_bug_is_answered_without_details_and_raised_on(serve):
-    atlas = FakeAtlas()
+    atlas = FakeModel()
     with serve(toy=atlas) as client:
         atlas.solve = None
         response = client.post("/scenes/toy/solve", json=QUERY)

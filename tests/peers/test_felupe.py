@@ -12,12 +12,12 @@ import pytest
 from felupe.math import cdya_ik, cdya_il, det, dya, identity, inv, transpose
 from scipy.sparse.linalg import splu
 
-from offline.full_model import FullModel
-from offline.mesh import build_mesh
-from offline.scenes import find_scene
-from offline.surface_mesh import accessible_surface
-from shared.endoscope import footprint
-from shared.quadrature import surface_quadrature
+from palpate.offline.fem.mesh import build_mesh
+from palpate.offline.fem.model import FullModel
+from palpate.offline.fem.surface import accessible_surface
+from palpate.offline.scenes import find_scene
+from palpate.shared.geometry.quadrature import surface_quadrature
+from palpate.shared.mechanics.footprint import footprint
 
 STEPS = 8
 

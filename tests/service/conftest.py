@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import pytest
 
-PALPATE = [sys.executable, "-c", "from shared.cli import main; main()"]
+PALPATE = [sys.executable, "-c", "from palpate.shared.cli import main; main()"]
 
 
 class Server:

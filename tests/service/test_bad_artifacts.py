@@ -5,7 +5,7 @@ import shutil
 import h5py
 import pytest
 
-from online.client import Client
+from palpate.online.client.http import Client
 
 pytestmark = pytest.mark.service
 

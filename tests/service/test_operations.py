@@ -11,9 +11,9 @@ from contextlib import ExitStack
 
 import pytest
 
-from online.client import Client
-from online.loadtest.run import Plan, run
-from online.session_client import SessionClosed
+from palpate.online.client.http import Client
+from palpate.online.client.session import SessionClosed
+from palpate.online.loadtest.run import Plan, run
 
 from .conftest import PALPATE
 

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from online.client import Client, ServiceError
-from online.latency import measure
-from shared.atlas import Atlas
+from palpate.online.client.http import Client, ServiceError
+from palpate.online.loadtest.latency import measure
+from palpate.shared.model import ReducedModel
 
 pytestmark = pytest.mark.service
 
@@ -20,7 +20,7 @@ def client(server):
 
 @pytest.fixture(scope="module")
 def atlas(artifact):
-    return Atlas.load(artifact)
+    return ReducedModel.load(artifact)
 
 
 @pytest.fixture

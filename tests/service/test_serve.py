@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from online.client import Client
+from palpate.online.client.http import Client
 
 from .conftest import PALPATE
 

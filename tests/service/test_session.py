@@ -7,12 +7,12 @@ import time
 import numpy as np
 import pytest
 
-from online.client import Client
-from online.frames import Output
-from online.recording import read_recording
-from online.replay import replay
-from online.session_client import Session, SessionClosed
-from shared.atlas import Atlas
+from palpate.online.client.http import Client
+from palpate.online.client.session import Session, SessionClosed
+from palpate.online.session.frames import Output
+from palpate.online.session.recording import read_recording
+from palpate.online.session.replay import replay
+from palpate.shared.model import ReducedModel
 
 pytestmark = pytest.mark.service
 
@@ -37,7 +37,7 @@ def test_a_recorded_session_is_replayed_to_the_bit(server, artifact, tmp_path, r
                 at = position + rng.uniform([-3, -3, -1.5], [3, 3, 1])
             at = at + rng.normal(0.0, 0.03, 3)
             session.step(at, outputs=Output.STRESS if i % 50 == 0 else 0)
-    report = replay(read_recording(path), Atlas.load(artifact))
+    report = replay(read_recording(path), ReducedModel.load(artifact))
     assert report == (300, 0, None, 0.0)
 
 

@@ -5,7 +5,7 @@ import h5py
 import numpy as np
 import pytest
 
-from shared.artifact import (
+from palpate.shared.artifact import (
     FORMAT_VERSION,
     SEAL_BYTES,
     ArtifactError,

@@ -7,8 +7,8 @@ import click
 import pytest
 from click.testing import CliRunner
 
-import shared.cli
-from shared.errors import PalpateError, QueryError
+from palpate.shared import cli
+from palpate.shared.errors import PalpateError, QueryError
 
 COMMANDS = ["bench", "info", "serve", "solve", "study", "train", "validate"]
 
@@ -16,7 +16,7 @@ COMMANDS = ["bench", "info", "serve", "solve", "study", "train", "validate"]
 @pytest.fixture
 def run():
     def run(*arguments):
-        return CliRunner().invoke(shared.cli.main, list(arguments))
+        return CliRunner().invoke(cli.main, list(arguments))
 
     return run
 
@@ -52,7 +52,7 @@ def failing_command(monkeypatch):
         raise QueryError("pressure", "must be 0 to 9 kPa, not -1")
 
     entry = SimpleNamespace(load=lambda: click.Command("fail", callback=fail))
-    monkeypatch.setattr(shared.cli, "entry_points", lambda **_: [entry])
+    monkeypatch.setattr(cli, "entry_points", lambda **_: [entry])
 
 
 @pytest.mark.usefixtures("failing_command")
@@ -85,7 +85,7 @@ def test_whatever_imports_the_software_runs_on_one_blas_thread():
 def test_help_is_quick():
     """Nothing that computes is imported just to print a help text."""
     script = (
-        "import sys; from click.testing import CliRunner; from shared.cli import main\n"
+        "import sys; from click.testing import CliRunner; from palpate.shared.cli import main\n"
         "CliRunner().invoke(main, ['--help'])\n"
         "print(*{'numpy', 'numba', 'fastapi', 'h5py'} & sys.modules.keys())"
     )

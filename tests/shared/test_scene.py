@@ -5,7 +5,15 @@ import re
 import pytest
 from pydantic import ValidationError
 
-from shared.scene import Block, Extrusion, Scene, SceneError, Tolerance, load_scene, parse_scene
+from palpate.shared.scene import (
+    Block,
+    Extrusion,
+    Scene,
+    SceneError,
+    Tolerance,
+    load_scene,
+    parse_scene,
+)
 
 SLAB = """
 name = "slab"

@@ -1,18 +1,18 @@
 import numpy as np
 import pytest
 
-from offline.methods.catalogue import Snapshots, Training
-from offline.validate import random_loads, unseen_loads
-from offline.workshop import Workshop
-from shared.artifact import read_artifact
-from shared.atlas import Atlas
+from palpate.offline.methods.catalogue import Snapshots, Training
+from palpate.offline.run.workshop import Workshop
+from palpate.offline.validate.loads import random_loads, unseen_loads
+from palpate.shared.artifact import read_artifact
+from palpate.shared.model import ReducedModel
 
 SNAPSHOTS, QUERIES = 40, 4
 
 
 @pytest.fixture(scope="session")
 def atlas(artifact):
-    return Atlas.load(artifact)
+    return ReducedModel.load(artifact)
 
 
 @pytest.fixture(scope="session")

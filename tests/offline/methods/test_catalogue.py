@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from offline.methods.catalogue import BUILDERS, build
-from offline.methods.method import Case
-from offline.validate import relative
-from offline.workshop import Load
-from shared.errors import PalpateError
+from palpate.offline.methods.catalogue import BUILDERS, build
+from palpate.offline.methods.method import Case
+from palpate.offline.run.workshop import Load
+from palpate.offline.validate.loads import relative
+from palpate.shared.errors import PalpateError
 
 SIZE = 18
 

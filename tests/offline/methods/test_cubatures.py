@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from offline.methods.galerkin import Cubature, Galerkin
-from offline.methods.method import Case
+from palpate.offline.methods.galerkin import Cubature, Galerkin
+from palpate.offline.methods.method import Case
 
 MODES = 12
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from offline.methods.deim import Deim, Samples, force_modes, sample
-from offline.methods.galerkin import Cubature, Galerkin
-from offline.methods.method import Case
-from offline.validate import unseen_loads
-from offline.workshop import Load
+from palpate.offline.methods.deim import Deim, Samples, force_modes, sample
+from palpate.offline.methods.galerkin import Cubature, Galerkin
+from palpate.offline.methods.method import Case
+from palpate.offline.run.workshop import Load
+from palpate.offline.validate.loads import unseen_loads
 
 MODES = 12
 

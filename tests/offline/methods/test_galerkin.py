@@ -3,22 +3,22 @@
 import numpy as np
 import pytest
 
-from offline.full_model import FullModel
-from offline.methods.catalogue import build
-from offline.methods.galerkin import (
+from palpate.offline.fem.model import FullModel
+from palpate.offline.methods.catalogue import build
+from palpate.offline.methods.galerkin import (
     TOLERANCE,
     Cubature,
     Galerkin,
     GalerkinAtHand,
-    ReducedModel,
+    GalerkinModel,
     point_gradients,
 )
-from offline.methods.method import Case
-from offline.spaces import energy_pod
-from offline.studies.baselines import solve_galerkin
-from offline.validate import relative
-from offline.workshop import Load
-from shared.reduced import LANES
+from palpate.offline.methods.method import Case
+from palpate.offline.reduce.ritz import energy_pod
+from palpate.offline.run.workshop import Load
+from palpate.offline.studies.baselines import solve_galerkin
+from palpate.offline.validate.loads import relative
+from palpate.shared.reduced.press import LANES
 
 CLOSE = 3 * TOLERANCE
 """The residual allowed, with tissue that is at most three times softer than at rest; gradients in
@@ -119,4 +119,4 @@ def test_points_that_share_a_dilatation_are_refused(workshop):
     scene = workshop.scene
     other = FullModel(workshop.mesh, "hex8-mean-dilatation", scene.tissue.young, 0.49)
     with pytest.raises(ValueError, match="dilatation"):
-        ReducedModel(other, 4, Cubature.full(other))
+        GalerkinModel(other, 4, Cubature.full(other))

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from offline.methods.galerkin_in_time import GalerkinInTime
-from offline.methods.in_time import FullInTime
-from offline.methods.method import Case
-from offline.methods.spaces import modal, pod
-from offline.scenes import find_scene
-from offline.workshop import Load, Workshop
+from palpate.offline.methods.galerkin_in_time import GalerkinInTime
+from palpate.offline.methods.in_time import FullInTime
+from palpate.offline.methods.method import Case
+from palpate.offline.methods.spaces import modal, pod
+from palpate.offline.run.workshop import Load, Workshop
+from palpate.offline.scenes import find_scene
 
 COURSE = ((0.5, 0.02), (1.0, 0.05), (1.0, 0.3), (1.0, 2.0), (0.2, 0.01), (0.0, 0.0), (0.0, 0.5))
 """Shares of a pressure at the ends of time steps (s)."""

@@ -4,12 +4,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from offline.methods.mass_spring import POISSON, MassSpring, Springs, identify, linear_stiffness
-from offline.methods.method import Case
-from offline.methods.tetrahedra import Tetrahedra, edges_of, scaled
-from offline.scenes import find_scene
-from offline.validate import relative
-from offline.workshop import Load, Workshop
+from palpate.offline.methods.mass_spring import (
+    POISSON,
+    MassSpring,
+    Springs,
+    identify,
+    linear_stiffness,
+)
+from palpate.offline.methods.method import Case
+from palpate.offline.methods.tetrahedra import Tetrahedra, edges_of, scaled
+from palpate.offline.run.workshop import Load, Workshop
+from palpate.offline.scenes import find_scene
+from palpate.offline.validate.loads import relative
 
 YOUNG = 15.0
 POINT = np.array([4.0, 6.0, 8.0])

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.interpolate import RBFInterpolator
 
-from offline.methods.catalogue import build
-from offline.methods.method import Case
-from offline.methods.regression import Interpolant
-from offline.studies.baselines import KERNELS
-from offline.validate import relative
-from offline.workshop import Load
+from palpate.offline.methods.catalogue import build
+from palpate.offline.methods.method import Case
+from palpate.offline.methods.regression import Interpolant
+from palpate.offline.run.workshop import Load
+from palpate.offline.studies.baselines import KERNELS
+from palpate.offline.validate.loads import relative
 
 ALL = 10_000
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from offline.methods.relaxation import Stencil, invert_diagonal, relax
+from palpate.offline.methods.relaxation import Stencil, invert_diagonal, relax
 
 POINTS, FREE = 12, 9
 ENDS = np.array([(a, b) for a in range(POINTS) for b in range(a + 1, POINTS) if (a + b) % 3])

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh
 
-from offline.methods.catalogue import loads_about
-from offline.methods.method import Case
-from offline.methods.spaces import krylov, mass, modal, pod, static_derivatives
-from offline.workshop import Load
+from palpate.offline.methods.catalogue import loads_about
+from palpate.offline.methods.method import Case
+from palpate.offline.methods.spaces import krylov, mass, modal, pod, static_derivatives
+from palpate.offline.run.workshop import Load
 
 SIZE = 12
 

@@ -8,13 +8,13 @@ from scipy.sparse import lil_matrix
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
-from offline.methods.method import Case
-from offline.methods.tensor_mass import LinearTetrahedra, NonlinearTetrahedra, TensorMass
-from offline.methods.tetrahedra import Tetrahedra, gradients, scaled
-from offline.scenes import find_scene
-from offline.validate import relative
-from offline.workshop import Load, Workshop
-from shared.tissue import lame
+from palpate.offline.methods.method import Case
+from palpate.offline.methods.tensor_mass import LinearTetrahedra, NonlinearTetrahedra, TensorMass
+from palpate.offline.methods.tetrahedra import Tetrahedra, gradients, scaled
+from palpate.offline.run.workshop import Load, Workshop
+from palpate.offline.scenes import find_scene
+from palpate.offline.validate.loads import relative
+from palpate.shared.mechanics.tissue import lame
 
 YOUNG, POISSON = 15.0, 0.3
 KINDS = LinearTetrahedra, NonlinearTetrahedra

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from offline.mesh import jacobians
-from offline.methods.method import Case
-from offline.methods.tetrahedra import Tetrahedra, gradients, lattice, scaled, volumes
-from offline.scenes import find_scene
-from offline.workshop import Load, Workshop
-from shared.errors import PalpateError
+from palpate.offline.fem.mesh import jacobians
+from palpate.offline.methods.method import Case
+from palpate.offline.methods.tetrahedra import Tetrahedra, gradients, lattice, scaled, volumes
+from palpate.offline.run.workshop import Load, Workshop
+from palpate.offline.scenes import find_scene
+from palpate.shared.errors import PalpateError
 
 
 @pytest.fixture(scope="module", params=["quick", "turbinate"])

@@ -3,7 +3,7 @@ import socket
 import numpy as np
 import pytest
 
-from online.loadtest.generator import Log, drive
+from palpate.online.loadtest.generator import Log, drive
 
 
 class Echo:

@@ -1,17 +1,17 @@
 import numpy as np
 import pytest
 
-from online.client import Accessible
-from online.loadtest.paths import LIFTED, SPEED, Tip, tool_path
+from palpate.online.client.http import Accessible
+from palpate.online.loadtest.paths import LIFTED, SPEED, Tip, tool_path
 
-from ..fake_atlas import FakeAtlas
+from ..fake_model import FakeModel
 
 TIP = Tip(radius=2.0, depth=0.8)
 
 
 @pytest.fixture(scope="module")
 def surface():
-    surface = FakeAtlas().surface
+    surface = FakeModel().surface
     return Accessible(
         surface.vertices.astype(np.float32), surface.normals.astype(np.float32), surface.triangles
     )

@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
-from online.frames import Flag
-from online.loadtest.generator import ANSWERED, DROPPED, LOST, SUPERSEDED, Log, Machine
-from online.loadtest.report import (
+from palpate.online.loadtest.generator import ANSWERED, DROPPED, LOST, SUPERSEDED, Log, Machine
+from palpate.online.loadtest.report import (
     clean_windows,
     gather,
     quantiles,
@@ -11,6 +10,7 @@ from online.loadtest.report import (
     summarize_queries,
     summarize_sessions,
 )
+from palpate.online.session.frames import Flag
 
 
 def log(due, latency_ms=0.2, late_ms=0.0, outcome=ANSWERED):

@@ -6,10 +6,10 @@ import re
 import pytest
 from click.testing import CliRunner
 
-from online.commands import loadtest
-from online.loadtest.run import Plan, run
-from online.settings import Settings
-from shared.errors import PalpateError
+from palpate.online.commands import loadtest
+from palpate.online.loadtest.run import Plan, run
+from palpate.online.serve.settings import Settings
+from palpate.shared.errors import PalpateError
 
 
 @pytest.mark.parametrize("region", ["none", "all"])

@@ -5,10 +5,10 @@ import socket
 import numpy as np
 import pytest
 
-from online.frames import REPLY, REQUEST, Flag, decode_request
-from online.loadtest import sessions
-from online.loadtest.generator import ANSWERED, LOST, SUPERSEDED
-from online.loadtest.sessions import Session, _frame
+from palpate.online.loadtest import sessions
+from palpate.online.loadtest.generator import ANSWERED, LOST, SUPERSEDED
+from palpate.online.loadtest.sessions import Session, _frame
+from palpate.online.session.frames import REPLY, REQUEST, Flag, decode_request
 
 POSITIONS = np.arange(15.0).reshape(5, 3)
 

@@ -1,0 +1,30 @@
+"""Palpate: soft tissue pressed in real time, by reduced finite element models."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from palpate.online.client.http import Client
+    from palpate.online.client.session import Session
+    from palpate.shared.model import ReducedModel
+
+__all__ = ["Client", "ReducedModel", "Session"]
+
+_WHERE = {
+    "Client": "palpate.online.client.http",
+    "ReducedModel": "palpate.shared.model",
+    "Session": "palpate.online.client.session",
+}
+
+if not (Path(__file__).parent / "shared").is_dir():  # a checkout without symbolic links
+    __path__.append(str(Path(__file__).parents[2]))
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for, so that a client loads no solver and a solver no client."""
+    if name not in _WHERE:
+        raise AttributeError(f"module 'palpate' has no attribute {name!r}")
+    return getattr(import_module(_WHERE[name]), name)

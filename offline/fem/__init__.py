@@ -1,0 +1,1 @@
+"""The full-order model: mesh, assembly, linear solver, equilibria."""

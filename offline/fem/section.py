@@ -1,0 +1,274 @@
+"""A cross-section: its smooth outline and a smooth map of the unit square onto it.
+
+The outline is a periodic cubic spline through the measured points. The map minimises the mean
+ratio energy (the variational form of Winslow's smoothing) of a fine grid whose nodes are uniform
+along the outer side and the two ends and slide freely along the inner side, so that the mesh lines
+leave the boundary as squarely as the shape allows. Every mesh of a section, coarse or fine, is a
+sampling of the same map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline, RectBivariateSpline
+from scipy.optimize import minimize
+
+from palpate.shared.scene import SceneError
+
+Floats = NDArray[np.float64]
+
+# Grids on which the map is found. The last is fine enough that its cubic interpolation error
+# (microns) is far below the resolution of any medical image.
+LEVELS = ((18, 3), (36, 6), (72, 12))
+
+
+def read_outline(path: Path) -> Floats:
+    """Read a closed outline from a CSV file with one header line.
+
+    Parameters
+    ----------
+    path : Path
+        Two columns, x and z in mm; the last point is joined to the first.
+
+    Returns
+    -------
+    points : ndarray, shape (n, 2), mm
+        The outline, clockwise when x points right and z up.
+
+    Raises
+    ------
+    SceneError
+        If the file cannot be read, has fewer than 8 points, repeats one or crosses itself.
+    """
+    try:
+        points = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise SceneError(f"geometry.section: {path} cannot be read: {error}") from error
+    if points.ndim != 2 or points.shape[1] != 2 or len(points) < 8 or not np.isfinite(points).all():
+        raise SceneError(f"geometry.section: {path} must hold at least 8 rows of finite x, z")
+    if (np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1) == 0).any():
+        raise SceneError(f"geometry.section: {path} repeats a point")
+    crossing = _first_crossing(points)
+    if crossing is not None:
+        raise SceneError(
+            "geometry.section: {} crosses itself between points {} and {}".format(path, *crossing)
+        )
+    return points if polygon_area(points) < 0 else points[::-1]
+
+
+def polygon_area(points: Floats) -> float:
+    """Signed area of a closed polygon, shape (n, 2); mm², positive if counter-clockwise."""
+    after = np.roll(points, -1, axis=0)
+    return float(0.5 * np.sum(_cross(points, after)))
+
+
+def _first_crossing(points: Floats) -> tuple[int, int] | None:
+    """Find the first two edges of a closed polygon that cross, if any do."""
+    a, b = points, np.roll(points, -1, axis=0)
+    # Two edges cross where each separates the other's ends.
+    side_a = _cross((b - a)[:, None], a[None] - a[:, None])
+    side_b = _cross((b - a)[:, None], b[None] - a[:, None])
+    separates = side_a * side_b < 0
+    found = np.argwhere(np.triu(separates & separates.T))
+    return (int(found[0, 0]), int(found[0, 1])) if len(found) else None
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    cross: Floats = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return cross
+
+
+@dataclass(frozen=True)
+class SectionMap:
+    """A smooth map of the unit square (u, v) onto a section.
+
+    u runs from the lip (0) to the tip (1), v from the inner (0) to the outer side (1).
+    """
+
+    x: RectBivariateSpline
+    z: RectBivariateSpline
+
+    def __call__(self, u: ArrayLike, v: ArrayLike) -> Floats:
+        """Points (..., 2) mm of the section for parameters u, v of equal shape."""
+        return np.stack([self.x(u, v, grid=False), self.z(u, v, grid=False)], axis=-1)
+
+
+def map_section(points: Floats, corners: ArrayLike) -> SectionMap:
+    """Find the map of the unit square onto the inside of an outline.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, 2), mm
+        Clockwise outline.
+    corners : array, shape (4, 2), mm
+        Where (u, v) = (0, 1), (1, 1), (1, 0), (0, 0) go; moved to the nearest outline point.
+
+    Raises
+    ------
+    SceneError
+        If the corners are off the outline or out of order, or leave the grid folded.
+
+    Notes
+    -----
+    Minimises the sum of (|a|² + |b|²) / (2 det(a, b)) over the four corners of every grid cell, a
+    and b being its edges scaled by the mean cell size. As cells may be folded at first, det stands
+    for (det + sqrt(det² + ε²)) / 2 with ε going down (Escobar et al., Comput. Methods Appl. Mech.
+    Eng. 192, 2003). The coarser levels only serve to start the finest well.
+    """
+    boundary = _Boundary(points, corners)
+    u, v = _uniform(LEVELS[0])
+    slid = boundary.inner * u[1:-1]
+    grid = boundary.blend(u, v, slid)
+    for level in LEVELS:
+        refined = _uniform(level)
+        grid = np.stack(
+            [RectBivariateSpline(u, v, grid[..., i])(*refined) for i in (0, 1)], axis=-1
+        )
+        slid = CubicSpline(u, [0.0, *slid, boundary.inner])(refined[0])[1:-1]
+        u, v = refined
+        for epsilon in (1.0, 0.1, 0.01) if level is LEVELS[0] else (0.01,):
+            grid, slid = _smooth(boundary, grid, slid, epsilon)
+    if _mean_ratio(grid, boundary.scale(grid), epsilon)[2] <= 0:
+        raise SceneError("geometry.corners: this split of the outline leaves a folded mesh")
+    return SectionMap(*(RectBivariateSpline(u, v, grid[..., i]) for i in (0, 1)))
+
+
+class _Boundary:
+    """A smooth outline cut into four sides.
+
+    Attributes
+    ----------
+    outer, tip, inner, lip : float, mm
+        Arc lengths of the sides.
+    """
+
+    def __init__(self, points: Floats, corners: ArrayLike) -> None:
+        closed = np.vstack([points, points[:1]])
+        arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+        self._curve = CubicSpline(arc, closed, bc_type="periodic")
+        dense = np.linspace(0.0, arc[-1], 40 * len(points), endpoint=False)
+        gaps = np.linalg.norm(np.asarray(corners)[:, None] - self._curve(dense)[None], axis=2)
+        if (gaps.min(axis=1) > 0.02 * arc[-1]).any():
+            raise SceneError("geometry.corners: must lie on the outline of the section")
+        self._starts = dense[gaps.argmin(axis=1)]
+        sides = np.diff(self._starts, append=self._starts[0]) % arc[-1]
+        if not np.isclose(sides.sum(), arc[-1]) or sides.min() < 0.01 * arc[-1]:
+            raise SceneError("geometry.corners: must lie apart and go clockwise round the section")
+        self.outer, self.tip, self.inner, self.lip = sides
+
+    def scale(self, grid: Floats) -> Floats:
+        """Inverse of a grid's mean cell size along u and v, shape (2,), 1/mm."""
+        cells = np.array(grid.shape[:2]) - 1
+        return 2 * cells / np.array([self.outer + self.inner, self.tip + self.lip])
+
+    def place(self, grid: Floats, slid: Floats) -> None:
+        """Put the rim of a grid onto the outline.
+
+        Parameters
+        ----------
+        grid : ndarray, shape (nu + 1, nv + 1, 2), mm
+            Overwritten on its rim.
+        slid : ndarray, shape (nu - 1,), mm
+            Where its inner nodes lie along the inner side, counted from the lip.
+        """
+        u, v = _uniform((grid.shape[0] - 1, grid.shape[1] - 1))
+        grid[:, -1] = self._at(0, self.outer * u)
+        grid[-1] = self._at(1, self.tip * (1 - v))
+        grid[0] = self._at(3, self.lip * v)
+        grid[1:-1, 0] = self._at(3, -slid)
+
+    def blend(self, u: Floats, v: Floats, slid: Floats) -> Floats:
+        """Coons patch over the outline, shape (nu + 1, nv + 1, 2), mm."""
+        grid = np.empty((len(u), len(v), 2))
+        self.place(grid, slid)
+        u, v = u[:, None, None], v[None, :, None]
+        along = (1 - v) * grid[:, :1] + v * grid[:, -1:]
+        across = (1 - u) * grid[:1] + u * grid[-1:]
+        lip = (1 - v) * grid[:1, :1] + v * grid[:1, -1:]
+        tip = (1 - v) * grid[-1:, :1] + v * grid[-1:, -1:]
+        blend: Floats = along + across - (1 - u) * lip - u * tip
+        return blend
+
+    def slope(self, slid: Floats) -> Floats:
+        """How the inner nodes move as they slide, shape (nu - 1, 2)."""
+        return -self._at(3, -slid, derivative=1)
+
+    def _at(self, corner: int, distance: Floats, derivative: int = 0) -> Floats:
+        arc = (self._starts[corner] + distance) % self._curve.x[-1]
+        at: Floats = self._curve(arc, derivative)
+        return at
+
+
+def _uniform(cells: tuple[int, int]) -> tuple[Floats, Floats]:
+    """Grid lines u (cells[0] + 1,) and v (cells[1] + 1,) of the unit square."""
+    return np.linspace(0.0, 1.0, cells[0] + 1), np.linspace(0.0, 1.0, cells[1] + 1)
+
+
+def _smooth(
+    boundary: _Boundary, grid: Floats, slid: Floats, epsilon: float
+) -> tuple[Floats, Floats]:
+    """Move a grid's inside, and its inner side's nodes along that side, to the least energy."""
+    grid, inside, scale = grid.copy(), grid[1:-1, 1:-1].shape, boundary.scale(grid)
+
+    def unpack(unknown: Floats) -> Floats:
+        slid, free = np.split(unknown, [len(grid) - 2])
+        boundary.place(grid, slid)
+        grid[1:-1, 1:-1] = free.reshape(inside)
+        return slid
+
+    def objective(unknown: Floats) -> tuple[float, Floats]:
+        slope = boundary.slope(unpack(unknown))
+        energy, gradient, _ = _mean_ratio(grid, scale, epsilon)
+        sliding = np.sum(gradient[1:-1, 0] * slope, axis=1)
+        return energy, np.concatenate([sliding, gradient[1:-1, 1:-1].ravel()])
+
+    found = minimize(
+        objective,
+        np.concatenate([slid, grid[1:-1, 1:-1].ravel()]),
+        jac=True,
+        method="L-BFGS-B",
+        options={"maxiter": 5000, "maxcor": 30, "ftol": 1e-9},
+    )
+    slid = unpack(found.x)
+    return grid, slid
+
+
+def _mean_ratio(grid: Floats, scale: Floats, epsilon: float) -> tuple[float, Floats, float]:
+    """Mean ratio energy of a grid, its gradient, and the smallest scaled corner determinant.
+
+    Parameters
+    ----------
+    grid : ndarray, shape (nu + 1, nv + 1, 2), mm
+    scale : ndarray, shape (2,), 1/mm
+        Inverse of the wanted cell size along the two grid directions.
+    epsilon : float
+        Regularisation of folded cells, > 0.
+    """
+    gradient = np.zeros_like(grid)
+    energy, smallest = 0.0, np.inf
+    low, high = slice(None, -1), slice(1, None)
+    for i in (low, high):
+        for j in (low, high):
+            # The two edges that meet in this corner of every cell.
+            a = scale[0] * (grid[high, j] - grid[low, j])
+            b = scale[1] * (grid[i, high] - grid[i, low])
+            det = _cross(a, b)
+            root = np.sqrt(det**2 + epsilon**2)
+            smallest = min(smallest, det.min())
+            safe = (det + root) / 2
+            term = (np.sum(a**2, axis=-1) + np.sum(b**2, axis=-1)) / (2 * safe)
+            pull = (term / safe * (1 + det / root) / 2)[..., None]
+            turned_a = np.stack([-a[..., 1], a[..., 0]], axis=-1)
+            turned_b = np.stack([b[..., 1], -b[..., 0]], axis=-1)
+            by_a = scale[0] * (a / safe[..., None] - pull * turned_b)
+            by_b = scale[1] * (b / safe[..., None] - pull * turned_a)
+            energy += float(term.sum())
+            gradient[high, j] += by_a
+            gradient[low, j] -= by_a
+            gradient[i, high] += by_b
+            gradient[i, low] -= by_b
+    return energy, gradient, float(smallest)

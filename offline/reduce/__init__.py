@@ -1,0 +1,1 @@
+"""From full to reduced: load ranges, bases, cubature, local models."""

@@ -1,0 +1,201 @@
+"""Empirical cubature: few quadrature points of positive weight that do the work of all.
+
+The reduced internal force is a sum over quadrature points ``sum_q w_q G_q^T P_q``.  Points ``c``
+and weights ``x_c > 0`` are chosen by non-negative least squares so that ``sum_c x_c G_c^T P_c``
+equals the whole sum in training states, and the volume too (Hernandez, Caicedo & Ferrer 2017; An,
+Kim & James 2008).  States off equilibrium belong to the training: in equilibrium the sum is the
+load, whatever the tissue does, and says little about the points.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import qr_delete, solve, solve_triangular
+
+from palpate.shared.reduced.press import LANES, nonlinear_stress
+from palpate.shared.reduced.press_in_time import add_past_stress
+
+Array = NDArray[np.float64]
+
+EXACT = 1e-9
+"""Relative residual that needs no further point."""
+
+STATES = 32
+"""States whose stresses are held at once."""
+
+
+def compress(
+    contributions: NDArray[np.floating[Any]], size: int, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Replace many equations by few of the same least squares (randomised range finder).
+
+    Parameters
+    ----------
+    contributions : ndarray, shape (q, r)
+        Contribution of each point (row) to each sum (column).
+    size : int
+        Equations to keep.
+
+    Returns
+    -------
+    A : ndarray, shape (size, q)
+        Equations: ``|A x|`` is ``|contributions.T x|`` but for what ``size`` directions of ``x``
+        do not catch.
+    b : ndarray, shape (size,)
+        Their sums over all points.
+    """
+    noise = rng.standard_normal((contributions.shape[1], size))
+    Q = np.linalg.qr(contributions @ noise.astype(contributions.dtype))[0]
+    B = contributions.T @ Q
+    A = np.asarray(np.linalg.qr(B, mode="r"), dtype=float) @ Q.T
+    return A, A.sum(axis=1)
+
+
+def nonnegative(A: Array, b: Array, most: int) -> tuple[NDArray[np.int64], Array]:
+    """Sparse non-negative solution of ``A x ~ b`` (Lawson & Hanson 1974, stopped early).
+
+    Parameters
+    ----------
+    A : ndarray, shape (r, q)
+    b : ndarray, shape (r,)
+    most : int
+        Largest number of points.
+
+    Returns
+    -------
+    chosen : ndarray, shape (c,)
+        Columns with positive weight, ascending.
+    weights : ndarray, shape (c,)
+    """
+    norms = np.linalg.norm(A, axis=0)
+    usable = norms > 1e-12 * norms.max()
+    chosen: list[int] = []
+    x = np.empty(0)
+    Q, R = np.empty((len(b), 0)), np.empty((0, 0))
+    residual = b.copy()
+    target = EXACT * np.linalg.norm(b)
+    blocked = np.zeros(A.shape[1], dtype=bool)
+    while np.linalg.norm(residual) > target and len(chosen) < min(most, len(b)):
+        gain = np.where(usable & ~blocked, A.T @ residual / np.maximum(norms, 1e-300), -np.inf)
+        gain[chosen] = -np.inf
+        best = int(np.argmax(gain))
+        if not gain[best] > 0:
+            break
+        Q, R = _append(Q, R, A[:, best])
+        chosen.append(best)
+        x = np.append(x, 0.0)
+        while True:
+            z = solve_triangular(R, Q.T @ b)
+            if (z > 0).all():
+                x = z
+                blocked[:] = False
+                break
+            falling = z <= 0
+            step = np.min(x[falling] / (x[falling] - z[falling]))
+            x = x + step * (z - x)
+            dropped = int(np.flatnonzero(falling)[np.argmin(x[falling])])
+            if dropped == len(chosen) - 1 and step == 0.0:
+                blocked[best] = True  # would leave at once: try another first
+            del chosen[dropped]
+            x = np.delete(x, dropped)
+            Q, R = qr_delete(Q, R, dropped, which="col", check_finite=False)
+            Q, R = Q[:, : len(chosen)], R[: len(chosen)]
+        residual = b - A[:, chosen] @ x
+    order = np.argsort(chosen)
+    return np.array(chosen, dtype=np.int64)[order], x[order]
+
+
+def _append(Q: Array, R: Array, column: Array) -> tuple[Array, Array]:
+    """Thin QR with one more column (twice-iterated Gram-Schmidt)."""
+    r = Q.T @ column
+    rest = column - Q @ r
+    again = Q.T @ rest
+    rest -= Q @ again
+    norm = np.linalg.norm(rest)
+    k = R.shape[0]
+    grown = np.zeros((k + 1, k + 1))
+    grown[:k, :k] = R
+    grown[:k, k] = r + again
+    grown[k, k] = norm
+    return np.column_stack([Q, rest / norm]), grown
+
+
+def point_forces(
+    gradients: NDArray[np.float32],
+    weights: Array,
+    mu: Array,
+    lam: Array,
+    state: Array,
+    past: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None,
+) -> NDArray[np.float32] | None:
+    """Nonlinear force of every point (c, r) at a state (r,) of a local model; None if inverted.
+
+    Parameters
+    ----------
+    gradients : ndarray, shape (c, 9, r), 1/mm
+        Of the modes; c is a multiple of ``LANES``.
+    weights : ndarray, shape (c,), mm^3
+    mu, lam : ndarray, shape (c,), kPa
+    state : ndarray, shape (r,)
+    past : (ndarray, ndarray), shape (6 c,), optional
+        Of tissue that remembers: ``B`` and ``S`` of ``reduced.press_in_time.predict_points``.
+    """
+    H = np.dot(gradients, state.astype(np.float32)).reshape(-1, LANES, 9)
+    rows = np.ascontiguousarray(H.transpose(0, 2, 1)).reshape(-1)
+    P, (J, trace, linear) = np.empty_like(rows), np.empty((3, len(gradients)))
+    nonlinear_stress(rows, weights, mu, lam, J, trace, linear, P)
+    if not J.min() > 0.0:
+        return None
+    if past is not None:
+        add_past_stress(rows, weights, mu, J, *past, 0.0, trace, P)
+    points = P.reshape(-1, 9, LANES).transpose(0, 2, 1).reshape(-1, 1, 9)
+    return (points @ gradients)[:, 0]
+
+
+def linear_forces(
+    gradients: NDArray[np.float32], weights: Array, mu: Array, lam: Array, states: Array
+) -> NDArray[np.float32]:
+    """Linear elasticity's force of every point (c, r k) at states (k, r); see ``point_forces``."""
+    H = (gradients @ states.T.astype(np.float32)).reshape(len(gradients), 3, 3, -1)
+    P = mu[:, None, None, None] * (H + H.swapaxes(1, 2))
+    P += (lam[:, None] * np.trace(H, axis1=1, axis2=2))[:, None, None] * np.eye(3)[..., None]
+    P = (weights[:, None, None, None] * P).reshape(len(gradients), 9, -1).astype(np.float32)
+    return np.asarray((gradients.swapaxes(1, 2) @ P).reshape(len(gradients), -1))
+
+
+def nonlinear_forces(
+    rows: NDArray[np.float32], weights: Array, mu: Array, lam: Array, states: Array
+) -> Array:
+    """Nonlinear force of all points together (k, r) at states (k, r); NaN where inverted.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (r, 9 c), 1/mm
+        Gradients of the modes in tiles.
+    weights : ndarray, shape (c,), mm^3
+    mu, lam : ndarray, shape (c,), kPa
+    states : ndarray, shape (k, r)
+    """
+    forces = np.empty(states.shape)
+    J, trace, linear = np.empty((3, len(weights)))
+    for start in range(0, len(states), STATES):
+        some = slice(start, start + STATES)
+        H = states[some].astype(np.float32) @ rows
+        P = np.empty_like(H)
+        for h, p in zip(H, P, strict=True):
+            nonlinear_stress(h, weights, mu, lam, J, trace, linear, p)
+            if not J.min() > 0.0:
+                p[:] = np.nan
+        forces[some] = P @ rows.T
+    return forces
+
+
+def damped_fit(A: Array, B: Array, damping: float = 1e-4) -> Array:
+    """Least squares ``A X ~ B``, each column of A scaled to one and damped."""
+    scale = np.sqrt(np.mean(A**2, axis=0)) + 1e-300
+    A = A / scale
+    normal = A.T @ A + damping**2 * len(A) * np.eye(A.shape[1])
+    return np.asarray(solve(normal, A.T @ B, assume_a="pos")) / scale[:, None]

@@ -1,0 +1,202 @@
+"""Where tissue gives way within its load range: the range ends before that.
+
+Near a fold of the load path a small error of the force is a large one of the displacement, and
+between the folds of the full and of the reduced model the two lie on different branches: the one
+kind of answer that is converged, in range and wrong.  The reduced model is quick enough to be
+pressed everywhere, in all directions and a little beyond the range, and shows where its own path
+turns; the full model's does so close by.
+
+Under the rigid tip a free edge can lie on either side of it, and slips off to the other as the tip
+slides on.  There one position has several answers, and which is the right one hangs on the way that
+the tip came: reduced and full model need not part from the same one at the same step.  The reduced
+model is asked everywhere whether its answers depend on the way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from tqdm import tqdm
+
+from palpate.offline.reduce.sampling import cone, random_points_and_rim, tangents
+from palpate.shared.errors import QueryError
+from palpate.shared.mechanics.footprint import TIP_DEPTH, pressure_limit
+from palpate.shared.model import ReducedModel
+from palpate.shared.reduced.touch import Touch
+
+Array = NDArray[np.float64]
+
+PATHS_PER_PATCH = 16
+
+SHARES = np.linspace(0.6, 1.1, 11)
+"""Of the limit at which each path is solved."""
+
+SUDDEN = 1.0
+"""Growth of the exponent of displacement over pressure from one step to the next: softening tissue
+has up to .6, a jump by 5 % of the displacement 1."""
+
+MARGIN = 1.1
+"""Limit at which the reduced model gives way over the one it gets: the full one may do so before
+that."""
+
+REACH = 2.0
+"""Distance (mm) from where tissue gives way up to which the limit is lowered."""
+
+CLOSER = 24
+"""More paths near each that gives way."""
+
+CONTACTS_PER_PATCH, CONTACTS_CLOSER = 2, 4
+"""Contacts of the tip, and more of them near each whose answer depends on the way."""
+
+DEPTH_SHARES = np.linspace(1.0, 0.1, 7)
+"""Of the depth limit that are tried, until one has the same answer by all ways."""
+
+WAYS, FAR, STRIDE = 4, 1.5, 0.5
+"""Ways that the tip comes sliding, their length and steps (mm)."""
+
+SAME = 0.1
+"""Difference of answers, relative to them, that is not one of equilibria."""
+
+SLIP_REACH = 1.0
+"""As ``REACH``, of a tip: half its radius."""
+
+
+class Search(NamedTuple):
+    """How a limit is lowered."""
+
+    title: str
+    field: int  # of the limits
+    first: int  # contact points
+    closer: int  # more points near each at which less is bearable
+    reach: float  # mm
+    bearable: Callable[[int, Array, Array, Array], float]
+    """Share of the limit, of the i-th point, its normal and its limits."""
+
+
+def lowered_limits(atlas: ReducedModel, rng: np.random.Generator) -> Array:
+    """The atlas's load range (v, LIMIT_FIELDS), its pressures lowered where tissue gives way."""
+
+    def bearable(i: int, x: Array, normal: Array, fields: Array) -> float:
+        direction = cone(normal, atlas.scene.endoscope.max_tilt, 1, rng, border=i % 2 == 0)[0]
+        return limit_load_share(atlas, x, direction, pressure_limit(fields, normal, direction))
+
+    count = PATHS_PER_PATCH * len(atlas.models.centres)
+    return _lowered(atlas, rng, Search("giving way", 0, count, CLOSER, REACH, bearable))
+
+
+def lowered_depths(atlas: ReducedModel, rng: np.random.Generator) -> Array:
+    """The same, depths of the tip lowered to where an answer does not depend on the way."""
+
+    def bearable(i: int, x: Array, normal: Array, fields: Array) -> float:
+        return path_independent_share(atlas, x, rng.uniform(0.0, 2.0 * np.pi))
+
+    count = CONTACTS_PER_PATCH * len(atlas.models.centres)
+    search = Search("slipping off", TIP_DEPTH, count, CONTACTS_CLOSER, SLIP_REACH, bearable)
+    return _lowered(atlas, rng, search)
+
+
+def _lowered(atlas: ReducedModel, rng: np.random.Generator, search: Search) -> Array:
+    surface, limits = atlas.surface, atlas.limits.copy()
+    vertices = cKDTree(surface.vertices)
+
+    def lacking(points: Iterator[Array] | Array, count: int) -> list[tuple[Array, float]]:
+        found = []
+        for i, point in enumerate(tqdm(points, search.title, count)):
+            x, normal, _, fields = surface.locate(point, atlas.limits)
+            share = search.bearable(i, x, normal, fields)
+            if share < 1.0:
+                found.append((x, share))
+        return found
+
+    found = lacking(random_points_and_rim(surface, search.first, rng), search.first)
+    near = [rng.choice(vertices.query_ball_point(x, search.reach), search.closer) for x, _ in found]
+    if near:
+        closer = surface.vertices[np.concatenate(near)]
+        found += lacking(closer, len(closer))
+    share = np.ones(len(limits))
+    for x, bearable in found:
+        lowered = vertices.query_ball_point(x, search.reach)
+        share[lowered] = np.minimum(share[lowered], bearable)
+    limits[:, search.field] *= share
+    return limits
+
+
+def limit_load_share(atlas: ReducedModel, x: Array, direction: Array, limit: float) -> float:
+    """Share of a pressure (kPa) up to which tissue yields gradually, with ``MARGIN``; at most 1."""
+    moved = np.full(len(SHARES), np.nan)  # where it does not converge an answer says so itself
+    for i, share in enumerate(SHARES):
+        solution = atlas.solve(x, share * limit, direction)
+        if solution.converged:
+            moved[i] = sum(weight * np.linalg.norm(wide) for _, weight, wide in solution.patches)
+    exponents = np.diff(np.log(moved)) / np.diff(np.log(SHARES))
+    sudden = np.flatnonzero(np.diff(exponents) > SUDDEN)
+    return float(SHARES[sudden[0] + 1]) / MARGIN if len(sudden) else 1.0
+
+
+def path_independent_share(atlas: ReducedModel, x: Array, turn: float = 0.0) -> float:
+    """Share of the depth limit at a contact up to which the tip's way there does not matter.
+
+    Parameters
+    ----------
+    atlas : ReducedModel
+    x : ndarray, shape (3,), mm
+        On the surface.
+    turn : float
+        Of the ways about the normal, rad.
+    """
+    for share in DEPTH_SHARES:
+        if not _depends_on_way(atlas, x, share, turn):
+            return float(share) if share == 1.0 else float(share) / MARGIN
+    return float(DEPTH_SHARES[-1]) / MARGIN
+
+
+def _depends_on_way(atlas: ReducedModel, x: Array, share: float, turn: float) -> bool:
+    """Whether a tip that comes sliding finds another equilibrium than one pressed in."""
+    pressed = atlas.touch(_over(atlas, x, share))
+    state = atlas.new_state()
+    for angle in turn + 2.0 * np.pi * np.arange(WAYS) / WAYS:
+        state.forget()
+        slid = None
+        for place in reversed(_way(atlas, x, angle)):
+            try:
+                slid = atlas.touch(_over(atlas, place, share), state)
+            except QueryError:  # in a fold the tip's centre can be below the other side
+                continue
+        if slid is not None and _apart(pressed, slid):
+            return True
+    return False
+
+
+def _over(atlas: ReducedModel, x: Array, share: float) -> Array:
+    """Centre of a tip pressed in at a point of the surface by a share of the depth limit."""
+    x, normal, _, fields = atlas.surface.locate(x, atlas.limits)
+    return x + (atlas.scene.endoscope.radius - share * fields[TIP_DEPTH]) * normal
+
+
+def _way(atlas: ReducedModel, x: Array, angle: float) -> list[Array]:
+    """Points of the surface from one point on, as far as it goes."""
+    places, normal = [x], atlas.surface.project(x)[1]
+    heading = np.array([np.cos(angle), np.sin(angle)]) @ np.array(tangents(normal))
+    for _ in range(round(FAR / STRIDE)):
+        on, normal = atlas.surface.project(places[-1] + STRIDE * heading)[:2]
+        heading = heading - heading @ normal * normal
+        size = float(np.linalg.norm(heading))
+        if size < 1e-6 or np.linalg.norm(on - places[-1]) < 0.3 * STRIDE:
+            break
+        heading /= size
+        places.append(on)
+    return places
+
+
+def _apart(one: Touch, other: Touch) -> bool:
+    """Whether answers to the same position are different equilibria, as far as they are known."""
+    if not (one.converged and other.converged):
+        return False
+    known = {k: q for k, _, q in other.patches}
+    both = [(weight, q, known[k]) for k, weight, q in one.patches if k in known]
+    away = sum(weight * np.linalg.norm(p - q) for weight, p, q in both)
+    return bool(away > SAME * sum(weight * np.linalg.norm(p) for weight, p, _ in both))

@@ -1,0 +1,128 @@
+"""Space-filling points and loads on a surface."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from palpate.shared.geometry.surface import Surface
+from palpate.shared.scene import Tolerance
+
+Array = NDArray[np.float64]
+
+CANDIDATES = 20
+"""Random candidates per point wanted, from which the farthest are taken."""
+
+
+LLOYD_SAMPLE, LLOYD_STEPS = 100, 40
+
+
+def area(surface: Surface) -> float:
+    """Area of the surface, mm^2."""
+    return float(_triangle_areas(surface).sum())
+
+
+def _triangle_areas(surface: Surface) -> Array:
+    a, b, c = np.moveaxis(surface.vertices[surface.triangles], 1, 0)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+
+
+def random_points(surface: Surface, count: int, rng: np.random.Generator) -> Array:
+    """Points uniform over the surface, (count, 3) mm."""
+    areas = _triangle_areas(surface)
+    triangle = rng.choice(len(areas), count, p=areas / areas.sum())
+    r, s = np.sqrt(rng.random(count)), rng.random(count)
+    weights = np.stack([1 - r, r * (1 - s), r * s], axis=1)
+    return np.einsum("pc,pci->pi", weights, surface.vertices[surface.triangles[triangle]])
+
+
+def random_points_and_rim(
+    surface: Surface, count: int, rng: np.random.Generator
+) -> Iterator[Array]:
+    """As ``random_points``, one by one, but one in eight, the first among them, is on the rim."""
+    points, rim = random_points(surface, count, rng), surface.rim()
+    for i, point in enumerate(points):
+        yield surface.vertices[rng.choice(rim)] if i % 8 == 0 else point
+
+
+def spread_points(surface: Surface, count: int, rng: np.random.Generator) -> Array:
+    """Points that fill the surface evenly, its rim included, (count, 3) mm.
+
+    Farthest-point sampling among the vertices and random points.
+    """
+    candidates = np.vstack([surface.vertices, random_points(surface, CANDIDATES * count, rng)])
+    return candidates[farthest(candidates, count)]
+
+
+def farthest(points: Array, count: int) -> list[int]:
+    """Indices of so many of the points (n, 3), each as far from the earlier ones as can be."""
+    chosen = [int(np.argmin(points.sum(axis=1)))]
+    distance = np.linalg.norm(points - points[chosen[0]], axis=1)
+    while len(chosen) < count:
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return chosen
+
+
+def centred_points(surface: Surface, count: int, rng: np.random.Generator) -> Array:
+    """Points whose cells on the surface are as compact as can be, (count, 3) mm.
+
+    Lloyd's relaxation of evenly spread points; unlike those, none is left on the rim.
+    """
+    points = spread_points(surface, count, rng)
+    sample = random_points(surface, LLOYD_SAMPLE * count, rng)
+    for _ in range(LLOYD_STEPS):
+        _, nearest = cKDTree(points).query(sample)
+        members = np.bincount(nearest, minlength=count)
+        sums = np.stack([np.bincount(nearest, x, minlength=count) for x in sample.T], axis=1)
+        points = np.where(members[:, None] > 0, sums / np.maximum(members, 1)[:, None], points)
+        points = np.array([surface.project(x)[0] for x in points])
+    return points
+
+
+def fewer(count: int, tolerance: Tolerance) -> int:
+    """Samples to learn from, of ``count`` for the usual tolerance.
+
+    What n samples tell is uncertain by the root of n: a looser tolerance needs fewer, but the root
+    of its looseness is all that is saved, for it may be uncertain, not wrong.
+    """
+    return math.ceil(count / math.sqrt(tolerance.looseness))
+
+
+def spacing_count(surface: Surface, spacing: float) -> int:
+    """How many points have the given mean spacing (mm) on the surface (hexagonal packing)."""
+    return max(1, round(area(surface) * 2 / (math.sqrt(3) * spacing**2)))
+
+
+def neighbours(points: Array, at: Array, radius: float) -> list[NDArray[np.int64]]:
+    """Indices of ``points`` within ``radius`` of each row of ``at``."""
+    found = cKDTree(points).query_ball_point(at, radius)
+    return [np.sort(np.array(rows, dtype=np.int64)) for rows in found]
+
+
+def cone(
+    normal: Array, tilt: float, count: int, rng: np.random.Generator, border: bool = False
+) -> Array:
+    """Unit directions (count, 3) in the cone of ``tilt`` degrees round -normal or on its border."""
+    share = np.ones(count) if border else rng.random(count)
+    cosine = 1 - share * (1 - math.cos(math.radians(tilt)))
+    sine, turn = np.sqrt(1 - cosine**2), 2 * math.pi * rng.random(count)
+    t, b = tangents(normal)
+    return -cosine[:, None] * normal + sine[:, None] * (
+        np.cos(turn)[:, None] * t + np.sin(turn)[:, None] * b
+    )
+
+
+def tangents(normal: Array) -> tuple[Array, Array]:
+    """Two unit vectors that complete ``normal`` to an orthonormal frame."""
+    i = int(np.argmin(np.abs(normal)))
+    j, k = (i + 1) % 3, (i + 2) % 3
+    across = math.hypot(normal[j], normal[k])
+    t, b = np.zeros(3), np.empty(3)
+    t[j], t[k] = normal[k] / across, -normal[j] / across  # normal x axis i
+    b[i], b[j], b[k] = -across, normal[i] * normal[j] / across, normal[i] * normal[k] / across
+    return t, b

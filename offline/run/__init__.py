@@ -1,0 +1,1 @@
+"""How training runs: tasks, workers, checkpoints."""

@@ -1,0 +1,1 @@
+"""The reduced against the full model on loads it has not seen."""

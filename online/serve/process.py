@@ -1,0 +1,247 @@
+"""From settings to a running service: one process, or several under a supervisor.
+
+The supervisor is uvicorn's. It binds the socket, starts the workers, starts a new one for each that
+dies, and passes on the signal to end. All workers accept from the one socket, so a session belongs
+to the worker that accepted it and is none of the others' business.
+"""
+
+import asyncio
+import json
+import logging
+import os
+import signal
+import sys
+import tempfile
+import threading
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+import click
+import uvicorn
+from fastapi import FastAPI, Response
+from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
+from uvicorn.supervisors.multiprocess import Multiprocess
+
+from palpate.online.serve import logs
+from palpate.online.serve.errors import Refusal
+from palpate.online.serve.guard import RECEIVED
+from palpate.online.serve.metrics import Metrics, make_table
+from palpate.online.serve.settings import Settings, is_loopback
+from palpate.online.session import realtime
+from palpate.online.session.websocket import OPTIONS
+from palpate.shared.errors import PalpateError
+
+if TYPE_CHECKING:
+    from palpate.online.serve.store import Store
+
+logger = logging.getLogger(__name__)
+
+MOST_CONNECTIONS = 900
+"""Of one worker; systems commonly allow a process 1024 files."""
+
+PATIENCE = 10.0
+"""Seconds that a client gets to send a request, or to begin its first one."""
+
+LAST_WAIT = 4.0
+"""Seconds that workers get to end."""
+
+
+def _http(response: Response) -> bytes:
+    """Write a response as it goes over the wire."""
+    head = b"".join(name + b": " + value + b"\r\n" for name, value in response.raw_headers)
+    return STATUS_LINE[response.status_code] + head + b"\r\n" + bytes(response.body)
+
+
+FULL = _http(
+    Refusal(
+        "overloaded",
+        "",
+        "The service has no place for another connection",
+        {"max_connections": MOST_CONNECTIONS},
+        {"Retry-After": "1", "Connection": "close"},
+    ).response()
+)
+"""What a client is told for whom there is no place."""
+
+
+class Protocol(HttpToolsProtocol):
+    """Uvicorn's HTTP, which also notes when it read a request, and whom it waits for.
+
+    A connection beyond `MOST_CONNECTIONS` is told so and closed, and one whose request is not
+    whole after `PATIENCE` is closed: it holds a place and memory.
+    """
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Take over a connection."""
+        super().connection_made(transport)
+        self.waiting_since: float | None = self.loop.time()
+        self.patience = self.loop.call_later(PATIENCE, self.check_patience)
+        if len(self.connections) > MOST_CONNECTIONS:
+            transport.write(FULL)
+            transport.close()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forget a connection."""
+        self.patience.cancel()
+        super().connection_lost(exc)
+
+    def on_message_begin(self) -> None:
+        """Begin a request."""
+        super().on_message_begin()
+        self.waiting_since = self.loop.time()
+        self.scope[RECEIVED] = perf_counter()  # type: ignore[literal-required]
+
+    def on_message_complete(self) -> None:
+        """End a request."""
+        super().on_message_complete()
+        self.waiting_since = None
+
+    def handle_websocket_upgrade(self) -> None:
+        """Leave a connection to its session."""
+        self.patience.cancel()
+        super().handle_websocket_upgrade()
+
+    def check_patience(self) -> None:
+        """Close the connection if its request has been coming for too long; else look again."""
+        now = self.loop.time()
+        since = now if self.waiting_since is None else self.waiting_since
+        if now - since >= PATIENCE:
+            self.transport.abort()
+        else:
+            self.patience = self.loop.call_at(since + PATIENCE, self.check_patience)
+
+
+class Supervisor(Multiprocess):
+    """Uvicorn's, but it does not wait for ever for a worker to end."""
+
+    def join_all(self) -> None:
+        """Wait for the workers; kill those that are still loading their models."""
+        end = perf_counter() + LAST_WAIT
+        for worker in self.processes:
+            worker.process.join(max(0.0, end - perf_counter()))
+            if worker.process.is_alive():
+                worker.process.kill()
+        super().join_all()
+
+
+def serve(settings: Settings, host: str, port: int, public: bool) -> None:
+    """Serve until a signal says to end.
+
+    Parameters
+    ----------
+    settings : Settings
+    host, port
+        Where to listen; port 0 takes a free one.
+    public : bool
+        Whether other machines may be served without a token.
+
+    Raises
+    ------
+    PalpateError
+        If there is nothing to serve, or everybody would be served and nobody asked for a token.
+    """
+    if not any(settings.artifacts.glob("*.h5")):
+        raise PalpateError(
+            f"no artifacts (*.h5) in {settings.artifacts}; make one with: "
+            f"palpate train turbinate --out {settings.artifacts / 'turbinate.h5'}"
+        )
+    if not settings.token and not public:
+        settings = replace(settings, hosts=_local_names(host))
+    logs.set_up(settings)
+    try:
+        _run(settings, host, port)
+    finally:
+        _leave_loading()
+
+
+def _run(settings: Settings, host: str, port: int) -> None:
+    with tempfile.TemporaryDirectory(prefix="palpate-") as directory:
+        config = _config(settings, host, port)
+        bound = config.bind_socket()
+        # From here on clients wait for a worker that is ready rather than being turned away.
+        bound.listen(config.backlog)
+        url = f"http://{f'[{host}]' if ':' in host else host}:{bound.getsockname()[1]}"
+        table = None
+        if settings.workers > 1:
+            table = Path(directory) / "metrics"
+            make_table(table, settings.workers)
+        config.app = partial(_work, settings, url, table)
+        # A server shuts down on a signal and then raises it again, for us to end cleanly.
+        for stop in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(stop, lambda *_: sys.exit(0))
+        if settings.workers > 1:
+            Supervisor(config, [bound]).run()
+        else:
+            uvicorn.Server(config).run([bound])
+
+
+def _leave_loading() -> None:
+    """End the process at once if models are still being loaded.
+
+    The interpreter's own end would wait for ever for locks of the compiler, which the thread that
+    loads holds while it is halted.
+    """
+    if any(thread.daemon for thread in threading.enumerate()):
+        logging.shutdown()
+        sys.stdout.flush()
+        os._exit(0)
+
+
+def _local_names(host: str) -> tuple[str, ...]:
+    """Names by which to serve all who ask: this machine's, if it alone can ask."""
+    if not is_loopback(host):
+        raise PalpateError(
+            f"--host {host or '(any)'} lets other machines in: set PALPATE_TOKEN, or say "
+            "--public to serve anybody"
+        )
+    return ("localhost", host)
+
+
+def _config(settings: Settings, host: str, port: int) -> uvicorn.Config:
+    return uvicorn.Config(
+        "",  # known once the socket is bound
+        factory=True,
+        host=host,
+        port=port,
+        workers=settings.workers,
+        http=Protocol,
+        log_config=None,
+        access_log=settings.access_log,
+        **OPTIONS,
+    )
+
+
+def _work(settings: Settings, url: str, table: Path | None) -> FastAPI:
+    """Make the application of one worker, in its own process."""
+    # Not before: the supervisor has no use for the models' code.
+    from palpate.online.serve.app import create_app
+
+    logs.set_up(settings)
+    # Uvicorn tells of every session that opens; that it starts and ends, the supervisor tells.
+    logging.getLogger("uvicorn.error").setLevel(logging.WARNING)
+    metrics = Metrics(table)
+
+    def greet(store: "Store") -> None:
+        if settings.realtime:
+            logger.info(realtime.enter())
+        logger.info("worker %d is ready", metrics.worker)
+        if metrics.worker == 0 and not metrics.restarted:
+            _invite(store, url)
+
+    return create_app(settings, on_ready=greet, metrics=metrics)
+
+
+def _invite(store: "Store", url: str) -> None:
+    """Print what is served and a request to try."""
+    for refused in store.refused:
+        click.echo(f"Refused {refused.reason}")
+    click.echo(f"Serving {', '.join(store.models) or 'nothing'} on {url} (API: {url}/docs)")
+    for name, model in store.models.items():
+        click.echo(
+            f"Try: curl {url}/scenes/{name}/solve -H 'Content-Type: application/json' "
+            f"-d '{json.dumps({'contacts': [model.example]})}'"
+        )
+        break

@@ -1,0 +1,422 @@
+"""What goes over the wire, for the validator and for the reader of the OpenAPI page.
+
+Units are mm, mN, kPa and s. Requests are checked against these models; answers are written straight
+from arrays (`serve.answer`), and their models below only describe them.
+"""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, field_validator
+from pydantic_core import PydanticCustomError
+
+from palpate.online.serve.errors import Refusal, invalid
+from palpate.online.session.frames import Output, Request
+
+FieldName = Literal["displacement", "von_mises"]
+Region = Literal["none", "surface", "all"]
+MeshRegion = Literal["surface", "all"]
+
+Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
+Component = Annotated[float, Field(ge=-1e3, le=1e3)]
+Position = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
+Direction = Annotated[list[Component], Field(min_length=3, max_length=3)]
+Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+
+SHORTEST_DIRECTION = 1e-3
+
+EXAMPLE_CONTACT: dict[str, JsonValue] = {
+    "position": [5.0, 5.0, 5.0],
+    "pressure": 4.0,
+    "direction": [0.1, 0.0, -1.0],
+}
+EXAMPLE: dict[str, JsonValue] = {
+    "contacts": [EXAMPLE_CONTACT],
+    "outputs": ["displacement"],
+    "region": "surface",
+}
+
+
+MOST_STEPS = 200
+"""Of a history: they keep others waiting for some 50 ms."""
+
+MOST_SNAPSHOTS = 8
+"""That a session keeps."""
+
+EXAMPLE_HISTORY: dict[str, JsonValue] = {
+    "steps": [
+        {"time": 0.1, "contact": EXAMPLE_CONTACT},
+        {"time": 1.0, "contact": EXAMPLE_CONTACT},
+        {"time": 1.1, "contact": None},
+    ],
+}
+
+
+class _Strict(BaseModel):
+    """Refuses unknown keys, NaN, infinities, and booleans or strings in place of numbers."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+
+
+class Contact(_Strict):
+    """One endoscope pressing on the tissue."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [EXAMPLE_CONTACT]})
+
+    position: Position = Field(
+        description="Where the endoscope presses, [x, y, z] mm in the undeformed body's frame. "
+        "Off the surface it is projected, up to the scene's reach."
+    )
+    pressure: float = Field(
+        ge=0,
+        le=1e6,
+        description="Peak of the pressure footprint, kPa. Above the scene's range the answer says "
+        "in_range: false; above ten times its end it is refused.",
+    )
+    direction: Direction | None = Field(
+        None,
+        description="Where the endoscope pushes, [x, y, z] of any length from 0.001 up; less than "
+        "90 degrees from the inward normal. Default: the inward normal.",
+    )
+    radius: float | None = Field(
+        None, ge=1e-2, le=1e3, description="Radius of the footprint, mm. Default: the scene's."
+    )
+
+    @field_validator("direction")
+    @classmethod
+    def _has_a_direction(cls, direction: list[float] | None) -> list[float] | None:
+        if direction is not None and sum(c * c for c in direction) < SHORTEST_DIRECTION**2:
+            raise PydanticCustomError(
+                "zero_vector", "Input should not be a zero vector", {"min_norm": SHORTEST_DIRECTION}
+            )
+        return direction
+
+
+class SolveRequest(_Strict):
+    """A load, and what to answer about it."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [EXAMPLE]})
+
+    contacts: list[Contact] = Field(
+        min_length=1, max_length=1, description="The endoscopes at work; one, for now."
+    )
+    outputs: list[FieldName] = Field(
+        ["displacement", "von_mises"], max_length=2, description="The fields to return."
+    )
+    region: Region = Field(
+        "none",
+        description="The nodes to return fields for, in the order of the mesh of that region; with "
+        "none, the answer holds the contact, the force and the trust block.",
+    )
+
+
+class Step(_Strict):
+    """What presses at a time."""
+
+    time: float = Field(ge=0, le=1e6, description="Since rest, s; no less than the step before.")
+    contact: Contact | None = Field(
+        None, description="The load then; it changed evenly since the step before. None: released."
+    )
+
+
+class HistoryRequest(_Strict):
+    """Loads over time on tissue at rest, and what to answer about their end."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [EXAMPLE_HISTORY]})
+
+    steps: list[Step] = Field(
+        min_length=1,
+        max_length=MOST_STEPS,
+        description="In order of time. Steps should be short beside the time constants of the "
+        "tissue while the load changes; two at one time are a sudden change.",
+    )
+    outputs: list[FieldName] = Field(
+        ["displacement", "von_mises"], max_length=2, description="The fields to return."
+    )
+    region: Region = Field(
+        "none", description="The nodes to return the fields of the last step for, as in solve."
+    )
+
+    @field_validator("steps")
+    @classmethod
+    def _time_goes_on(cls, steps: list[Step]) -> list[Step]:
+        times = [step.time for step in steps]
+        if times != sorted(times):
+            raise PydanticCustomError("time_order", "Times should not decrease", {"order": "time"})
+        return steps
+
+
+class SessionRequest(_Strict):
+    """A position of the tip, in the JSON mode of a session."""
+
+    seq: int = Field(0, ge=0, lt=2**32, description="The client's number of this message, echoed.")
+    client_time: float = Field(
+        0.0, description="The client's clock, s, echoed; the time of visco-elastic tissue."
+    )
+    position: Position = Field(description="Centre of the tip, [x, y, z] mm.")
+    outputs: list[Literal["coordinates", "displacement", "von_mises", "stress"]] = Field(
+        [], max_length=4, description="What is wanted beyond force and tangent."
+    )
+
+
+class SessionCommand(_Strict):
+    """A request to keep the state of a session's tissue, or to go back to one that was kept."""
+
+    snapshot: int | None = Field(None, ge=0, lt=MOST_SNAPSHOTS, description="Number to keep it by.")
+    restore: int | None = Field(None, ge=0, lt=MOST_SNAPSHOTS, description="Number to go back to.")
+
+
+_NAMES = {"": list(SolveRequest.model_fields), "contacts": list(Contact.model_fields)}
+
+
+def parse_request(body: bytes) -> SolveRequest:
+    """Make a request of its JSON text; raise `Refusal` with the field that is wrong."""
+    try:
+        return SolveRequest.model_validate_json(body)
+    except ValidationError as error:
+        details = error.errors(include_url=False, include_input=False)
+        raise invalid(details, _NAMES) from None
+
+
+_HISTORY_NAMES = {
+    "": list(HistoryRequest.model_fields),
+    "steps": [*Step.model_fields, *Contact.model_fields],
+}
+
+
+def parse_history(body: bytes) -> HistoryRequest:
+    """Make a history of its JSON text; raise `Refusal` with the field that is wrong."""
+    try:
+        return HistoryRequest.model_validate_json(body)
+    except ValidationError as error:
+        details = error.errors(include_url=False, include_input=False)
+        raise invalid(details, _HISTORY_NAMES) from None
+
+
+def parse_session_request(text: str) -> Request:
+    """Make a request frame of its JSON text; raise `Refusal` with the field that is wrong."""
+    try:
+        read = SessionRequest.model_validate_json(text)
+    except ValidationError as error:
+        details = error.errors(include_url=False, include_input=False)
+        raise invalid(details, {"": list(SessionRequest.model_fields)}) from None
+    outputs = sum(Output[name.upper()] for name in set(read.outputs))
+    x, y, z = read.position
+    return Request(read.seq, read.client_time, (x, y, z), outputs)
+
+
+def is_command(text: str) -> bool:
+    """Whether a text message is a `SessionCommand` rather than a position."""
+    return '"snapshot"' in text or '"restore"' in text
+
+
+def parse_session_command(text: str) -> tuple[bool, int]:
+    """Read a command: whether it restores, and the number; raise `Refusal` for nonsense."""
+    names = list(SessionCommand.model_fields)
+    try:
+        read = SessionCommand.model_validate_json(text)
+    except ValidationError as error:
+        details = error.errors(include_url=False, include_input=False)
+        raise invalid(details, {"": names}) from None
+    if read.snapshot is not None and read.restore is None:
+        return False, read.snapshot
+    if read.restore is not None and read.snapshot is None:
+        return True, read.restore
+    raise Refusal("invalid_value", "snapshot", "One of snapshot and restore is wanted", names)
+
+
+class ContactAnswer(BaseModel):
+    """The load that was applied."""
+
+    position: Vector = Field(description="The contact on the undeformed surface, mm.")
+    normal: Vector = Field(description="Outward unit normal there.")
+    distance: float = Field(description="How far the requested position was from there, mm.")
+    direction: Vector = Field(description="Unit vector of the push.")
+    pressure: float = Field(description="kPa")
+    radius: float = Field(description="mm")
+    pressure_limit: float = Field(description="Largest pressure trained for there, kPa.")
+
+
+class ErrorEstimate(BaseModel):
+    """Relative L2 errors against the full model that 95 % of answers stay within, as fractions.
+
+    Over a history: the largest so far, over the largest so far of the field.
+    """
+
+    displacement: float
+    von_mises: float
+
+
+class Trust(BaseModel):
+    """Whether and how far to believe the answer."""
+
+    converged: bool = Field(description="Always true: a load without equilibrium is refused.")
+    iterations: int = Field(description="Newton steps taken.")
+    in_range: bool = Field(
+        description="Whether the load is in the range the model was trained for."
+    )
+    out_of_range: list[str] = Field(description="The contact's fields that are not.")
+    error_estimate: ErrorEstimate
+    min_jacobian: float = Field(description="Smallest volume ratio met; 1 at rest, 0 is collapse.")
+
+
+class Fields(BaseModel):
+    """The fields asked for, one entry per node of the region."""
+
+    displacement: list[Vector] | None = Field(None, description="mm")
+    von_mises: list[float] | None = Field(None, description="Cauchy stress, kPa")
+
+
+class Timing(BaseModel):
+    """Where the server's time went, µs."""
+
+    solve_us: float
+    recover_us: float
+
+
+class Answer(BaseModel):
+    """How the tissue answers a load."""
+
+    scene: str
+    contact: ContactAnswer
+    force: Vector = Field(description="Force on the tissue, mN.")
+    contact_displacement: Vector = Field(description="Displacement of the contact point, mm.")
+    trust: Trust
+    fields: Fields
+    timing: Timing
+
+
+class MomentAnswer(BaseModel):
+    """How the tissue answers at the time of a step."""
+
+    time: float = Field(description="s")
+    contact: ContactAnswer
+    force: Vector = Field(description="Force on the tissue, mN.")
+    contact_displacement: Vector = Field(description="Displacement of the contact point, mm.")
+    trust: Trust
+
+
+class HistoryAnswer(BaseModel):
+    """How the tissue answers a history."""
+
+    scene: str
+    steps: list[MomentAnswer]
+    fields: Fields
+    timing: Timing
+
+
+class MeshFields(BaseModel):
+    """Nodes and the surface they make."""
+
+    nodes: list[Vector] = Field(description="mm; the order of every field of this region.")
+    triangles: list[Annotated[list[int], Field(min_length=3, max_length=3)]] = Field(
+        description="The body's surface: indices into nodes, counter-clockwise from outside."
+    )
+    surface_nodes: list[int] = Field(
+        description="Where the nodes of region surface are among those of region all."
+    )
+    clamped: list[Literal[0, 1]] = Field(description="Per node: 1 if held fixed.")
+
+
+class Mesh(BaseModel):
+    """The undeformed mesh of a region."""
+
+    scene: str
+    region: MeshRegion
+    fields: MeshFields
+
+
+class AccessibleFields(BaseModel):
+    """A triangulated surface with a normal that varies linearly over each triangle."""
+
+    vertices: list[Vector] = Field(description="mm")
+    normals: list[Vector] = Field(description="Outward unit normals at the vertices.")
+    triangles: list[Annotated[list[int], Field(min_length=3, max_length=3)]] = Field(
+        description="Indices into vertices, counter-clockwise from outside."
+    )
+
+
+class Accessible(BaseModel):
+    """The surface that the endoscope can touch."""
+
+    scene: str
+    fields: AccessibleFields
+
+
+class Refused(BaseModel):
+    """A file that is not served."""
+
+    file: str
+    reason: str
+
+
+class SceneEntry(BaseModel):
+    """A scene that is served."""
+
+    name: str
+    description: str
+
+
+class SceneList(BaseModel):
+    """What is served and what could not be."""
+
+    scenes: list[SceneEntry]
+    refused: list[Refused]
+
+
+class Ranges(BaseModel):
+    """The loads the model was trained for; outside, answers say in_range: false."""
+
+    pressure: list[float] = Field(
+        description="[from, to] kPa, where the surface takes most; see pressure_limit"
+    )
+    tilt: list[float] = Field(description="[from, to] degrees between push and inward normal")
+    radius: float = Field(description="mm")
+    reach: float = Field(description="Farthest a position may be from the surface, mm.")
+
+
+class Size(BaseModel):
+    """What the fields of this scene hold."""
+
+    nodes: int
+    dofs: int
+    surface_nodes: int
+    triangles: int
+
+
+class SceneSummary(BaseModel):
+    """One scene: what may be asked and how well it is answered."""
+
+    name: str
+    description: str
+    ranges: Ranges
+    tolerance: dict[str, float] = Field(description="Relative L2 errors promised, as fractions.")
+    size: Size
+    info: dict[str, Any] = Field(description="Training, validation and provenance.")
+    example: dict[str, Any] = Field(description="A request that this scene can answer.")
+
+
+class Status(BaseModel):
+    """The service is up."""
+
+    status: Literal["ok", "ready"]
+
+
+class Checked(BaseModel):
+    """The request is well-formed."""
+
+    valid: Literal[True]
+
+
+class ErrorBody(BaseModel):
+    """What is wrong."""
+
+    code: str
+    field: str = Field(description="Path of what is wrong in the request: contacts.0.pressure")
+    message: str
+    allowed: Any = Field(description="What would be right, where that is short.")
+
+
+class Problem(BaseModel):
+    """Why there is no answer."""
+
+    error: ErrorBody

@@ -1,0 +1,1 @@
+"""Sessions of a tool at 1 kHz over WebSocket."""

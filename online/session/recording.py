@@ -1,0 +1,207 @@
+"""What a tool did and felt, in a file.
+
+A recording is an HDF5 file with one dataset for each field of a reply (`session.frames`), with a
+row for each reply in order of arrival, and beside them what was asked for and when. Every dataset
+has ``units`` and a ``description``. Since an answer depends on those before it, and on how many
+positions were solved for each (``steps``), the recording of a whole session is enough to answer it
+anew, bit for bit (`session.replay`).
+"""
+
+import json
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.online.session.frames import REPLY, REPLY_FIELDS, Field, Request
+from palpate.shared.errors import PalpateError
+
+FORMAT = "palpate-session"
+FORMAT_VERSION = 2
+
+CHUNK = 2000
+"""Replies that are kept in memory until they are written."""
+
+MOST_UNANSWERED = 100_000
+"""Requests that are remembered for their replies: more than the buffers on the way can hold."""
+
+ASKED = (
+    Field("asked_position", "float64", "mm", "centre of the tip that was asked for", (3,)),
+    Field("asked_outputs", "uint16", "", "what was wanted, bits"),
+    Field("received", "float64", "s", "when the reply came, on the client's clock"),
+)
+
+
+class Command(NamedTuple):
+    """A snapshot that was taken or gone back to."""
+
+    replies: int  # that had come before
+    restores: bool
+    number: int
+
+
+class RecordingError(PalpateError):
+    """A file that is no recording, or one of another scene."""
+
+
+class Recorder:
+    """Writes a session to a file as it goes.
+
+    Parameters
+    ----------
+    path : Path
+        Overwritten.
+    hello : dict
+        Of the session.
+    """
+
+    def __init__(self, path: Path, hello: dict[str, Any]) -> None:
+        self._requests: dict[int, Request] = {}
+        self._asked: list[tuple[Any, ...]] = []
+        self._replies: list[bytes] = []
+        self._file = h5py.File(path, "w")
+        self._file.attrs["format"] = FORMAT
+        self._file.attrs["format_version"] = FORMAT_VERSION
+        self._file.attrs["scene"] = hello["scene"]
+        self._file.attrs["hello"] = json.dumps(hello)
+        self._count = 0
+        commands = self._file.create_dataset("commands", (0, 3), "uint32", maxshape=(None, 3))
+        commands.attrs["units"] = ""
+        commands.attrs["description"] = (
+            "snapshots: replies before, 0 if taken or 1 if gone back to, number"
+        )
+        for field in (*ASKED, *REPLY_FIELDS):
+            dataset = self._file.create_dataset(
+                field.name,
+                shape=(0, *field.shape),
+                maxshape=(None, *field.shape),
+                chunks=(CHUNK, *field.shape),
+                dtype=field.type,
+            )
+            dataset.attrs["units"] = field.unit
+            dataset.attrs["description"] = field.meaning
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def sent(self, request: Request) -> None:
+        """Note a request."""
+        self._requests[request.seq] = request
+        if len(self._requests) > MOST_UNANSWERED:
+            del self._requests[next(iter(self._requests))]
+
+    def received(self, reply: bytes, now: float) -> None:
+        """Note the reply (a frame) to one of the requests noted, which came at `now` (s).
+
+        A reply to anything else is left out: what was asked is not known.
+        """
+        request = self._requests.pop(int(np.frombuffer(reply, REPLY, 1)[0]["seq"]), None)
+        if request is None:
+            return
+        self._count += 1
+        self._asked.append((request.position, request.outputs, now))
+        self._replies.append(reply[: REPLY.itemsize])
+        # replies come in order: what was sent earlier was dropped or refused
+        for seq in [seq for seq in self._requests if _before(seq, request.seq)]:
+            del self._requests[seq]
+        if len(self._replies) >= CHUNK:
+            self._write()
+
+    def obeyed(self, restores: bool, number: int) -> None:
+        """Note that a snapshot was taken or gone back to, after the replies received so far."""
+        commands = self._file["commands"]
+        commands.resize(len(commands) + 1, axis=0)
+        commands[-1] = self._count, restores, number
+
+    def close(self) -> None:
+        """Write what is left and close the file."""
+        self._write()
+        self._file.close()
+
+    def _write(self) -> None:
+        if not self._replies:
+            return
+        asked = np.array(self._asked, [(f.name, f.type, f.shape) for f in ASKED])
+        replies = np.frombuffer(b"".join(self._replies), REPLY)
+        for table in (asked, replies):
+            for name in table.dtype.names or ():
+                dataset = self._file[name]
+                dataset.resize(len(dataset) + len(table), axis=0)
+                dataset[-len(table) :] = table[name]
+        self._file.flush()
+        self._asked.clear()
+        self._replies.clear()
+
+
+def _before(seq: int, other: int) -> bool:
+    """Whether a number was given before another one; numbers start again at 2^32."""
+    return (other - seq) % 2**32 < 2**31
+
+
+class Recording(NamedTuple):
+    """A recorded session.
+
+    Parameters
+    ----------
+    scene : str
+    requests : list of Request
+        Those that were answered, in order.
+    replies : ndarray, shape (n,), of `session.frames.REPLY`
+    received : ndarray, shape (n,), s
+        On the client's clock.
+    commands : list of Command
+        In order.
+    """
+
+    scene: str
+    requests: list[Request]
+    replies: NDArray[Any]
+    received: NDArray[np.float64]
+    commands: list[Command]
+
+
+def read_recording(path: Path) -> Recording:
+    """Read a recording.
+
+    Raises
+    ------
+    RecordingError
+        If the file is missing, damaged or none of this version.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("format") != FORMAT:
+                raise RecordingError(f"{path}: not a recording of a session")
+            version = file.attrs["format_version"]
+            if version != FORMAT_VERSION:
+                raise RecordingError(
+                    f"{path}: format version {version}; this program reads {FORMAT_VERSION}"
+                )
+            replies = np.zeros(len(file["seq"]), REPLY)
+            for name in REPLY.names or ():
+                replies[name] = file[name][:]
+            asked = zip(
+                replies["seq"].tolist(),
+                replies["client_time"].tolist(),
+                map(tuple, file["asked_position"][:].tolist()),
+                file["asked_outputs"][:].tolist(),
+                strict=True,
+            )
+            requests = [Request(*values) for values in asked]
+            commands = [Command(n, bool(back), k) for n, back, k in file["commands"][:].tolist()]
+            return Recording(
+                str(file.attrs["scene"]), requests, replies, file["received"][:], commands
+            )
+    except (OSError, KeyError, ValueError) as error:
+        raise RecordingError(f"{path}: cannot be read: {error}") from error

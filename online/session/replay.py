@@ -1,0 +1,81 @@
+"""Recorded sessions answered anew, to the bit."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.online.session import frames
+from palpate.online.session.frames import REPLY
+from palpate.online.session.recording import Recording, RecordingError
+from palpate.online.session.session import recover
+from palpate.online.session.timed_follower import follower_of
+from palpate.shared.model import ReducedModel
+
+VOLATILE = ("server_received", "server_sent", "solve_time", "superseded")
+"""Fields of a reply that depend on the clock and on the network."""
+
+
+class Replay(NamedTuple):
+    """How a replay compares with its recording.
+
+    Parameters
+    ----------
+    replies : int
+    different : int
+        Replies that are not the same, bit for bit.
+    first_different : int or None
+        Number of the first one.
+    force_difference : float, mN
+        Largest difference of a component.
+    """
+
+    replies: int
+    different: int
+    first_different: int | None
+    force_difference: float
+
+
+def replay(recording: Recording, atlas: ReducedModel) -> Replay:
+    """Answer a recorded session anew and compare.
+
+    Raises
+    ------
+    RecordingError
+        If the recording is of another scene.
+    """
+    if atlas.name != recording.scene:
+        raise RecordingError(
+            f"the recording is of scene {recording.scene!r}, the artifact of {atlas.name!r}"
+        )
+    follower = follower_of(atlas)
+    snapshots: dict[int, Any] = {}
+    commands = list(recording.commands)
+    again = np.zeros_like(recording.replies)
+    for i, request in enumerate(recording.requests):
+        while commands and commands[0].replies <= i:
+            command = commands.pop(0)
+            if command.restores:
+                follower.restore(snapshots[command.number])
+            else:
+                snapshots[command.number] = follower.snapshot()
+        steps = int(recording.replies["steps"][i])
+        step = follower.repeat(request.position, steps, request.client_time)
+        extras = recover(atlas, step.touch, request.outputs)
+        frame = frames.encode_reply(request, step, extras)
+        again[i] = np.frombuffer(frame, REPLY, 1)[0]
+    for name in VOLATILE:
+        again[name] = recording.replies[name]
+    different = np.flatnonzero(_bytes(again) != _bytes(recording.replies))
+    forces = np.abs(again["force"] - recording.replies["force"])
+    return Replay(
+        replies=len(again),
+        different=len(different),
+        first_different=int(different[0]) if len(different) else None,
+        force_difference=float(forces.max(initial=0.0)),
+    )
+
+
+def _bytes(replies: NDArray[Any]) -> NDArray[Any]:
+    """Rows as opaque bytes, for which a NaN is equal to itself and -0 is not 0."""
+    return np.ascontiguousarray(replies).view(f"V{REPLY.itemsize}")

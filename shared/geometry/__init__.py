@@ -1,0 +1,1 @@
+"""Shapes: elements, quadrature, and the closest point of a surface."""

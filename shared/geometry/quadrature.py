@@ -1,0 +1,101 @@
+"""Integration points of a mesh: in the volume, on the boundary, and for stress recovery."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.shared.errors import PalpateError
+from palpate.shared.geometry.elements import (
+    HEX_CORNERS,
+    HEX_EDGES,
+    gauss,
+    hexahedron,
+    quadrilateral,
+    shape,
+)
+from palpate.shared.mechanics.footprint import SurfaceQuadrature
+from palpate.shared.mechanics.stress import StressRecovery
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int32]
+
+LOAD_SPACING = 0.4
+"""Millimetres of a face's edge to a Gauss point: the load must be smooth in the contact point."""
+
+
+def volume_quadrature(nodes: Array, elements: Ints, points: int) -> tuple[Array, Array]:
+    """Gradients of the shape functions and weights at ``points``^3 Gauss points.
+
+    Returns
+    -------
+    gradients : ndarray, shape (e, q, n, 3), 1/mm
+    weights : ndarray, shape (e, q), mm^3
+
+    Raises
+    ------
+    PalpateError
+        If an element is inverted in the reference state.
+    """
+    at, w = gauss(points, 3)
+    _, dN = shape(hexahedron(elements.shape[1]), at)
+    jacobian = np.einsum("eai,qaj->eqij", nodes[elements], dN)
+    det = np.linalg.det(jacobian)
+    if not (det > 0).all():
+        worst = int(np.argmin(det.min(axis=1)))
+        raise PalpateError(f"mesh: element {worst} is inverted; change geometry.divisions")
+    gradients = np.einsum("qaj,eqji->eqai", dN, np.linalg.inv(jacobian))
+    return np.ascontiguousarray(gradients), det * w
+
+
+def surface_quadrature(
+    nodes: Array, faces: Ints, spacing: float = LOAD_SPACING
+) -> SurfaceQuadrature:
+    """Gauss points of boundary faces, one to each ``spacing`` mm of an edge, feeding mesh nodes."""
+    X = nodes[faces]
+    edges = np.linalg.norm(X[:, [1, 2, 3, 0]] - X[:, :4], axis=2)
+    counts = np.ceil(np.maximum(edges[:, :2], edges[:, 2:]) / spacing).astype(int)
+    parts = []
+    for along, across in np.unique(counts, axis=0):
+        own = np.flatnonzero((counts == (along, across)).all(axis=1))
+        (x, wx), (y, wy) = gauss(along, 1), gauss(across, 1)
+        at = np.column_stack([np.repeat(x[:, 0], across), np.tile(y[:, 0], along)])
+        N, dN = shape(quadrilateral(faces.shape[1]), at)
+        tangents = np.einsum("fai,qaj->fqij", X[own], dN)
+        normals = np.cross(tangents[..., 0], tangents[..., 1])
+        areas = np.linalg.norm(normals, axis=-1)
+        parts.append(
+            (
+                np.einsum("qa,fai->fqi", N, X[own]).reshape(-1, 3),
+                (normals / areas[..., None]).reshape(-1, 3),
+                (areas * np.outer(wx, wy).ravel()).reshape(-1),
+                np.repeat(faces[own], len(at), axis=0).astype(np.int32),
+                np.tile(N, (len(own), 1)),
+            )
+        )
+    return SurfaceQuadrature(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def stress_recovery(
+    nodes: Array, elements: Ints, mu: Array, lam: Array, precision: type = np.float64
+) -> StressRecovery:
+    """Recovery of nodal stresses from 2x2x2 points per element; mu, lam (e,) kPa."""
+    gradients, _ = volume_quadrature(nodes, elements, 2)
+    at, _ = gauss(2, 3)
+    to_points, _ = shape(HEX_CORNERS, at)
+    corners = elements[:, :8]
+    midsides = np.empty((0, 3), np.int32)
+    if elements.shape[1] == 20:
+        edges = np.array(HEX_EDGES)
+        ends = corners[:, edges].reshape(-1, 2)
+        midsides = np.unique(np.column_stack([elements[:, 8:].reshape(-1), ends]), axis=0)
+        midsides = midsides[np.unique(midsides[:, 0], return_index=True)[1]]
+    return StressRecovery(
+        connectivity=np.ascontiguousarray(elements, dtype=np.int32),
+        gradients=np.ascontiguousarray(np.moveaxis(gradients, 1, 3), dtype=precision),
+        extrapolation=np.linalg.inv(to_points).astype(np.float64),
+        mu=np.ascontiguousarray(mu),
+        lam=np.ascontiguousarray(lam),
+        elements_at=np.bincount(corners.ravel(), minlength=len(nodes)).astype(float),
+        midsides=midsides.astype(np.int32),
+    )

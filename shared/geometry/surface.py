@@ -1,0 +1,240 @@
+"""The body's boundary as triangles: where a queried position lands and which way is out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _closest_on_triangle(p, vertices, first, second, third):
+    """Distance of a triangle from p, and the barycentric coordinates of its nearest point.
+
+    Ericson, Real-Time Collision Detection, 2005, 5.1.5.  No array is made of a vertex: that takes
+    longer than the arithmetic.
+    """
+    d1 = d2 = d3 = d4 = d5 = d6 = 0.0
+    for i in range(3):
+        a, b, c = vertices[first, i], vertices[second, i], vertices[third, i]
+        ab, ac = b - a, c - a
+        d1 += ab * (p[i] - a)
+        d2 += ac * (p[i] - a)
+        d3 += ab * (p[i] - b)
+        d4 += ac * (p[i] - b)
+        d5 += ab * (p[i] - c)
+        d6 += ac * (p[i] - c)
+    vc, vb, va = d1 * d4 - d3 * d2, d5 * d2 - d1 * d6, d3 * d6 - d5 * d4
+    if d1 <= 0.0 and d2 <= 0.0:
+        v, w = 0.0, 0.0
+    elif d3 >= 0.0 and d4 <= d3:
+        v, w = 1.0, 0.0
+    elif vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        v, w = d1 / (d1 - d3), 0.0
+    elif d6 >= 0.0 and d5 <= d6:
+        v, w = 0.0, 1.0
+    elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        v, w = 0.0, d2 / (d2 - d6)
+    elif va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
+        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        v = 1.0 - w
+    else:
+        v, w = vb / (va + vb + vc), vc / (va + vb + vc)
+    u = 1.0 - v - w
+    squared = 0.0
+    for i in range(3):
+        x = u * vertices[first, i] + v * vertices[second, i] + w * vertices[third, i]
+        squared += (p[i] - x) ** 2
+    return math.sqrt(squared), u, v, w
+
+
+UPRIGHT = 0.7
+"""Cosine between the normal and the way to a point below which it is beside the surface, beyond its
+rim, rather than above or below."""
+
+
+class SurfaceIndex(NamedTuple):
+    """A surface as compiled code sees it, with fields given at its vertices."""
+
+    vertices: Array  # (v, 3) mm
+    triangles: NDArray[np.int32]  # (t, 3), neighbours next to each other
+    balls: Array  # (t, 4) mm, centres and radii of balls that hold them
+    normals: Array  # (v, 3)
+    first: NDArray[np.int64]  # (c + 1,) first triangle of each cluster
+    centres: Array  # (3, c) mm, of balls that hold the clusters
+    radii: Array  # (c,) mm
+    values: Array  # (v, k)
+
+
+CLUSTER = 32
+"""Most triangles of a cluster."""
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _project(ground, p, squared, weights):
+    """Nearest triangle and barycentric ``weights`` (3,) there; returns (triangle, distance).
+
+    ``squared`` (c,) is scratch: squared distances of the balls' centres.
+    """
+    centres, radii = ground.centres, ground.radii
+    x, y, z = p[0], p[1], p[2]
+    for c in range(len(radii)):
+        dx, dy, dz = x - centres[0, c], y - centres[1, c], z - centres[2, c]
+        squared[c] = dx * dx + dy * dy + dz * dz
+    first, least = 0, np.inf
+    for c in range(len(radii)):
+        if squared[c] < least:
+            first, least = c, squared[c]
+    nearest, best = _nearest_in(ground, p, first, 0, np.inf, weights)
+    for c in range(len(radii)):
+        bound = best + radii[c]
+        if squared[c] < bound * bound and c != first:
+            nearest, best = _nearest_in(ground, p, c, nearest, best, weights)
+    return nearest, best
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _nearest_in(ground, p, cluster, nearest, best, weights):
+    """``nearest`` triangle and its distance ``best``, or those of a nearer one in the cluster."""
+    balls, triangles = ground.balls, ground.triangles
+    for t in range(ground.first[cluster], ground.first[cluster + 1]):
+        dx, dy, dz = p[0] - balls[t, 0], p[1] - balls[t, 1], p[2] - balls[t, 2]
+        bound = best + balls[t, 3]
+        if dx * dx + dy * dy + dz * dz < bound * bound:
+            i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+            distance, u, v, w = _closest_on_triangle(p, ground.vertices, i, j, k)
+            if distance < best:
+                nearest, best = t, distance
+                weights[0], weights[1], weights[2] = u, v, w
+    return nearest, best
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def locate(ground, p, scratch, x, normal, at):
+    """Write the projection of p, the normal and the values ``at`` it; return the distance.
+
+    ``scratch`` (clusters + 3,) holds one value for each ball of triangles and three more.
+    """
+    count = len(ground.radii)
+    weights = scratch[count:]
+    t, distance = _project(ground, p, scratch, weights)
+    a, b, c = ground.triangles[t, 0], ground.triangles[t, 1], ground.triangles[t, 2]
+    u, v, w = weights[0], weights[1], weights[2]
+    vertices, normals, values = ground.vertices, ground.normals, ground.values
+    for k in range(len(at)):
+        at[k] = u * values[a, k] + v * values[b, k] + w * values[c, k]
+    length = 0.0
+    for i in range(3):
+        x[i] = u * vertices[a, i] + v * vertices[b, i] + w * vertices[c, i]
+        normal[i] = u * normals[a, i] + v * normals[b, i] + w * normals[c, i]
+        length += normal[i] ** 2
+    length = math.sqrt(length)
+    for i in range(3):
+        normal[i] /= length
+    return distance
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A triangulated piece of boundary with a continuous normal.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (v, 3), mm
+    triangles : ndarray, shape (t, 3), int32
+        Outward by the right-hand rule.
+    normals : ndarray, shape (v, 3)
+        Outward unit normals, interpolated over the triangles.
+    """
+
+    vertices: Array
+    triangles: NDArray[np.int32]
+    normals: Array
+    _ordered: NDArray[np.int32] = field(init=False, repr=False)
+    _balls: Array = field(init=False, repr=False)
+    _first: NDArray[np.int64] = field(init=False, repr=False)
+    _centres: Array = field(init=False, repr=False)
+    _radii: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        clusters = _clusters(
+            self.vertices[self.triangles].mean(axis=1), np.arange(len(self.triangles))
+        )
+        first = np.cumsum([0, *map(len, clusters)])
+        starts = first[:-1]
+        ordered = np.ascontiguousarray(self.triangles[np.concatenate(clusters)])
+        corners = self.vertices[ordered]
+        low, high = corners.min(axis=1), corners.max(axis=1)
+        balls = np.column_stack([(low + high) / 2, np.zeros(len(ordered))])
+        balls[:, 3] = np.linalg.norm(corners - balls[:, None, :3], axis=2).max(axis=1)
+        low, high = np.minimum.reduceat(low, starts), np.maximum.reduceat(high, starts)
+        centres = (low + high) / 2
+        own = np.repeat(centres, np.diff(first), axis=0)
+        reach = np.linalg.norm(corners - own[:, None], axis=2).max(axis=1)
+        object.__setattr__(self, "_ordered", ordered)
+        object.__setattr__(self, "_balls", balls)
+        object.__setattr__(self, "_first", first)
+        object.__setattr__(self, "_centres", np.ascontiguousarray(centres.T))
+        object.__setattr__(self, "_radii", np.maximum.reduceat(reach, starts))
+
+    def project(self, position: Array) -> tuple[Array, Array, float]:
+        """Nearest surface point (mm), its outward unit normal and the distance (mm)."""
+        return self.locate(position, np.empty((len(self.vertices), 0)))[:3]
+
+    def locate(self, position: Array, values: Array) -> tuple[Array, Array, float, Array]:
+        """As ``project``, and the values (k,) there of fields given at the vertices, (v, k)."""
+        x, normal, at = np.empty(3), np.empty(3), np.empty(values.shape[1])
+        scratch = np.empty(len(self._radii) + 3)
+        distance = locate(self.ground(values), position, scratch, x, normal, at)
+        return x, normal, distance, at
+
+    @property
+    def clusters(self) -> int:
+        """Number of balls that triangles are searched in."""
+        return len(self._radii)
+
+    def ground(self, values: Array) -> SurfaceIndex:
+        """For compiled code, with fields (v, k) given at the vertices."""
+        return SurfaceIndex(
+            self.vertices,
+            self._ordered,
+            self._balls,
+            self.normals,
+            self._first,
+            self._centres,
+            self._radii,
+            np.ascontiguousarray(values),
+        )
+
+    def rim(self) -> NDArray[np.int64]:
+        """Vertices on the border of the surface: ends of edges that belong to one triangle."""
+        edges = np.sort(np.vstack([self.triangles[:, [i, (i + 1) % 3]] for i in range(3)]), axis=1)
+        unique, count = np.unique(edges, axis=0, return_counts=True)
+        return np.unique(unique[count == 1])
+
+
+def _clusters(centres: Array, members: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Triangles in groups of neighbours, halved across the longest side until small enough."""
+    if len(members) <= CLUSTER:
+        return [members]
+    extent = np.ptp(centres[members], axis=0)
+    members = members[np.argsort(centres[members, np.argmax(extent)], kind="stable")]
+    half = len(members) // 2
+    return _clusters(centres, members[:half]) + _clusters(centres, members[half:])
+
+
+def boundary_triangles(faces: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Boundary for drawing: node ids (s,) and triangles (t, 3) as indices into them."""
+    if faces.shape[1] == 4:
+        pattern = [(0, 1, 2), (0, 2, 3)]
+    else:
+        pattern = [(0, 4, 7), (4, 1, 5), (5, 2, 6), (6, 3, 7), (4, 5, 7), (5, 6, 7)]
+    triangles = np.vstack([faces[:, p] for p in pattern])
+    nodes, compact = np.unique(triangles, return_inverse=True)
+    return nodes.astype(np.int32), compact.reshape(-1, 3).astype(np.int32)

@@ -1,0 +1,1 @@
+"""One physics for both sizes: tissue laws, loads, contact, equilibrium, stress."""

@@ -1,0 +1,408 @@
+"""The rigid spherical tip of the endoscope, pushed into the surface: frictionless contact.
+
+The tip with its centre at ``x`` and of radius ``R`` adds to the potential energy of the body
+
+    Phi(u, x) = int phi(d) dA,     d = R - |X + u - x|,
+
+summed over integration points of the surface at rest.  The penalty ``phi`` is zero for d <= 0 and
+twice continuously differentiable,
+
+    phi' = k d^2 / (2 e)  for d <= e,        phi' = k (d - e / 2)  beyond,
+
+so ``phi'`` is the contact pressure and grows in proportion to the penetration ``d`` but for the
+onset ``e``.  What Phi exerts on the tissue and on the tool, and how stiff it is, are its first and
+second derivatives in ``u`` and ``x``; no friction, no adhesion (Wriggers, Computational Contact
+Mechanics, 2006, ch. 5 and 6).
+
+On a mesh much finer than the contact the pressure is Hertz's, about E sqrt(D / R) at a depth ``D``.
+On a coarse one, whose faces cannot dent, the contact is far smaller: as on a rigid plane, a force F
+needs the penetration sqrt(F / (pi k R)).  ``HARDNESS`` is set by the latter, and the points are so
+close (``SPACING``) that even such a contact holds several.
+
+Only faces whose surroundings the tip reaches are looked at, and of those only the blocks of points
+that it can reach.  A point whose outward normal (at rest) faces away from the tip's centre does not
+feel it: it belongs to the far side of a thin wall.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from palpate.shared.geometry.elements import quadrilateral, shape
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int32]
+
+HARDNESS = 12000.0
+"""Of the penalty, in units of Young's modulus over the tip's radius."""
+
+ONSET = 5e-4
+"""Penetration over which the penalty sets in, in radii of the tip."""
+
+SPACING = 0.05
+"""Largest distance of integration points, in radii of the tip."""
+
+SIDE = 4
+BLOCK = SIDE * SIDE
+"""Points of a block: two vectors of double precision."""
+
+SAG = 4.0
+"""By which the squared distance of the tip's centre from a point of a block is at most less than
+from the nearest corner of the block, in squared half diagonals at rest; 1 on a plane."""
+
+SMOOTH = np.cos(np.radians(45.0))
+"""Faces that meet at less than this angle go on in one another."""
+
+REACH = 1.25
+"""A curved face stays in the box of its nodes stretched by this factor."""
+
+
+FORCE, STIFFNESS, CONVEX = 0.0, 1.0, 2.0
+"""What is wanted of ``touch``; for integers the compiler would make a version of it each."""
+
+
+class Tip(NamedTuple):
+    """The tip and its penalty."""
+
+    radius: float  # mm
+    stiffness: float  # kPa/mm
+    onset: float  # mm
+
+
+class TipSurface(NamedTuple):
+    """Faces that a tip can touch, with b blocks of ``BLOCK`` integration points each."""
+
+    nodes: Array  # (n, 3) mm, at rest
+    faces: Ints  # (f, k) rows of ``nodes``
+    shape: Array  # (b, k, BLOCK) shape functions at the points of a face
+    corner_shape: Array  # (k, e) the same at the corners of blocks
+    corners: Ints  # (b, 4) those of each block
+    reach: Array  # (f, b) mm^2, squared distance of all corners at which the tip misses the block
+    areas: Array  # (f, b, BLOCK) mm^2
+    normals: Array  # (f, b, 3, BLOCK) outward unit normals at rest
+
+
+class Touching(NamedTuple):
+    """What the tip does to the faces that it touches; room for all of a surface's."""
+
+    face: Ints  # (f,) places in the list of faces looked at
+    force: Array  # (f, k, 3) mN, on their nodes
+    stiffness: Array  # (f, 3, 3, k, k) mN/mm, second derivative in the places of the nodes
+    own: Array  # (3, 3) mN/mm, in the place of the tip
+    touched: NDArray[np.int64]  # (1,) number of faces
+    deepest: Array  # (1,) mm, largest penetration
+    at: Array  # (k, 3) scratch: nodes of a face from the tip's centre, mm
+    gap: Array  # (4, BLOCK) scratch: points of a block from there, mm, and squared distances
+    row: Array  # (k,) scratch: shape functions at a point
+    ends: Array  # (4, e) scratch: the same of the corners of blocks
+
+
+def tip_of(radius: float, young: float) -> Tip:
+    """Tip of a radius (mm) for a tissue of Young's modulus ``young`` (kPa)."""
+    return Tip(radius, HARDNESS * young / radius, ONSET * radius)
+
+
+def tip_surface(
+    nodes: Array, faces: Ints, accessible: NDArray[np.bool_], radius: float
+) -> TipSurface:
+    """Faces that a tip on the accessible ones can touch: those and their smooth continuation.
+
+    Parameters
+    ----------
+    nodes : ndarray, shape (n, 3), mm
+    faces : ndarray, shape (f, 4) or (f, 8)
+        Of the whole boundary.
+    accessible : ndarray, shape (f,), bool
+    radius : float, mm
+        Of the tip; sets the distance of integration points.
+    """
+    touched = faces[_with_smooth_neighbours(nodes, faces, accessible)]
+    reference = quadrilateral(faces.shape[1])
+    at, ends, corners = _grid(nodes[touched], SPACING * radius)
+    N, dN = shape(reference, at)
+    tangents = np.einsum("fai,qaj->fijq", nodes[touched], dN)
+    normals = np.cross(tangents[:, :, 0], tangents[:, :, 1], axis=1)
+    areas = np.linalg.norm(normals, axis=1)
+    blocks = len(touched), -1, BLOCK
+    at_ends, _ = shape(reference, ends)
+    placed = np.einsum("fai,qa->fqi", nodes[touched], at_ends)[:, corners]  # (f, b, 4, 3)
+    diagonals = np.linalg.norm(placed[:, :, :2] - placed[:, :, 2:], axis=-1).max(axis=-1)
+    return TipSurface(
+        nodes=nodes,
+        faces=np.ascontiguousarray(touched, dtype=np.int32),
+        shape=_in_blocks(N),
+        corner_shape=np.ascontiguousarray(at_ends.T),
+        corners=corners,
+        reach=np.ascontiguousarray(radius**2 + SAG * (diagonals / 2) ** 2),
+        areas=(areas * 4 / len(N)).reshape(blocks),
+        normals=np.ascontiguousarray(
+            np.moveaxis((normals / areas[:, None]).reshape(len(touched), 3, -1, BLOCK), 1, 2)
+        ),
+    )
+
+
+def _in_blocks(N: Array) -> Array:
+    """Shape functions (q, k) at points as (q / BLOCK, k, BLOCK)."""
+    return np.ascontiguousarray(N.reshape(-1, BLOCK, N.shape[1]).transpose(0, 2, 1))
+
+
+def _grid(nodes: Array, spacing: float) -> tuple[Array, Array, Ints]:
+    """Blocks of equal cells of the reference face, at most ``spacing`` mm wide on any face.
+
+    Returns
+    -------
+    centres : ndarray, shape (b BLOCK, 2)
+        Of the cells, block by block.
+    ends : ndarray, shape (e, 2)
+        Corners of the blocks.
+    corners : ndarray, shape (b, 4)
+        Which those of a block are; the first and third, and the others, are opposite.
+    """
+    edges = np.linalg.norm(nodes[:, [1, 2, 3, 0]] - nodes[:, :4], axis=2)
+    # a block more or less must not hang on round-off
+    m, n = (max(1, int(np.ceil(edges[:, i::2].max() / (SIDE * spacing) - 1e-6))) for i in range(2))
+    cells = [(np.arange(SIDE * count) + 0.5) * 2 / (SIDE * count) - 1 for count in (m, n)]
+    centres = np.stack(np.meshgrid(*cells, indexing="ij"), axis=-1)
+    centres = centres.reshape(m, SIDE, n, SIDE, 2).transpose(0, 2, 1, 3, 4).reshape(-1, 2)
+    borders = np.meshgrid(np.linspace(-1, 1, m + 1), np.linspace(-1, 1, n + 1), indexing="ij")
+    number = np.arange((m + 1) * (n + 1), dtype=np.int32).reshape(m + 1, n + 1)
+    corners = [number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]]
+    return centres, np.stack(borders, axis=-1).reshape(-1, 2), np.stack(corners, -1).reshape(-1, 4)
+
+
+def _with_smooth_neighbours(
+    nodes: Array, faces: Ints, accessible: NDArray[np.bool_]
+) -> NDArray[np.int64]:
+    """Accessible faces and those that share an edge with one at less than 45 degrees."""
+    reference = quadrilateral(faces.shape[1])
+    _, dN = shape(reference, reference[:4])
+    tangents = np.einsum("fai,qaj->fqij", nodes[faces], dN)
+    normals = np.cross(tangents[..., 0], tangents[..., 1])
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)  # (f, 4, 3) at the corners
+    at_corner = {
+        (int(face), int(node)): normals[face, corner]
+        for face in range(len(faces))
+        for corner, node in enumerate(faces[face, :4])
+    }
+    of_edge: dict[tuple[int, int], list[int]] = {}
+    for face, corners in enumerate(faces[:, :4].tolist()):
+        for a, b in zip(corners, corners[1:] + corners[:1], strict=True):
+            of_edge.setdefault((min(a, b), max(a, b)), []).append(face)
+    kept = accessible.copy()
+    for edge, pair in of_edge.items():
+        if len(pair) == 2 and accessible[pair].any():
+            smooth = all(
+                at_corner[pair[0], node] @ at_corner[pair[1], node] > SMOOTH for node in edge
+            )
+            kept[pair] |= smooth
+    return np.flatnonzero(kept)
+
+
+def room_for(surface: TipSurface, f: int) -> Touching:
+    """Memory for what touches f faces of a surface."""
+    k = surface.faces.shape[1]
+    return Touching(
+        face=np.zeros(f, np.int32),
+        force=np.zeros((f, k, 3)),
+        stiffness=np.zeros((f, 3, 3, k, k)),
+        own=np.zeros((3, 3)),
+        touched=np.zeros(1, np.int64),
+        deepest=np.zeros(1),
+        at=np.zeros((k, 3)),
+        gap=np.zeros((4, BLOCK)),
+        row=np.zeros(k),
+        ends=np.zeros((4, surface.corner_shape.shape[1])),
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def penalty(tip, d):
+    """Energy density (mN/mm), pressure (kPa) and stiffness (kPa/mm) at a penetration (mm)."""
+    k, e = tip.stiffness, tip.onset
+    if d <= 0.0:
+        return 0.0, 0.0, 0.0
+    if d <= e:
+        return k * d * d * d / (6.0 * e), k * d * d / (2.0 * e), k * d / e
+    return k * (0.5 * d * (d - e) + e * e / 6.0), k * (d - 0.5 * e), k
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _within_reach(tip, surface, face, x, moved, at):
+    """Whether the tip at x reaches the surroundings of a deformed face; writes its nodes from x."""
+    nodes, faces = surface.nodes, surface.faces
+    squared = largest = 0.0
+    for i in range(3):
+        low, high = np.inf, -np.inf
+        for k in range(faces.shape[1]):
+            node = faces[face, k]
+            at[k, i] = nodes[node, i] + moved[node, i] - x[i]
+            low, high = min(low, at[k, i]), max(high, at[k, i])
+        largest = max(largest, high - low)
+        # of all nodes from the tip's centre; what a curved face goes beyond them comes off below
+        beside = max(low, -high, 0.0)
+        squared += beside * beside
+    return math.sqrt(squared) - 0.5 * (REACH - 1.0) * math.sqrt(3.0) * largest < tip.radius
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc", "nsz"})
+def _gaps(shape, at, gap):
+    """Points of a face from the tip's centre and their squared distances, into ``gap`` (4, n).
+
+    shape (k, n); k is 4 or 8.
+    """
+    x, y, z, squared = gap[0], gap[1], gap[2], gap[3]
+    for q in range(len(x)):
+        x[q] = y[q] = z[q] = 0.0
+    for k in range(0, len(at), 4):
+        K, L, M, N = shape[k], shape[k + 1], shape[k + 2], shape[k + 3]
+        a0, b0, c0, d0 = at[k, 0], at[k + 1, 0], at[k + 2, 0], at[k + 3, 0]
+        a1, b1, c1, d1 = at[k, 1], at[k + 1, 1], at[k + 2, 1], at[k + 3, 1]
+        a2, b2, c2, d2 = at[k, 2], at[k + 1, 2], at[k + 2, 2], at[k + 3, 2]
+        for q in range(len(x)):
+            x[q] += K[q] * a0 + L[q] * b0 + M[q] * c0 + N[q] * d0
+            y[q] += K[q] * a1 + L[q] * b1 + M[q] * c1 + N[q] * d1
+            z[q] += K[q] * a2 + L[q] * b2 + M[q] * c2 + N[q] * d2
+    for q in range(len(x)):
+        squared[q] = x[q] * x[q] + y[q] * y[q] + z[q] * z[q]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def touch(tip, surface, near, x, moved, touching, wanted):
+    """Find the faces that touch the tip, and what it does to them.
+
+    Parameters
+    ----------
+    tip : Tip
+    surface : TipSurface
+    near : ndarray, shape (s,), int32
+        Faces to look at.
+    x : ndarray, shape (3,), mm
+        Centre of the tip.
+    moved : ndarray, shape (n, 3), mm
+        Displacement of the surface's nodes.
+    touching : Touching, out
+        The first ``count`` faces are overwritten.
+    wanted : float
+        ``FORCE``, ``STIFFNESS`` (second derivatives, too) or ``CONVEX`` (second derivatives without
+        their negative part, that of the normal's turning: positive definite far from equilibrium).
+
+    Returns
+    -------
+    count : int
+    energy : float, mN mm
+        Of the penalty.
+    deepest : float, mm
+        Largest penetration.
+    """
+    count, energy, deepest = 0, 0.0, 0.0
+    at, ends, corner = touching.at, touching.ends, touching.ends[3]
+    corners, reach = surface.corners, surface.reach
+    touching.own[:] = 0.0
+    for place in range(len(near)):
+        face = near[place]
+        if not _within_reach(tip, surface, face, x, moved, at):
+            continue
+        _gaps(surface.corner_shape, at, ends)
+        new = True
+        for b in range(len(corners)):
+            first = min(corner[corners[b, 0]], corner[corners[b, 1]])
+            if min(first, corner[corners[b, 2]], corner[corners[b, 3]]) >= reach[face, b]:
+                continue
+            _gaps(surface.shape[b], at, touching.gap)
+            density, depth = _touch_block(tip, surface, face, b, touching, count, new, wanted)
+            if depth > 0.0:
+                touching.face[count] = place
+                new = False
+                energy += density
+                deepest = max(deepest, depth)
+        if not new:
+            count += 1
+    touching.touched[0], touching.deepest[0] = count, deepest
+    return count, energy, deepest
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _touch_block(tip, surface, face, block, touching, place, new, wanted):
+    """Add what the tip does to the points of a block whose ``gap`` is known: energy, penetration.
+
+    ``new`` faces have nothing at their place yet.
+    """
+    radius, gap, areas, normals = tip.radius, touching.gap, surface.areas, surface.normals
+    energy = deepest = 0.0
+    for q in range(BLOCK):
+        if gap[3, q] >= radius * radius:
+            continue
+        y0, y1, y2 = gap[0, q], gap[1, q], gap[2, q]
+        facing = normals[face, block, 0, q] * y0 + normals[face, block, 1, q] * y1
+        if facing + normals[face, block, 2, q] * y2 >= 0.0:
+            continue
+        if new:
+            new = False
+            touching.force[place] = 0.0
+            if wanted > FORCE:
+                touching.stiffness[place] = 0.0
+        distance, area = math.sqrt(gap[3, q]), areas[face, block, q]
+        density, pressure, slope = penalty(tip, radius - distance)
+        energy += area * density
+        deepest = max(deepest, radius - distance)
+        n0, n1, n2 = y0 / distance, y1 / distance, y2 / distance
+        _press(surface.shape, block, q, area * pressure, n0, n1, n2, touching.force, place)
+        if wanted > FORCE:
+            across = -area * pressure / distance if wanted == STIFFNESS else 0.0
+            _stiffen(surface.shape, block, q, area * slope, across, n0, n1, n2, touching, place)
+    return energy, deepest
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _press(shape, block, q, push, n0, n1, n2, force, place):
+    """Share a point's force among the nodes of its face."""
+    for k in range(shape.shape[1]):
+        share = shape[block, k, q] * push
+        force[place, k, 0] += share * n0
+        force[place, k, 1] += share * n1
+        force[place, k, 2] += share * n2
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _stiffen(shape, block, q, along, across, n0, n1, n2, touching, place):
+    """Add a point's second derivative to the upper blocks of its face's, and to the tip's own."""
+    K, own, steep = touching.stiffness, touching.own, along - across
+    h00, h01, h02 = steep * n0 * n0 + across, steep * n0 * n1, steep * n0 * n2
+    h11, h12, h22 = steep * n1 * n1 + across, steep * n1 * n2, steep * n2 * n2 + across
+    own[0, 0] += h00
+    own[1, 1] += h11
+    own[2, 2] += h22
+    own[0, 1] += h01
+    own[1, 0] += h01
+    own[0, 2] += h02
+    own[2, 0] += h02
+    own[1, 2] += h12
+    own[2, 1] += h12
+    row = touching.row
+    for k in range(len(row)):
+        row[k] = shape[block, k, q]
+    for a in range(len(row)):
+        N = row[a]
+        for b in range(len(row)):
+            value = N * row[b]
+            K[place, 0, 0, a, b] += h00 * value
+            K[place, 0, 1, a, b] += h01 * value
+            K[place, 0, 2, a, b] += h02 * value
+            K[place, 1, 1, a, b] += h11 * value
+            K[place, 1, 2, a, b] += h12 * value
+            K[place, 2, 2, a, b] += h22 * value
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def reaction(touching, count, force):
+    """Write the tissue's force on the tool (3,) mN."""
+    force[:] = 0.0
+    for c in range(count):
+        for k in range(touching.force.shape[1]):
+            for i in range(3):
+                force[i] -= touching.force[c, k, i]

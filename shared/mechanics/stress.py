@@ -1,0 +1,159 @@
+"""Von Mises stress at the nodes, recovered from the displacement.
+
+The equivalent stress is taken at the Gauss points, where it converges fastest, extrapolated to the
+corners of each element by the trilinear field through its 2x2x2 points, averaged over the elements
+that share a corner, and interpolated to midside nodes.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from palpate.shared.mechanics import tissue, viscosity
+
+
+class StressRecovery(NamedTuple):
+    """What recovery needs of a mesh: 2x2x2 points per element."""
+
+    connectivity: NDArray[np.int32]  # (e, n)
+    gradients: NDArray[np.floating]  # (e, n, 3, 8) 1/mm: point index last, for vector arithmetic
+    extrapolation: NDArray[np.float64]  # (8, 8) corner from point
+    mu: NDArray[np.float64]  # (e,) kPa
+    lam: NDArray[np.float64]  # (e,) kPa
+    elements_at: NDArray[np.float64]  # (nodes,) number of elements that share a corner node
+    midsides: NDArray[np.int32]  # (k, 3) midside node and the corners either side of it
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc", "nsz"})
+def nodal_von_mises(mesh, u, out):
+    """Write the von Mises stress (nodes,) kPa of the displacement ``u`` (nodes, 3) mm to ``out``.
+
+    Displacement gradients are summed in the precision of ``mesh.gradients``, which ``u`` shares.
+    Never negative: extrapolation may undershoot near steep gradients, which is cut at zero.
+    """
+    connectivity = mesh.connectivity
+    nodes = connectivity.shape[1]
+    flat = mesh.gradients.reshape(len(connectivity), nodes * 24)
+    H, at_points = np.empty(72, flat.dtype), np.empty(8)
+    extrapolation = mesh.extrapolation
+    out[:] = 0.0
+    for e in range(len(connectivity)):
+        H[:] = 0.0
+        for a in range(nodes):
+            node = connectivity[e, a]
+            x, y, z = u[node, 0], u[node, 1], u[node, 2]
+            gradients = flat[e, 24 * a : 24 * a + 24]
+            for k in range(24):
+                H[k] += x * gradients[k]
+                H[24 + k] += y * gradients[k]
+                H[48 + k] += z * gradients[k]
+        mu, lam = mesh.mu[e], mesh.lam[e]
+        for q in range(8):
+            at_points[q] = tissue.von_mises(
+                1.0 + H[q], H[8 + q], H[16 + q],
+                H[24 + q], 1.0 + H[32 + q], H[40 + q],
+                H[48 + q], H[56 + q], 1.0 + H[64 + q],
+                mu, lam,
+            )  # fmt: skip
+        for corner in range(8):
+            value = 0.0
+            for q in range(8):
+                value += extrapolation[corner, q] * at_points[q]
+            out[connectivity[e, corner]] += max(value, 0.0)
+    _average(mesh, out)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc", "nsz"})
+def remember(mesh, u, share, B):
+    """Add to ``B`` (e, 6, 8) what a displacement ``u`` (nodes, 3) mm of the past drives it to.
+
+    See ``mechanics.viscosity``: ``share (m - I)`` at the points; point index last.
+    """
+    nodes = mesh.connectivity.shape[1]
+    flat = mesh.gradients.reshape(len(mesh.connectivity), nodes * 24)
+    H = np.empty(72)
+    for e in range(len(mesh.connectivity)):
+        _gradients(mesh.connectivity[e], flat[e], u, H)
+        b = B[e]
+        for q in range(8):
+            f0, f1, f2 = 1.0 + H[q], H[8 + q], H[16 + q]
+            f3, f4, f5 = H[24 + q], 1.0 + H[32 + q], H[40 + q]
+            f6, f7, f8 = H[48 + q], H[56 + q], 1.0 + H[64 + q]
+            m0, m1, m2, m3, m4, m5 = viscosity.driven(f0, f1, f2, f3, f4, f5, f6, f7, f8)
+            b[0, q] += share * m0
+            b[1, q] += share * m1
+            b[2, q] += share * m2
+            b[3, q] += share * m3
+            b[4, q] += share * m4
+            b[5, q] += share * m5
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc", "nsz"})
+def remember_linearly(mesh, u, B):
+    """The same of a small displacement (mm) that stands for all shares."""
+    nodes = mesh.connectivity.shape[1]
+    flat = mesh.gradients.reshape(len(mesh.connectivity), nodes * 24)
+    H = np.empty(72)
+    for e in range(len(mesh.connectivity)):
+        _gradients(mesh.connectivity[e], flat[e], u, H)
+        b = B[e]
+        for q in range(8):
+            third = (H[q] + H[32 + q] + H[64 + q]) / 3.0
+            b[0, q] -= 2.0 * (H[q] - third)
+            b[1, q] -= 2.0 * (H[32 + q] - third)
+            b[2, q] -= 2.0 * (H[64 + q] - third)
+            b[3, q] -= H[40 + q] + H[56 + q]
+            b[4, q] -= H[16 + q] + H[48 + q]
+            b[5, q] -= H[8 + q] + H[24 + q]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc", "nsz"})
+def nodal_von_mises_after(mesh, u, B, out):
+    """As ``nodal_von_mises`` of tissue with a past: ``B`` (e, 6, 8), point index last."""
+    nodes = mesh.connectivity.shape[1]
+    flat = mesh.gradients.reshape(len(mesh.connectivity), nodes * 24)
+    H, at_points = np.empty(72), np.empty(8)
+    out[:] = 0.0
+    for e in range(len(mesh.connectivity)):
+        _gradients(mesh.connectivity[e], flat[e], u, H)
+        b, mu, lam = B[e], mesh.mu[e], mesh.lam[e]
+        for q in range(8):
+            at_points[q] = viscosity.von_mises(
+                1.0 + H[q], H[8 + q], H[16 + q],
+                H[24 + q], 1.0 + H[32 + q], H[40 + q],
+                H[48 + q], H[56 + q], 1.0 + H[64 + q],
+                b[0, q], b[1, q], b[2, q], b[3, q], b[4, q], b[5, q],
+                mu, lam,
+            )  # fmt: skip
+        for corner in range(8):
+            value = 0.0
+            for q in range(8):
+                value += mesh.extrapolation[corner, q] * at_points[q]
+            out[mesh.connectivity[e, corner]] += max(value, 0.0)
+    _average(mesh, out)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc", "nsz"})
+def _average(mesh, out):
+    """Turn sums over elements at nodes into means, and set nodes on edges between theirs."""
+    for node in range(len(mesh.elements_at)):
+        if mesh.elements_at[node] > 0.0:
+            out[node] /= mesh.elements_at[node]
+    for k in range(len(mesh.midsides)):
+        out[mesh.midsides[k, 0]] = 0.5 * (out[mesh.midsides[k, 1]] + out[mesh.midsides[k, 2]])
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc", "nsz"})
+def _gradients(connectivity, flat, u, H):
+    """Displacement gradients (72,) at the points of an element."""
+    H[:] = 0.0
+    for a in range(len(connectivity)):
+        node = connectivity[a]
+        x, y, z = u[node, 0], u[node, 1], u[node, 2]
+        gradients = flat[24 * a : 24 * a + 24]
+        for k in range(24):
+            H[k] += x * gradients[k]
+            H[24 + k] += y * gradients[k]
+            H[48 + k] += z * gradients[k]

@@ -1,0 +1,1 @@
+"""Local reduced models: what a query solves."""

@@ -1,0 +1,254 @@
+"""Meshes of the shipped scenes: valid, closed, oriented, of the promised size."""
+
+from collections import Counter
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.offline.fem.mesh import Mesh, build_mesh, jacobians, local_thickness, mesh_quality
+from palpate.offline.fem.section import map_section, polygon_area, read_outline
+from palpate.offline.scenes import FOLDER, find_scene, shipped_scenes
+from palpate.shared.scene import Scene, SceneError, parse_scene
+
+OUTLINE = FOLDER / "inferior_turbinate_section.csv"
+
+
+@cache
+def shipped_mesh(name: str) -> Mesh:
+    return build_mesh(find_scene(name))
+
+
+@pytest.fixture(params=shipped_scenes())
+def mesh(request) -> Mesh:
+    return shipped_mesh(request.param)
+
+
+def variant(name: str, *changes: tuple[str, str]) -> Scene:
+    """A shipped scene with some of its text replaced."""
+    scene = find_scene(name)
+    text = scene.text
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    return parse_scene(text, scene.folder)
+
+
+@pytest.fixture(scope="module")
+def turbinate_hex8() -> Mesh:
+    divisions = ("[13, 2, 13]", "[23, 3, 20]")
+    return build_mesh(variant("turbinate", ('"hex20"', '"hex8"'), divisions))
+
+
+def face_normals(mesh: Mesh) -> np.ndarray:
+    corner = mesh.nodes[mesh.faces[:, :4]]
+    normal = np.cross(corner[:, 2] - corner[:, 0], corner[:, 3] - corner[:, 1])
+    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+def test_elements_are_not_inverted(mesh) -> None:
+    for points in (2, 3):
+        assert jacobians(mesh, points)[0].min() > 0
+
+
+def test_boundary_is_closed_and_outward(mesh) -> None:
+    edges = Counter()
+    for face in mesh.faces[:, :4]:
+        edges.update(zip(face.tolist(), np.roll(face, -1).tolist(), strict=True))
+    # Every edge is walked once each way: closed, and consistently oriented.
+    assert set(edges.values()) == {1}
+    assert all(edge[::-1] in edges for edge in edges)
+    # By the divergence theorem the enclosed volume is positive only if the normals point out.
+    a, b, c, d = np.moveaxis(mesh.nodes[mesh.faces[:, :4]], 1, 0)
+    volume = sum(np.sum(p * np.cross(q, r)) / 6 for p, q, r in ((a, b, c), (a, c, d)))
+    assert volume == pytest.approx(mesh_quality(mesh)["volume_mm3"], rel=0.06)
+
+
+def test_every_node_is_used(mesh) -> None:
+    assert np.array_equal(np.unique(mesh.elements), np.arange(len(mesh.nodes)))
+    assert mesh.elements.dtype == mesh.faces.dtype == np.int32
+
+
+def test_midside_nodes_lie_near_the_middle_of_their_edge(mesh) -> None:
+    edges = [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4)]
+    edges += [(0, 4), (1, 5), (2, 6), (3, 7)]
+    for middle, (start, end) in enumerate(edges, start=8):
+        a, b, m = (mesh.nodes[mesh.elements[:, i]] for i in (start, end, middle))
+        length = np.linalg.norm(b - a, axis=1)
+        assert (np.abs(np.sum((m - (a + b) / 2) * (b - a), axis=1)) < 0.25 * length**2).all()
+
+
+def test_support_and_surface_are_apart(mesh) -> None:
+    assert mesh.clamped.any()
+    assert mesh.accessible.any()
+    assert not mesh.clamped[mesh.faces[mesh.accessible]].any()
+
+
+@pytest.mark.parametrize(
+    ("name", "degrees_of_freedom", "within"),
+    [("turbinate", 6048, 0.03), ("turbinate-fine", 40_000, 0.03)],
+)
+def test_promised_size(name: str, degrees_of_freedom: int, within: float) -> None:
+    assert shipped_mesh(name).nodes.size == pytest.approx(degrees_of_freedom, rel=within)
+
+
+def test_hexahedra_of_eight_nodes_have_the_promised_size_too(turbinate_hex8) -> None:
+    assert turbinate_hex8.nodes.size == pytest.approx(6048, rel=0.03)
+
+
+def test_turbinate_keeps_the_volume_of_the_section() -> None:
+    expected = 40.0 * abs(polygon_area(read_outline(OUTLINE)))
+    for name, tolerance in (("turbinate", 4e-3), ("turbinate-fine", 1e-3)):
+        volume = mesh_quality(shipped_mesh(name))["volume_mm3"]
+        assert volume == pytest.approx(expected, rel=tolerance)
+
+
+def test_turbinate_elements_are_well_shaped() -> None:
+    quality = mesh_quality(shipped_mesh("turbinate"))
+    assert quality["scaled_jacobian_min"] > 0.3
+    assert quality["scaled_jacobian_median"] > 0.85
+    assert quality["aspect_ratio_max"] < 10
+
+
+def test_turbinate_surface_is_the_medial_side_and_the_lower_edge_end_to_end() -> None:
+    mesh = shipped_mesh("turbinate")
+    touched = mesh.nodes[np.unique(mesh.faces[mesh.accessible])]
+    assert touched[:, 1].min() == 0.0
+    assert touched[:, 1].max() == pytest.approx(40.0)
+    assert touched[:, 0].min() == pytest.approx(1.2, abs=0.1)  # as far as the hook's tip
+    assert touched[:, 2].min() == pytest.approx(0.0, abs=0.05)  # round the lower edge
+    assert 15.0 < touched[:, 2].max() < 17.0
+    normals = face_normals(mesh)[mesh.accessible]
+    assert np.abs(normals[:, 1]).max() < 1e-12
+    assert normals[:, 0].max() > 0.99  # medial
+    assert normals[:, 2].min() < -0.99  # inferior
+    assert normals[:, 0].min() < -0.6  # lateral-inferior, towards the hook
+
+
+def test_turbinate_is_clamped_on_the_lip_only() -> None:
+    mesh = shipped_mesh("turbinate")
+    x, y, z = mesh.nodes[mesh.clamped].T
+    assert x.max() < 4.4
+    assert z.min() > 14.2
+    assert (y.min(), y.max()) == (0.0, pytest.approx(40.0))
+
+
+def test_outer_side_is_evenly_divided(turbinate_hex8) -> None:
+    mesh = turbinate_hex8
+    face = mesh.faces[mesh.accessible]
+    front = face[np.isclose(mesh.nodes[face, 1].min(axis=1), 0.0)]
+    corner = mesh.nodes[front][..., [0, 2]]
+    length = np.linalg.norm(corner - np.roll(corner, -1, axis=1), axis=2).max(axis=1)
+    assert length.max() < 1.1 * length.min()
+
+
+def test_section_map_follows_the_outline() -> None:
+    points = read_outline(OUTLINE)
+    section = map_section(points, find_scene("turbinate").geometry.corners)
+    along = np.linspace(0, 1, 400)
+    rim = [section(along, np.full_like(along, v)) for v in (0.0, 1.0)]
+    rim += [section(np.full_like(along, u), along) for u in (0.0, 1.0)]
+    gaps = np.linalg.norm(np.concatenate(rim)[:, None] - points[None], axis=2)
+    # The points lie 0.33 mm apart, so the nearest is at most about half of that away.
+    assert gaps.min(axis=1).max() < 0.18
+
+
+def test_quality_of_a_perfect_mesh() -> None:
+    assert mesh_quality(shipped_mesh("cube")) == pytest.approx(
+        {
+            "scaled_jacobian_min": 1.0,
+            "scaled_jacobian_median": 1.0,
+            "jacobian_ratio_min": 1.0,
+            "aspect_ratio_max": 1.0,
+            "volume_mm3": 1000.0,
+        }
+    )
+
+
+def test_local_thickness_of_a_block() -> None:
+    mesh = shipped_mesh("quick")
+    x, y, height = mesh.nodes.max(axis=0)
+    points = np.array([[3.1, 4.2, height], [0.0, 0.0, height], [x / 2, y / 2, height]])
+    up = np.tile([0.0, 0.0, 1.0], (3, 1))
+    assert local_thickness(mesh, points, up) == pytest.approx(height, rel=5e-3)
+    # Tilted, the ball touches the left side first: x / 2 - 0.6 D / 2 = D / 2.
+    tilted = np.array([[0.6, 0.0, 0.8]])
+    assert local_thickness(mesh, points[2:], tilted) == pytest.approx(x / 1.6, rel=5e-3)
+
+
+def test_local_thickness_of_the_turbinates_wall() -> None:
+    mesh = shipped_mesh("turbinate")
+    point = np.array([[10.12, 20.0, 9.4]])
+    thickness = local_thickness(mesh, point, np.array([[1.0, 0.0, 0.0]]))
+    # About straight across from the medial side to the deepest point of the inner one.
+    assert thickness == pytest.approx(10.12 - 5.58, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "message"),
+    [
+        ("quick", [('"bottom"', '"bottom"\nx = [20, 30]')], "support: no face"),
+        ("quick", [('"top"', '"top"\ny = [-2, -1]')], "surface: no face"),
+        ("turbinate", [("turbinate_section", "nothing")], "section: .* cannot be read"),
+        ("turbinate", [("[1.2, 2.9]", "[3.2, 7.0]")], "corners: must lie on the outline"),
+        (
+            "turbinate",
+            [("[[4.3, 17.7], [1.2, 2.9]", "[[1.2, 2.9], [4.3, 17.7]")],
+            "corners: .* clockwise",
+        ),
+    ],
+)
+def test_impossible_meshes_are_refused(name: str, changes, message: str) -> None:
+    with pytest.raises(SceneError, match=message):
+        build_mesh(variant(name, *changes))
+
+
+def test_a_scene_without_its_folder_cannot_be_meshed() -> None:
+    with pytest.raises(SceneError, match="folder"):
+        build_mesh(parse_scene(find_scene("turbinate").text))
+
+
+def write_outline(path: Path, points) -> Path:
+    np.savetxt(path, points, delimiter=",", header="x_mm,z_mm", comments="")
+    return path
+
+
+def circle(count: int) -> np.ndarray:
+    angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    return np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def test_an_outline_is_read_clockwise_whichever_way_it_runs(tmp_path) -> None:
+    for points in (circle(20), circle(20)[::-1]):
+        assert polygon_area(read_outline(write_outline(tmp_path / "c.csv", points))) < 0
+
+
+def test_a_round_section_keeps_its_area() -> None:
+    section = map_section(circle(64)[::-1], [[-0.7, 0.7], [0.7, 0.7], [0.7, -0.7], [-0.7, -0.7]])
+    # Green's theorem over the rim of the map.
+    t = np.linspace(0, 1, 200)
+    one, zero = np.ones_like(t), np.zeros_like(t)
+    rim = [section(zero, t), section(t, one), section(one, t[::-1]), section(t[::-1], zero)]
+    assert abs(polygon_area(np.concatenate(rim))) == pytest.approx(np.pi, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (np.column_stack([np.sin(np.arange(12)), np.cos(np.arange(12) * 2.5)]), "crosses itself"),
+        (circle(5), "at least 8"),
+        (np.vstack([circle(10), [[np.nan, 0.0]]]), "finite"),
+        (np.repeat(circle(10), 2, axis=0), "repeats"),
+        (np.ones((10, 3)), "x, z"),
+    ],
+)
+def test_bad_outlines_are_refused(tmp_path, points, message: str) -> None:
+    with pytest.raises(SceneError, match=message):
+        read_outline(write_outline(tmp_path / "outline.csv", points))
+
+
+def test_a_scene_is_found_by_name_or_path() -> None:
+    assert find_scene("quick") == find_scene(FOLDER / "quick.toml")
+    with pytest.raises(SceneError, match="turbinate-fine"):
+        find_scene("turbine")

@@ -1,0 +1,76 @@
+"""The pressure that moves the tissue as far as wanted, and where to look for it."""
+
+import numpy as np
+import pytest
+
+from palpate.offline.fem.model import NoEquilibrium
+from palpate.offline.reduce.load_path import LoadPath, pressure_that_moves
+from palpate.offline.run.workshop import Workshop
+from palpate.offline.scenes import find_scene
+
+
+@pytest.fixture(scope="module")
+def workshop():
+    return Workshop(find_scene("quick"))
+
+
+def spring(law, limit=np.inf):
+    """One node that moves by ``law(pressure)`` and has no equilibrium beyond ``limit``."""
+    asked = []
+
+    def solve(pressure, start):
+        asked.append(pressure)
+        if pressure > limit:
+            raise NoEquilibrium("load: too much")
+        return np.array([[0.0, 0.0, law(pressure)]])
+
+    return solve, asked
+
+
+@pytest.mark.parametrize("guess", [0.01, 1.0, 40.0])
+@pytest.mark.parametrize("power", [0.5, 1.0, 2.0])
+def test_it_finds_the_pressure_of_a_power_law(power, guess):
+    solve, asked = spring(lambda p: 2.0 * p**power)
+    pressure, exponent, _ = pressure_that_moves(solve, 3.0, guess)
+    assert pressure == pytest.approx(1.5 ** (1 / power), rel=1e-6)
+    assert exponent == pytest.approx(power, rel=1e-6)
+    assert len(asked) <= 12
+
+
+def test_a_known_exponent_saves_the_second_solution():
+    solve, asked = spring(lambda p: 2.0 * p)
+    assert pressure_that_moves(solve, 3.0, 1.45, exponent=1.0)[0] == pytest.approx(1.5)
+    assert len(asked) == 1
+
+
+def test_beyond_the_last_equilibrium_it_stops_within_three_percent():
+    solve, _ = spring(lambda p: p, limit=0.7)
+    assert 0.7 / 1.03 <= pressure_that_moves(solve, 3.0, 2.0)[0] <= 0.7
+
+
+def test_without_any_equilibrium_it_says_so():
+    solve, asked = spring(lambda p: p, limit=0.0)
+    with pytest.raises(NoEquilibrium):
+        pressure_that_moves(solve, 3.0, 2.0)
+    assert len(asked) < 15
+
+
+def test_the_path_is_near_the_full_model(workshop):
+    x = workshop.surface.vertices[len(workshop.surface.vertices) // 2]
+    nodal, normal = workshop.unit_load(x)
+    force = -nodal[:, None] * normal
+    path = LoadPath(workshop.model, force.reshape(-1)[workshop.model.free])
+    limit = workshop.load_range(x)[0]
+    for share, allowed in ((0.1, 1e-3), (0.5, 0.02), (1.0, 0.1)):
+        exact = workshop.model.solve(share * limit * force).displacement
+        error = np.linalg.norm(path.solve(share * limit, None) - exact)
+        assert error <= allowed * np.linalg.norm(exact)
+
+
+def test_the_limit_moves_the_tissue_by_the_indentation(workshop):
+    x = workshop.surface.vertices[len(workshop.surface.vertices) // 2]
+    nodal, normal = workshop.unit_load(x)
+    limit = workshop.load_range(x)[0]
+    u = workshop.model.solve(-limit * nodal[:, None] * normal).displacement
+    wanted = workshop.scene.load.max_indentation * workshop.scene.geometry.size[2]
+    assert np.linalg.norm(u, axis=1).max() == pytest.approx(wanted, rel=0.01)

@@ -1,0 +1,98 @@
+import threading
+
+import pytest
+from starlette.testclient import TestClient
+
+from palpate.online.serve.app import create_app
+from palpate.online.serve.settings import Settings
+from palpate.online.serve.store import Store
+from palpate.shared.errors import PalpateError
+
+from ..fake_model import FakeModel
+
+
+@pytest.fixture
+def slow_store(tmp_path):
+    """Return a store that is loading until the returned event is set."""
+    (tmp_path / "toy.h5").touch()
+    loaded = threading.Event()
+
+    def load(path):
+        loaded.wait()
+        return FakeModel()
+
+    return Store(tmp_path, load), loaded
+
+
+def test_it_lives_at_once_and_is_ready_when_warm(slow_store, tmp_path):
+    store, loaded = slow_store
+    ready = threading.Event()
+    app = create_app(Settings(tmp_path), store, on_ready=lambda store: ready.set())
+    with TestClient(app) as client:
+        assert client.get("/health").json() == {"status": "ok"}
+        for path in ("/ready", "/scenes", "/scenes/toy", "/scenes/toy/mesh"):
+            response = client.get(path)
+            assert response.status_code == 503
+            assert response.json()["error"]["code"] == "not_ready"
+        loaded.set()
+        assert ready.wait(5.0)
+        assert client.get("/ready").json() == {"status": "ready"}
+
+
+def test_a_service_that_is_told_to_stop_does_not_wait_for_its_models(slow_store, tmp_path):
+    store, loaded = slow_store
+    with TestClient(create_app(Settings(tmp_path), store)) as client:
+        assert client.get("/ready").status_code == 503
+    assert not store.ready
+    assert not loaded.is_set()
+    loaded.set()
+
+
+def test_a_service_without_any_model_is_not_ready(serve):
+    with serve(broken=PalpateError("broken.h5: truncated")) as client:
+        response = client.get("/ready")
+        assert response.status_code == 503
+        assert "broken.h5: truncated" in response.json()["error"]["message"]
+        assert client.get("/scenes").json()["refused"]
+
+
+def test_openapi_tells_units_ranges_and_examples(client):
+    document = client.get("/openapi.json").json()
+    schemas = document["components"]["schemas"]
+    contact = schemas["Contact"]["properties"]
+    assert "mm" in contact["position"]["description"]
+    assert "kPa" in contact["pressure"]["description"]
+    assert contact["pressure"]["minimum"] == 0
+    assert contact["position"]["maxItems"] == 3
+    assert schemas["SolveRequest"]["examples"]
+    assert schemas["SolveRequest"]["properties"]["contacts"]["maxItems"] == 1
+    solve = document["paths"]["/scenes/{name}/solve"]["post"]
+    reference = solve["requestBody"]["content"]["application/json"]["schema"]["$ref"]
+    assert reference == "#/components/schemas/SolveRequest"
+    assert set(solve["responses"]["200"]["content"]) == {
+        "application/json",
+        "application/octet-stream",
+        "application/msgpack",
+    }
+
+
+def test_the_documented_example_is_a_request_of_the_right_form(client):
+    schemas = client.get("/openapi.json").json()["components"]["schemas"]
+    example = schemas["SolveRequest"]["examples"][0]
+    assert client.post("/scenes/toy/check", json=example).json() == {"valid": True}
+
+
+def test_answers_are_as_documented(client):
+    """Hot answers bypass their models at run time, so hold them against the models here."""
+    from palpate.online.serve.schemas import Answer, Mesh, SceneList, SceneSummary
+
+    example = client.get("/scenes/toy").json()["example"]
+    answer = client.post("/scenes/toy/solve", json={**example, "region": "surface"}).text
+    documents = {
+        Answer: answer,
+        Mesh: client.get("/scenes/toy/mesh").text,
+        SceneList: client.get("/scenes").text,
+        SceneSummary: client.get("/scenes/toy").text,
+    }
+    for model, text in documents.items():
+        model.model_validate_json(text, strict=True, extra="forbid")

@@ -1,0 +1,98 @@
+"""Histories over HTTP: the atlas's own answers, step by step, or refusals that name the field."""
+
+import numpy as np
+import pytest
+
+from palpate.online.serve import wire
+from palpate.online.serve.negotiation import BINARY
+from palpate.online.serve.schemas import MOST_STEPS
+from palpate.shared.model import ReducedModel
+from palpate.shared.reduced.history import History
+
+CONTACT = {"position": [5.0, 5.0, 8.0], "pressure": 2.0}
+STEPS = [
+    {"time": 0.05, "contact": CONTACT},
+    {"time": 0.5, "contact": CONTACT},
+    {"time": 0.5, "contact": None},
+    {"time": 0.8},
+]
+
+
+@pytest.fixture(scope="module")
+def atlas(visco_artifact):
+    return ReducedModel.load(visco_artifact)
+
+
+@pytest.fixture
+def ask(serve, atlas):
+    """Return a function that posts a history to the visco-elastic scene."""
+    with serve(visco=atlas) as client:
+
+        def ask(steps=STEPS, accept="application/json", **options):
+            return client.post(
+                f"/scenes/{atlas.name}/history",
+                json={"steps": steps, **options},
+                headers={"accept": accept},
+            )
+
+        yield ask
+
+
+def test_steps_are_those_of_the_atlas(ask, atlas):
+    answered = ask().json()
+    history = History()
+    assert answered["scene"] == atlas.name
+    for step, pressure, dt in zip(
+        answered["steps"], (2.0, 2.0, 0.0, 0.0), (0.05, 0.45, 0.0, 0.3), strict=True
+    ):
+        moment, history = atlas.step(history, dt, CONTACT["position"], pressure)
+        np.testing.assert_allclose(
+            step["contact_displacement"], moment.contact_displacement, rtol=1e-6, atol=1e-9
+        )
+        assert step["trust"]["converged"]
+        assert 0.0 < step["trust"]["error_estimate"]["displacement"] < 0.2
+        assert 0.0 < step["trust"]["error_estimate"]["von_mises"] < 0.2
+        assert step["contact"]["pressure"] == pressure
+        assert step["time"] == pytest.approx(moment.time)
+    pressed, held, released, rested = (s["contact_displacement"][2] for s in answered["steps"])
+    assert held < pressed < released < rested < 0.0
+
+
+def test_fields_are_those_of_the_end(ask, atlas):
+    response = ask(accept=BINARY, region="all")
+    head, fields = wire.decode(response.content)
+    assert len(head["steps"]) == len(STEPS)
+    assert fields["displacement"].shape == atlas.nodes.shape
+    assert fields["von_mises"].shape == (len(atlas.nodes),)
+    assert 0 < np.abs(fields["displacement"]).max() < 0.5
+
+
+def changed(number, **values):
+    steps = [dict(step) for step in STEPS]
+    steps[number] |= values
+    return steps
+
+
+@pytest.mark.parametrize(
+    ("steps", "field"),
+    [
+        ([], "steps"),
+        (STEPS * (MOST_STEPS // len(STEPS) + 1), "steps"),
+        (changed(1, time=-1.0), "steps.1.time"),
+        (changed(1, time=0.01), "steps"),
+        (changed(1, tiem=0.01), "steps.1.tiem"),
+        (changed(1, contact={**CONTACT, "pressure": -1.0}), "steps.1.contact.pressure"),
+        (changed(1, contact={**CONTACT, "pressure": 900.0}), "steps.1.contact.pressure"),
+        (changed(1, contact={**CONTACT, "position": [0, 0, 99.0]}), "steps.1.contact.position"),
+    ],
+)
+def test_what_is_wrong_is_named(ask, steps, field):
+    response = ask(steps)
+    assert response.status_code == 422
+    assert response.json()["error"]["field"] == field
+
+
+def test_elastic_scenes_refuse(client):
+    response = client.post("/scenes/toy/history", json={"steps": STEPS})
+    assert response.status_code == 404
+    assert response.json()["error"]["code"] == "no_time"

@@ -1,0 +1,78 @@
+import struct
+
+import msgpack
+import numpy as np
+import orjson
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
+
+from palpate.online.serve import wire
+from palpate.online.serve.negotiation import BINARY, JSON, MSGPACK
+
+HEAD = {"scene": "toy", "force": [0.0, -1.5, 2.25], "trust": {"converged": True}}
+FIELDS = {
+    "displacement": np.arange(6, dtype=np.float32).reshape(2, 3) / 3,
+    "von_mises": np.array([1.5, np.float32(0.1)], np.float32),
+}
+
+
+def test_json_has_fields_as_nested_lists():
+    document = orjson.loads(wire.encode(JSON, HEAD, FIELDS))
+    fields = document.pop("fields")
+    assert document == HEAD
+    for name, field in FIELDS.items():
+        np.testing.assert_array_equal(np.array(fields[name], np.float32), field)
+
+
+def test_msgpack_has_fields_as_bytes():
+    document = msgpack.unpackb(wire.encode(MSGPACK, HEAD, FIELDS))
+    entry = document["fields"]["displacement"]
+    assert entry["dtype"] == "float32"
+    np.testing.assert_array_equal(
+        np.frombuffer(entry["data"], "<f4").reshape(entry["shape"]), FIELDS["displacement"]
+    )
+
+
+def test_binary_is_laid_out_as_documented():
+    body = wire.encode(BINARY, HEAD, FIELDS)
+    magic, version, count, head_length, payload_length = struct.unpack("<4sHHII", body[:16])
+    assert (magic, version, count, payload_length) == (b"PLPT", 1, 2, 32)
+    assert head_length % 8 == 0
+    assert len(body) == 16 + head_length + payload_length
+    head = orjson.loads(body[16 : 16 + head_length])
+    entry = head["arrays"][1]
+    assert entry == {"name": "von_mises", "dtype": "float32", "shape": [2], "offset": 24}
+    assert struct.unpack_from("<2f", body, 16 + head_length + 24) == pytest.approx((1.5, 0.1))
+
+
+@given(
+    arrays(np.float32, array_shapes(min_side=0, max_dims=3)),
+    arrays(np.int32, array_shapes(min_side=0, max_dims=2)),
+    arrays(np.uint8, array_shapes(min_side=0, max_dims=1)),
+    st.text(max_size=20),
+)
+def test_binary_comes_back_as_it_went(floats, integers, octets, text):
+    sent = {"floats": floats, "integers": integers, "octets": octets}
+    head, received = wire.decode(wire.encode(BINARY, {"text": text}, sent))
+    assert head == {"text": text}
+    for name, array in sent.items():
+        assert received[name].dtype == array.dtype
+        np.testing.assert_array_equal(received[name], array)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda body: body[:10], "too few"),
+        (lambda body: body[:-1], "bytes where the prefix says"),
+        (lambda body: body + b"\0", "bytes where the prefix says"),
+        (lambda body: b"\x89HDF" + body[4:], "wrong magic"),
+        (lambda body: body[:4] + b"\x02\0" + body[6:], "layout version 2"),
+        (lambda body: body[:6] + b"\x07\0" + body[8:], "2 arrays where the prefix says 7"),
+    ],
+)
+def test_damaged_documents_are_refused(damage, message):
+    with pytest.raises(wire.WireError, match=message):
+        wire.decode(damage(wire.encode(BINARY, HEAD, FIELDS)))

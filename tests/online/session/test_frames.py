@@ -1,0 +1,175 @@
+import struct
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from palpate.online.session import frames
+from palpate.online.session.frames import Extras, Flag, FrameError, Output, Request, VersionError
+
+REQUEST = Request(seq=7, client_time=1.5, position=(1.0, 2.0, 3.0), outputs=5)
+
+
+def step(patches=()):
+    touch = SimpleNamespace(
+        position=np.array([1.0, 2.0, 3.0]),
+        force=np.array([4.0, 5.0, 6.0]),
+        tangent=np.arange(9.0).reshape(3, 3),
+        energy=2.5,
+        contact_point=np.array([1.0, 2.0, 1.0]),
+        normal=np.array([0.0, 0.0, 1.0]),
+        depth=0.5,
+        penetration=0.01,
+        error_displacement=0.001,
+        error_von_mises=0.002,
+        error_force=0.003,
+        min_jacobian=0.9,
+        iterations=3,
+        patches=patches,
+    )
+    return SimpleNamespace(touch=touch, flags=7, steps=2, valid_radius=0.25, solve_seconds=1e-4)
+
+
+def test_every_field_lies_on_a_multiple_of_its_size():
+    for dtype in (frames.REQUEST, frames.REPLY):
+        for kind, offset in dtype.fields.values():
+            assert offset % kind.base.itemsize == 0
+        assert dtype.itemsize % 8 == 0
+
+
+def test_the_layout_of_version_1_stays_as_it_is():
+    """Clients are written against these numbers: a change of them is a new version."""
+    assert frames.VERSION == 1
+    assert (frames.REQUEST.itemsize, frames.REPLY.itemsize) == (40, 272)
+    offsets = {name: offset for name, (_, offset) in frames.REPLY.fields.items()}
+    assert (offsets["position"], offsets["force"], offsets["tangent"]) == (32, 56, 80)
+    assert (offsets["valid_radius"], offsets["superseded"], offsets["outputs"]) == (164, 256, 270)
+
+
+def test_a_request_comes_back():
+    assert frames.decode_request(frames.encode_request(REQUEST)) == REQUEST
+
+
+def test_a_reply_comes_back():
+    patches = ((12, 0.75, None), (3, 0.25, None))
+    frame = frames.encode_reply(REQUEST, step(patches), superseded=4, received=10.0, sent=10.5)
+    reply = frames.decode_reply(frame)
+    assert (reply.seq, reply.client_time, reply.flags) == (7, 1.5, 7)
+    assert (reply.server_received, reply.server_sent, reply.superseded) == (10.0, 10.5, 4)
+    np.testing.assert_array_equal(reply.position, [1, 2, 3])
+    np.testing.assert_array_equal(reply.force, [4, 5, 6])
+    np.testing.assert_array_equal(reply.tangent, np.arange(9.0).reshape(3, 3))
+    np.testing.assert_array_equal(reply.contact_point, [1, 2, 1])
+    np.testing.assert_array_equal(reply.model, [12, 3, -1, -1])
+    np.testing.assert_array_equal(reply.weight, [0.75, 0.25, 0, 0])
+    assert (reply.energy, reply.depth, reply.valid_radius) == (2.5, 0.5, 0.25)
+    assert reply.solve_time == np.float32(1e-4)
+    assert (reply.iterations, reply.steps, reply.nodes, reply.outputs) == (3, 2, 0, 0)
+    assert reply.contact
+    assert reply.good
+    assert reply.coordinates is reply.displacement is reply.von_mises is None
+
+
+@pytest.mark.parametrize("error", [3.5e38, 1e300, float("inf")])
+def test_estimates_too_large_for_their_field_are_unknown(error):
+    huge = step()
+    huge.touch.error_displacement = huge.touch.error_von_mises = huge.touch.error_force = error
+    reply = frames.decode_reply(frames.encode_reply(REQUEST, huge))
+    assert reply.error_displacement == reply.error_von_mises == reply.error_force == np.inf
+    huge.touch.error_force = 3e38
+    assert frames.decode_reply(frames.encode_reply(REQUEST, huge)).error_force < np.inf
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_extras_come_back(rng, half):
+    kind = np.float16 if half else np.float32
+    extras = Extras(
+        outputs=sum(Output) if half else sum(Output) - Output.HALF,
+        coordinates=rng.random((frames.MODELS, 6), np.float32),
+        displacement=rng.random((11, 3)).astype(kind),
+        von_mises=rng.random(11).astype(kind),
+        max_von_mises=3.0,
+        p99_von_mises=2.0,
+    )
+    reply = frames.decode_reply(frames.encode_reply(REQUEST, step(), extras))
+    for name in ("coordinates", "displacement", "von_mises"):
+        np.testing.assert_array_equal(getattr(reply, name), getattr(extras, name))
+    assert (reply.max_von_mises, reply.p99_von_mises, reply.nodes) == (3.0, 2.0, 11)
+
+
+@pytest.mark.parametrize("flag", [Flag.CLAMPED, Flag.FALLBACK])
+def test_a_reply_for_another_position_is_not_good(flag):
+    answer = step()
+    answer.flags |= flag
+    assert not frames.decode_reply(frames.encode_reply(REQUEST, answer)).good
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"outputs": 1 << 9}, "outputs"),
+        ({"client_time": float("nan")}, "client_time"),
+        ({"client_time": float("-inf")}, "client_time"),
+        ({"position": (float("nan"), 0.0, 0.0)}, "position"),
+        ({"position": (0.0, float("inf"), 0.0)}, "position"),
+        ({"position": (0.0, 0.0, -1.1e4)}, "position"),
+    ],
+)
+def test_nonsense_names_the_field(change, field):
+    with pytest.raises(FrameError) as error:
+        frames.decode_request(frames.encode_request(REQUEST._replace(**change)))
+    assert error.value.field == field
+
+
+@pytest.mark.parametrize("decode", [frames.decode_request, frames.decode_reply])
+def test_other_versions_and_sizes_are_refused(decode):
+    with pytest.raises(VersionError, match="is 2"):
+        decode(struct.pack("<H", 2) + bytes(300))
+    for size in (0, 1, 2, 39, 41, 271, 273):
+        with pytest.raises(FrameError, match="bytes"):
+            decode(struct.pack("<H", 1)[:size] + bytes(max(0, size - 2)))
+
+
+def test_a_reply_cut_short_is_refused(rng):
+    extras = Extras(outputs=Output.VON_MISES, von_mises=rng.random(5, np.float32))
+    frame = frames.encode_reply(REQUEST, step(), extras)
+    with pytest.raises(FrameError, match="within von_mises"):
+        frames.decode_reply(frame[:-1])
+    with pytest.raises(FrameError, match="fields say"):
+        frames.decode_reply(frame + b"x")
+
+
+@given(st.binary(max_size=80))
+def test_any_bytes_are_a_request_or_an_error(data):
+    try:
+        request = frames.decode_request(data)
+    except FrameError:
+        return
+    assert np.isfinite([request.client_time, *request.position]).all()
+
+
+@given(st.binary(max_size=38))
+def test_any_bytes_of_this_version_are_a_request_or_an_error(data):
+    test_any_bytes_are_a_request_or_an_error.hypothesis.inner_test(b"\x01\x00" + data.ljust(38))
+
+
+def test_the_layout_is_told_as_it_is():
+    layout = frames.layout()
+    assert layout["reply"]["size"] == frames.REPLY.itemsize
+    for field in layout["reply"]["fields"]:
+        kind, offset = frames.REPLY.fields[field["name"]]
+        assert (offset, kind.base.name, kind.shape) == (
+            field["offset"],
+            field["type"],
+            field["shape"],
+        )
+    assert f"| {frames.REPLY.fields['force'][1]} | force |" in frames.tables()
+    assert layout["flags"]["FALLBACK"] == Flag.FALLBACK
+
+
+def test_the_readme_has_the_layout():
+    readme = Path(__file__).parents[3] / "README.md"
+    assert frames.tables().rstrip() in readme.read_text()

@@ -1,0 +1,195 @@
+import asyncio
+import json
+
+import h5py
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from palpate.online import commands
+from palpate.online.client.http import AsyncClient, Client
+from palpate.online.client.session import Session
+from palpate.online.session.follower import Follower
+from palpate.online.session.frames import (
+    REPLY_FIELDS,
+    Flag,
+    Output,
+    Request,
+    encode_reply,
+    encode_request,
+)
+from palpate.online.session.recording import ASKED, Recorder, RecordingError, read_recording
+from palpate.online.session.replay import replay
+from palpate.shared.model import ReducedModel
+
+from ..fake_model import FakeModel
+
+
+@pytest.fixture
+def stiff():
+    """Return a toy that needs many strides, so that the number of steps matters."""
+    atlas = FakeModel()
+    atlas.stride = 0.3
+    return atlas
+
+
+@pytest.fixture
+def recorded(serving, stiff, tmp_path, rng):
+    """Return the recording of a wild session, and its replies."""
+    path = tmp_path / "session.h5"
+    positions = rng.uniform([0, 0, 4.5], [10, 10, 8], (100, 3))
+    with (
+        serving(toy=stiff) as url,
+        Client(url) as client,
+        client.session("toy", record=path) as session,
+    ):
+        replies = [
+            session.step(position, Output.STRESS if i % 3 == 0 else 0)
+            for i, position in enumerate(positions)
+        ]
+        for i in range(50):  # without waiting, so that some are superseded
+            session.send((5.0, 5.0, 7.0 - 0.01 * i))
+        while replies[-1].seq != 150:
+            replies.append(session.receive())
+    return path, replies
+
+
+def test_a_recording_holds_what_was_asked_and_answered(recorded):
+    path, replies = recorded
+    recording = read_recording(path)
+    assert recording.scene == "toy"
+    assert [request.seq for request in recording.requests] == [reply.seq for reply in replies]
+    assert len(replies) < 150
+    np.testing.assert_array_equal(recording.requests[-1].position, (5.0, 5.0, 7.0 - 0.49))
+    np.testing.assert_array_equal(recording.replies["force"], [reply.force for reply in replies])
+    assert (np.diff(recording.received) > 0).all()
+    with h5py.File(path) as file:
+        for field in (*ASKED, *REPLY_FIELDS):
+            assert file[field.name].attrs["units"] == field.unit
+            assert file[field.name].attrs["description"]
+
+
+def test_a_replay_gives_the_same_answers(recorded, stiff):
+    path, replies = recorded
+    flags = {reply.flags & (Flag.CLAMPED | Flag.FALLBACK) for reply in replies}
+    assert len(flags) > 1
+    report = replay(read_recording(path), stiff)
+    assert report == (len(replies), 0, None, 0.0)
+
+
+def test_a_replay_tells_what_differs(recorded, stiff):
+    path, _ = recorded
+    recording = read_recording(path)
+    stiff.stiffness *= 1.0 + 1e-15 * 8
+    report = replay(recording, stiff)
+    assert report.different > 0
+    assert 0 < report.force_difference < 1e-12
+    touching = np.flatnonzero(recording.replies["flags"] & Flag.CONTACT)
+    assert report.first_different == touching[0]
+
+
+def test_long_sessions_are_written_piece_by_piece(serving, tmp_path, monkeypatch):
+    monkeypatch.setattr("palpate.online.session.recording.CHUNK", 10)
+    path = tmp_path / "session.h5"
+    with (
+        serving(toy=FakeModel()) as url,
+        Client(url) as client,
+        client.session("toy", record=path) as session,
+    ):
+        for i in range(25):
+            session.step((5.0, 5.0, 7.0 - 0.01 * i))
+    assert [request.seq for request in read_recording(path).requests] == list(range(1, 26))
+
+
+def test_asyncio_sessions_are_recorded_too(url, tmp_path):
+    path = tmp_path / "session.h5"
+
+    async def run():
+        async with AsyncClient(url) as client, client.session("toy", record=path) as session:
+            return await session.step((5.0, 5.0, 6.5))
+
+    reply = asyncio.run(run())
+    np.testing.assert_array_equal(read_recording(path).replies["force"], [reply.force])
+
+
+def test_numbers_may_start_again(tmp_path):
+    follower = Follower(FakeModel())
+    with Recorder(tmp_path / "session.h5", {"scene": "toy"}) as recorder:
+        requests = [
+            Request(seq % 2**32, 0.0, (5.0, 5.0, 6.5)) for seq in range(2**32 - 2, 2**32 + 2)
+        ]
+        for request in requests:
+            recorder.sent(request)
+        last = requests[-1]
+        step = follower.follow(last.position, 0.0)
+        recorder.received(encode_reply(last, step, superseded=3), 1.0)
+        assert not recorder._requests
+    assert read_recording(tmp_path / "session.h5").requests == [last]
+
+
+@pytest.fixture
+def recorder(tmp_path):
+    with Recorder(tmp_path / "session.h5", {"scene": "toy"}) as recorder:
+        yield recorder
+
+
+def test_requests_that_were_refused_are_not_kept(recorder):
+    """The service complains of them without a number."""
+    follower = Follower(FakeModel())
+    for seq in range(1, 31):
+        request = Request(seq, 0.0, (5.0, 5.0, 6.5))
+        recorder.sent(request)
+        if seq % 10 == 0:
+            recorder.received(encode_reply(request, follower.follow(request.position, 0.0)), 1.0)
+            assert not recorder._requests
+
+
+def test_requests_without_any_reply_do_not_fill_the_memory(recorder, monkeypatch):
+    monkeypatch.setattr("palpate.online.session.recording.MOST_UNANSWERED", 10)
+    for seq in range(100):
+        recorder.sent(Request(seq, 0.0, (5.0, 5.0, 6.5)))
+    assert list(recorder._requests) == list(range(90, 100))
+
+
+def test_a_reply_to_a_frame_of_the_clients_own_is_left_out(url, tmp_path):
+    path = tmp_path / "session.h5"
+    with Session(url, "toy", record=path) as session:
+        session.send_bytes(encode_request(Request(77, 0.0, (5.0, 5.0, 6.5))))
+        assert session.receive().seq == 77
+        reply = session.step((5.0, 5.0, 6.4))
+    assert [request.seq for request in read_recording(path).requests] == [reply.seq]
+
+
+def test_other_files_are_refused(tmp_path):
+    text, foreign, newer = (tmp_path / name for name in ("text", "foreign", "newer"))
+    text.write_text("no HDF5")
+    with h5py.File(foreign, "w") as file:
+        file["x"] = [1.0]
+    with h5py.File(newer, "w") as file:
+        file.attrs["format"], file.attrs["format_version"] = "palpate-session", 9
+    for path, reason in (
+        (tmp_path / "missing", "cannot be read"),
+        (text, "cannot be read"),
+        (foreign, "not a recording"),
+        (newer, "version 9"),
+    ):
+        with pytest.raises(RecordingError, match=reason):
+            read_recording(path)
+
+
+def test_a_recording_of_another_scene_is_refused(recorded):
+    path, _ = recorded
+    with pytest.raises(RecordingError, match="of scene 'toy', the artifact of 'other'"):
+        replay(read_recording(path), FakeModel("other"))
+
+
+def test_the_command_tells_and_its_exit_code_too(recorded, stiff, monkeypatch):
+    path, replies = recorded
+    monkeypatch.setattr(ReducedModel, "load", lambda path: stiff)
+    result = CliRunner().invoke(commands.replay, [str(path), "toy.h5", "--json"])
+    assert result.exit_code == 0
+    assert json.loads(result.output)["replies"] == len(replies)
+    stiff.stiffness *= 2
+    result = CliRunner().invoke(commands.replay, [str(path), "toy.h5"])
+    assert result.exit_code == 1
+    assert "different" in result.output

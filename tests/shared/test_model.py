@@ -1,0 +1,159 @@
+"""Queries: which are answered, which are flagged as outside the range, which are refused."""
+
+import math
+
+import numpy as np
+import pytest
+
+from palpate.shared.errors import QueryError
+from palpate.shared.model import ReducedModel
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def atlas(artifact):
+    return ReducedModel.load(artifact)
+
+
+@pytest.fixture(scope="module")
+def contact(atlas):
+    """Return a contact point and half the pressure allowed there."""
+    x = atlas.models.centres[0]
+    return x, 0.5 * atlas.solve(x, 0.0).pressure_limit
+
+
+def tilted(atlas, degrees):
+    """A direction so far from the inward normal of the flat top."""
+    angle = math.radians(degrees)
+    return [math.sin(angle), 0.0, -math.cos(angle)]
+
+
+def test_an_answer_within_the_range_says_so(atlas, contact):
+    solution = atlas.solve(*contact)
+    assert solution.converged
+    assert solution.in_range
+    assert solution.out_of_range == ()
+    assert solution.distance == pytest.approx(0, abs=1e-9)
+    np.testing.assert_allclose(solution.direction, -solution.normal)
+    assert 0 < solution.min_jacobian < 1
+    assert 0 < solution.error_displacement < 0.1
+    assert 0 < solution.error_von_mises < 0.2
+    assert solution.contact_displacement @ solution.normal < 0
+
+
+def test_force_is_pressure_times_the_projected_footprint(atlas):
+    middle = atlas.nodes.max(axis=0) * [0.5, 0.5, 1.0]
+    solution = atlas.solve(middle, 2.0)
+    radius = atlas.scene.endoscope.radius
+    # the integral of (1 - rho^4)^2 over the disc, all of which lies on the top
+    area = math.pi * radius**2 * 8 / 15
+    np.testing.assert_allclose(solution.force, 2.0 * area * solution.direction, rtol=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("offset", "flags"),
+    [((0, 0, 1), ()), ((0, 0, -1), ()), ((-0.05, 0, 0), ()), ((-1, 0, 0), ("position",))],
+)
+def test_a_position_beside_the_surface_is_out_of_range_one_above_it_is_not(atlas, offset, flags):
+    edge = atlas.nodes.max(axis=0) * [0.0, 0.5, 1.0]
+    solution = atlas.solve(edge + offset, 0.1)
+    np.testing.assert_allclose(solution.contact_point, edge, atol=1e-9)
+    assert solution.out_of_range == flags
+
+
+@pytest.mark.parametrize(
+    ("changes", "flags"),
+    [
+        ({"pressure": 1.01}, ("pressure",)),
+        ({"tilt": 1.05}, ("direction",)),
+        ({"radius": 0.9}, ("radius",)),
+        ({"tilt": 1.05, "radius": 0.9}, ("direction", "radius")),
+        ({"pressure": 0.999, "tilt": 0.99}, ()),
+    ],
+)
+def test_what_is_outside_the_range_is_flagged(atlas, contact, changes, flags):
+    """Changes are relative to the largest values trained."""
+    endoscope = atlas.scene.endoscope
+    x, _ = contact
+    direction = tilted(atlas, changes.get("tilt", 0.0) * endoscope.max_tilt)
+    limit = atlas.solve(x, 0.0, direction).pressure_limit
+    radius = changes.get("radius", 1.0) * endoscope.radius
+    solution = atlas.solve(x, changes.get("pressure", 0.3) * limit, direction, radius)
+    assert solution.out_of_range == flags
+    assert solution.in_range == (not flags)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("pressure", math.nan),
+        ("pressure", math.inf),
+        ("pressure", -1e-9),
+        ("position", [math.nan, 0.0, 0.0]),
+        ("position", [0.0, math.inf, 0.0]),
+        ("position", [1.0, 2.0]),
+        ("position", "here"),
+        ("position", [5.0, 5.0, 500.0]),
+        ("direction", [0.0, 0.0, 0.0]),
+        ("direction", [0.0, math.nan, -1.0]),
+        ("direction", [0.0, -1.0]),
+        ("direction", [0.0, 0.0, 1.0]),
+        ("direction", [1.0, 0.0, 0.0]),
+        ("radius", 0.0),
+        ("radius", -1.0),
+        ("radius", 2.001),
+        ("radius", math.nan),
+    ],
+)
+def test_what_makes_no_sense_is_refused_by_name(atlas, contact, field, value):
+    query = {"position": contact[0], "pressure": contact[1], field: value}
+    with pytest.raises(QueryError) as refused:
+        atlas.solve(**query)
+    assert refused.value.field == field
+    assert str(refused.value)
+
+
+def test_a_position_off_the_surface_is_moved_to_it_within_reach(atlas, contact):
+    x, pressure = contact
+    reach = atlas.scene.endoscope.reach
+    solution = atlas.solve(x + 0.99 * reach * UP, pressure)
+    assert solution.distance == pytest.approx(0.99 * reach)
+    np.testing.assert_allclose(solution.contact_point, x, atol=1e-9)
+    with pytest.raises(QueryError, match=f"at most {reach} mm"):
+        atlas.solve(x + 1.01 * reach * UP, pressure)
+
+
+def test_the_length_of_a_direction_means_nothing(atlas, contact):
+    short, long = (atlas.solve(*contact, scale * np.array([0.2, 0.1, -1.0])) for scale in (1e-3, 7))
+    assert np.linalg.norm(long.direction) == pytest.approx(1)
+    np.testing.assert_allclose(short.force, long.force, rtol=1e-12)
+
+
+def test_no_pressure_moves_nothing(atlas, contact):
+    solution = atlas.solve(contact[0], 0.0)
+    assert solution.converged
+    assert np.abs(atlas.displacement(solution)).max() <= 1e-9
+    assert np.abs(atlas.von_mises(solution)).max() <= 1e-6
+
+
+def test_the_surface_is_part_of_the_whole(atlas, contact):
+    solution = atlas.solve(*contact)
+    whole = atlas.displacement(solution, "all")
+    assert (whole[atlas.clamped] == 0).all()
+    np.testing.assert_allclose(
+        atlas.displacement(solution, "surface"), whole[atlas.surface_nodes], atol=1e-6
+    )
+    stress = atlas.von_mises(solution, "all", whole)
+    np.testing.assert_array_equal(atlas.von_mises(solution, "surface"), stress[atlas.surface_nodes])
+
+
+def test_a_refused_query_leaves_the_state_as_it_was(atlas, contact):
+    x, pressure = contact
+    touched, untouched = atlas.new_state(), atlas.new_state()
+    for state in (touched, untouched):
+        atlas.solve(x, pressure, state=state)
+    with pytest.raises(QueryError):
+        atlas.solve(x, pressure, [0.0, 0.0, 1.0], state=touched)
+    answers = [atlas.solve(x, 0.9 * pressure, state=state) for state in (touched, untouched)]
+    np.testing.assert_array_equal(*[atlas.displacement(answer) for answer in answers])
