@@ -49,19 +49,19 @@ def bench(artifact: Path) -> dict[str, Any]:
     """
     atlas = ReducedModel.load(artifact)
     workshop = Workshop.of_artifact(read_artifact(artifact))
-    state, walker = atlas.new_state(), atlas.new_state()
+    state, walker = atlas.new_warm(), atlas.new_warm()
     rng = np.random.default_rng(atlas.scene.seed)
 
     def cold(load: Load) -> None:
         state.forget()
-        atlas.solve(load.position, load.pressure, load.direction, state=state)
+        atlas.press(load.position, load.pressure, load.direction, warm=state)
 
     def warm(load: Load) -> None:
-        atlas.solve(load.position, load.pressure, load.direction, state=walker)
+        atlas.press(load.position, load.pressure, load.direction, warm=walker)
 
     def with_fields(load: Load, region: Region) -> None:
         state.forget()
-        solution = atlas.solve(load.position, load.pressure, load.direction, state=state)
+        solution = atlas.press(load.position, load.pressure, load.direction, warm=state)
         displacement = atlas.displacement(solution)
         atlas.von_mises(solution, region, displacement)
         if region == "surface":
@@ -70,7 +70,7 @@ def bench(artifact: Path) -> dict[str, Any]:
     times: dict[str, list[float]] = {}
 
     def touch(position: Array) -> None:
-        atlas.touch(position, walker)
+        atlas.touch(position, warm=walker)
 
     def take(kind: str, query: Callable[[Any], object], loads: list[Any]) -> None:
         times.setdefault(kind, []).extend(_time(query, load) for load in loads)
@@ -84,7 +84,7 @@ def bench(artifact: Path) -> dict[str, Any]:
         take("surface_us", lambda load: with_fields(load, "surface"), loads)
         take("fields_us", lambda load: with_fields(load, "all"), loads)
         take("full_us", workshop.sample, loads[:1])
-        if atlas.tips is not None:
+        if atlas.models.tips is not None:
             first_touch, *touches = [tip_at(atlas, load) for load in (first, *steps)]
             touch(first_touch)
             take("tip_us", touch, touches)

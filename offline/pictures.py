@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.offline.vtu import CELL_TYPES
+from palpate.shared.answer import Answer
 from palpate.shared.errors import PalpateError
-from palpate.shared.model import ReducedModel, Solution
+from palpate.shared.model import ReducedModel
 
 Array = NDArray[np.float64]
 
@@ -71,7 +72,7 @@ def picture(
     except ImportError as error:
         raise PalpateError("pictures need PyVista: pip install -e '.[pictures]'") from error
     atlas = ReducedModel.load(artifact)
-    solution = atlas.solve(position, pressure, direction)
+    solution = atlas.press(position, pressure, direction)
     displacement = atlas.displacement(solution).astype(float)
     elements = atlas.body.elements
     grid = pv.UnstructuredGrid({CELL_TYPES[elements.shape[1]]: elements}, atlas.nodes)
@@ -126,7 +127,7 @@ def picture(
     plotter.close()
 
 
-def _tip_centre(surface: Array, solution: Solution) -> Array:
+def _tip_centre(surface: Array, solution: Answer) -> Array:
     """Centre of a ball that comes along the load's direction until it meets the surface (k, 3)."""
     d, R = solution.direction, solution.radius
     start = solution.contact_point + solution.contact_displacement
@@ -139,7 +140,7 @@ def _tip_centre(surface: Array, solution: Solution) -> Array:
     return centre
 
 
-def _endoscope(pv: Any, tip: Array, solution: Solution) -> list[Any]:
+def _endoscope(pv: Any, tip: Array, solution: Answer) -> list[Any]:
     """Surfaces of the half ball and of the shaft behind it."""
     d, R = solution.direction, solution.radius
     ball = pv.Sphere(radius=R, center=tip, theta_resolution=60, phi_resolution=60)
@@ -150,7 +151,7 @@ def _endoscope(pv: Any, tip: Array, solution: Solution) -> list[Any]:
     return [ball.clip(normal=-d, origin=tip), shaft]
 
 
-def _across(nodes: Array, solution: Solution) -> Array:
+def _across(nodes: Array, solution: Answer) -> Array:
     """The axis along which the body is cut: square to the load, or along a long body."""
     extent = np.ptp(nodes, axis=0)
     along_load = np.abs(solution.normal) + np.abs(solution.direction)
@@ -181,7 +182,7 @@ def _look(plotter: Any, towards: Array, up: Array) -> None:
     plotter.reset_camera_clipping_range()
 
 
-def _caption(solution: Solution) -> str:
+def _caption(solution: Answer) -> str:
     moved = float(np.linalg.norm(solution.contact_displacement))
     force = float(np.linalg.norm(solution.force))
     return (

@@ -61,7 +61,7 @@ def solve(
         under it.
     """
     atlas = ReducedModel.load(artifact)
-    solution, solve_us = _timed(lambda: atlas.solve(position, pressure, direction))
+    solution, solve_us = _timed(lambda: atlas.press(position, pressure, direction))
     if not solution.converged:
         raise NoEquilibrium(
             "pressure: no equilibrium found under this load; the model was trained for up to "
@@ -73,10 +73,14 @@ def solve(
             atlas.von_mises(solution).astype(float),
         )
     )
-    report = describe(atlas.name, solution) | {
-        "peak": _peaks(moved, stress),
-        "timing": {"solve_us": solve_us, "recover_us": recover_us},
-    }
+    report = (
+        {"scene": atlas.name}
+        | describe(solution)
+        | {
+            "peak": _peaks(moved, stress),
+            "timing": {"solve_us": solve_us, "recover_us": recover_us},
+        }
+    )
     if not (full_model or vtu):
         return report
     workshop = Workshop.of_artifact(read_artifact(artifact))

@@ -11,6 +11,7 @@ Every finished task is on disk before it counts; see ``run.checkpoint``.
 
 from __future__ import annotations
 
+import os
 import platform
 import subprocess
 import sys
@@ -49,8 +50,12 @@ from palpate.offline.reduce.sampling import (
 )
 from palpate.offline.reduce.size import Trial, TrialResult, choose, ladder
 from palpate.offline.reduce.tip_models import local_tips
-from palpate.offline.reduce.viscous import viscous_models
+from palpate.offline.reduce.transfer import FOLLOWED, overlaps
+from palpate.offline.reduce.transfer import neighbours as neighbouring
+from palpate.offline.reduce.viscous import deviatoric_of_all
 from palpate.offline.run.checkpoint import Checkpoint, content_key
+from palpate.offline.run.forecast import forecast
+from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.workers import Tasks, resume, worker_pool
 from palpate.offline.run.workshop import Load, TouchSample, Workshop, open_workshop, run
 from palpate.offline.scenes import default_artifact, find_scene
@@ -77,7 +82,6 @@ from palpate.offline.validate.tip import (
     TouchComparison,
     calibrate_touches,
     compare_touch,
-    fit_residuals,
     random_positions,
     summarise_touches,
 )
@@ -87,11 +91,11 @@ from palpate.offline.validate.tip_histories import (
     random_courses,
     summarise_courses,
 )
-from palpate.shared.artifact import Dataset, write_artifact
+from palpate.shared.artifact import ArtifactError, Dataset, read_artifact, write_artifact
 from palpate.shared.mechanics.footprint import TIP_DEPTH
-from palpate.shared.model import ESTIMATORS, Estimator, Estimators, LocalModels, ReducedModel
-from palpate.shared.reduced.press import NARROW
+from palpate.shared.model import ReducedModel
 from palpate.shared.scene import Scene, SceneError, Size, Tolerance
+from palpate.shared.tables import ESTIMATORS, Estimator, LocalModels, ViscousModels
 
 Array = NDArray[np.float64]
 
@@ -110,6 +114,9 @@ CONTACTS_PER_PATCH = 400
 
 TRIAL_PATCHES = 8
 
+PLACES = 64
+"""Where the reduced model is asked in one task."""
+
 TIP_SAMPLES = 300
 """Full solutions under the tip that validate and calibrate."""
 
@@ -119,8 +126,10 @@ MOST_COURSES = 48
 REFINED_LOADS = 4
 
 
-def train(scene: str | Path, out: Path | None = None, workers: int | None = None) -> Path:
-    """Train a scene and write its artifact.
+def train(
+    scene: str | Path, out: Path | None = None, workers: int | None = None, force: bool = False
+) -> Path:
+    """Train a scene and write its artifact, unless it is there already.
 
     Parameters
     ----------
@@ -130,6 +139,8 @@ def train(scene: str | Path, out: Path | None = None, workers: int | None = None
         ``artifacts/NAME.h5`` if absent.
     workers : int, optional
         Processes; one per core if absent.
+    force : bool
+        Train although the artifact is of this very scene and of this code.
 
     Returns
     -------
@@ -140,21 +151,35 @@ def train(scene: str | Path, out: Path | None = None, workers: int | None = None
     SceneError
         If the scene's element cannot be reduced.
     """
-    untrained = find_scene(scene)
+    started, untrained = time.perf_counter(), find_scene(scene)
     if untrained.geometry.element not in POINTWISE:
         raise SceneError(
             f"geometry.element: points of {untrained.geometry.element} share a dilatation, which "
             f"no cubature samples; train with {' or '.join(POINTWISE)} (hex20 does not lock)"
         )
+    path, key = out or default_artifact(untrained), content_key(untrained)
+    if not force and is_of(path, key):
+        tqdm.write(f"{path}: up to date; --force trains it again", file=sys.stderr)
+        return path
     trained, mesh_choice = with_mesh(untrained)
-    path = out or default_artifact(trained)
     path.parent.mkdir(parents=True, exist_ok=True)
     pool = worker_pool(open_workshop, trained.text, str(trained.folder), count=workers)
-    checkpoint = Checkpoint(path.parent / f".{path.stem}.training", content_key(trained))
+    checkpoint = Checkpoint(path.parent / f".{path.stem}.training", key)
     with pool:
-        Pipeline(trained, pool, checkpoint).run(path, mesh_choice)
+        pipeline = Pipeline(trained, pool, checkpoint, started)
+        count = workers or os.cpu_count() or 1
+        tqdm.write(forecast(pipeline.workshop, count), file=sys.stderr)
+        pipeline.run(path, mesh_choice)
     checkpoint.remove()
     return path
+
+
+def is_of(path: Path, key: str) -> bool:
+    """Whether an artifact is of the scene and code that ``content_key`` stands for."""
+    try:
+        return bool(read_artifact(path, ()).documents["provenance"]["content_key"] == key)
+    except ArtifactError:
+        return False
 
 
 @dataclass(frozen=True)
@@ -194,9 +219,18 @@ class Pipeline:
     executor : Executor
         Of workers initialized by ``open_workshop``.
     checkpoint : Checkpoint
+    started : float, optional
+        When the clock began to run, s; now if absent.
     """
 
-    def __init__(self, scene: Scene, executor: Executor, checkpoint: Checkpoint) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        executor: Executor,
+        checkpoint: Checkpoint,
+        started: float | None = None,
+    ) -> None:
+        self.started = time.perf_counter() if started is None else started
         self.scene = scene
         self.executor = executor
         self.checkpoint = checkpoint
@@ -224,15 +258,12 @@ class Pipeline:
         layout = self.layout(size)
         models = self.local_models(layout, limits)
         limits = self._lowered(models, limits)
+        atlas = self.workshop.untested(models, limits)
         estimators = {}
-        estimators["loads"], documents, rows = self._validate(models, limits)
+        estimators["loads"], documents, rows = self._validate(atlas)
         tip_rows: list[TouchComparison] = []
         if models.tips is not None:
-            atlas = self._untested(models, limits)
-            rng = np.random.default_rng([self.scene.seed, 7])
-            residuals = fit_residuals(self.workshop, atlas, rng)
-            models = replace(models, tips=replace(models.tips, residuals=residuals))
-            estimators["touches"], tip_rows = self._validate_tip(models, limits)
+            estimators["touches"], tip_rows = self._validate_tip(atlas)
             documents["validation_tip"] = summarise_touches(tip_rows)
         if 3 * len(self.workshop.mesh.nodes) <= MOST_DOFS:
             documents["mesh_error"] = self._mesh_error(limits)
@@ -242,10 +273,10 @@ class Pipeline:
         if mesh_choice is not None:
             documents["training"]["mesh_choice"] = mesh_choice
         if models.viscous is not None:
-            estimators["histories"], histories = self._validate_histories(models, limits)
+            estimators["histories"], histories = self._validate_histories(atlas)
             documents["validation_histories"] = summarise_histories(histories)
         if models.viscous_tips is not None:
-            estimators["courses"], courses = self._validate_courses(models, limits)
+            estimators["courses"], courses = self._validate_courses(atlas)
             documents["validation_tip_histories"] = summarise_courses(courses)
         self._write(path, models, limits, estimators, documents)
         report = path.parent / path.stem / "report"
@@ -256,14 +287,13 @@ class Pipeline:
 
     def untested_atlas(self, limits: Array, layout: Layout) -> ReducedModel:
         """An atlas without error estimate: stages 2 and 3 only."""
-        models = self.local_models(layout, limits)
-        return self._untested(models, limits)
+        return self.workshop.untested(self.local_models(layout, limits), limits)
 
     # --- stages --------------------------------------------------------------------------------
 
     def _load_range(self) -> Array:
         """Load range (v, LIMIT_FIELDS) at the vertices of the surface."""
-        rng = np.random.default_rng([self.scene.seed, 1])
+        rng = stream(self.scene.seed, Stage.LOAD_RANGE)
         count = spacing_count(self.surface, self.scene.training.limit_spacing)
         points = spread_points(self.surface, max(count, 16), rng)
         tasks = {f"range-{i}": (Workshop.load_range, x) for i, x in enumerate(points)}
@@ -278,7 +308,7 @@ class Pipeline:
     def _trial(self, size: Size, limits: Array) -> Trial:
         """Try a size on patches spread over the surface."""
         layout = self.layout(size)
-        rng = np.random.default_rng([self.scene.seed, 4])
+        rng = stream(self.scene.seed, Stage.TRIAL_PATCHES)
         places = spread_points(self.surface, min(TRIAL_PATCHES, len(layout.centres)), rng)
         chosen = np.unique(cKDTree(layout.centres).query(places)[1])
         footprints = self._footprints(layout, limits)
@@ -295,7 +325,7 @@ class Pipeline:
     def layout(self, size: Size) -> Layout:
         """Place patches, regions and Ritz vectors."""
         settings, surface = self.scene.training, self.surface
-        rng = np.random.default_rng([self.scene.seed, 2])
+        rng = stream(self.scene.seed, Stage.LAYOUT)
         centres = centred_points(surface, spacing_count(surface, size.patch_spacing), rng)
         normals = np.array([surface.project(x)[1] for x in centres])
         seeds = centred_points(surface, spacing_count(surface, settings.region_spacing), rng)
@@ -399,56 +429,48 @@ class Pipeline:
             point_from=np.concatenate([[0], np.cumsum([len(r.points) for r in results])]),
             points=np.concatenate([r.points for r in results]),
             weights=np.concatenate([r.weights for r in results]),
-            path=np.stack([r.path for r in results]).astype(np.float32),
             defect=np.stack([r.defect for r in results]).astype(np.float32),
             guess=np.stack([r.guess for r in results]).astype(np.float32),
+            directions=np.stack([r.directions for r in results]).astype(np.float32),
+            change=np.stack([r.change for r in results]).astype(np.float32),
             residuals=np.stack([r.residual for r in results]),
             extent=layout.extent,
             blend=self.scene.training.blend,
             tips=None,
         )
         if self.scene.endoscope.tip:
-            tips = [result.tip for result in results if result.tip is not None]
-            models = replace(models, tips=local_tips(self.workshop.model, models, tips))
+            trained = [result.tip for result in results if result.tip is not None]
+            models = replace(models, tips=local_tips(self.workshop.model, models, trained))
         if self.scene.tissue.prony:
-            model = self.workshop.model
-            models = replace(models, viscous=viscous_models(model, models, models.modes))
+            model, modes = self.workshop.model, models.modes
+            pairs = neighbouring(models, FOLLOWED * models.extent)
+            soft = deviatoric_of_all(model, models, modes)
+            viscous = ViscousModels(soft, pairs, overlaps(model, models, modes, pairs))
+            models = replace(models, viscous=viscous)
             if models.tips is not None:
-                viscous_tips = viscous_models(model, models, models.tips.modes)
+                tips = models.tips
+                soft = deviatoric_of_all(model, models, tips.modes)
+                viscous_tips = ViscousModels(soft, tips.pairs, tips.overlaps)
                 models = replace(models, viscous_tips=viscous_tips)
         return models
 
     def _lowered(self, models: LocalModels, limits: Array) -> Array:
         """Load range that ends before the tissue gives way, or slips off the tip."""
-        rng = np.random.default_rng([self.scene.seed, 8])
-        atlas = self._untested(models, limits)
-        limits = self._ending("giving way", limits, 0, lambda: lowered_limits(atlas, rng))
-        if models.tips is None:
-            return limits
-        rng = np.random.default_rng([self.scene.seed, 10])
-        tipped = self._untested(models, limits)
-        return self._ending("slipping off", limits, TIP_DEPTH, lambda: lowered_depths(tipped, rng))
-
-    def _ending(self, title: str, limits: Array, field: int, search: Callable[[], Array]) -> Array:
-        """What a search makes of the limits; say what it lowered."""
-        started = time.perf_counter()
-        lowered = search()
-        share = lowered[:, field] / limits[:, field]
-        tqdm.write(
-            f"{title}: load range lowered on {np.mean(share < 1):.1%} of the surface, "
-            f"to {share.min():.0%} of what it was",
-            file=sys.stderr,
-        )
-        self.seconds[title] = round(time.perf_counter() - started, 2)
+        ask = partial(self._ask, self.checkpoint.share("models", (models, limits)))
+        patches = len(models.centres)
+        rng = stream(self.scene.seed, Stage.GIVING_WAY)
+        lowered = lowered_limits(self.surface, limits, self.scene, patches, ask, rng)
+        _tell("giving way", lowered[:, 0] / limits[:, 0])
+        if models.tips is not None:
+            rng = stream(self.scene.seed, Stage.SLIPPING_OFF)
+            lowered = lowered_depths(self.surface, lowered, patches, ask, rng)
+            _tell("slipping off", lowered[:, TIP_DEPTH] / limits[:, TIP_DEPTH])
         return lowered
 
-    def _validate_tip(
-        self, models: LocalModels, limits: Array
-    ) -> tuple[Estimator, list[TouchComparison]]:
+    def _validate_tip(self, atlas: ReducedModel) -> tuple[Estimator, list[TouchComparison]]:
         """Validate under the tip, and calibrate its error estimate, as ``_validate`` does."""
-        rng = np.random.default_rng([self.scene.seed, 6])
-        atlas = self._untested(models, limits)
-        positions = random_positions(self.surface, limits, self.scene, TIP_SAMPLES, rng)
+        rng = stream(self.scene.seed, Stage.TIP_VALIDATION)
+        positions = random_positions(self.surface, atlas.limits, self.scene, TIP_SAMPLES, rng)
         answers = [atlas.touch(x) for x in positions]
         tasks = {
             f"touch-{i}": (Workshop.touch, answer.position, atlas.displacement(answer))
@@ -462,12 +484,9 @@ class Pipeline:
         ]
         return calibrate_by_halves(rows, calibrate_touches), rows
 
-    def _validate_histories(
-        self, models: LocalModels, limits: Array
-    ) -> tuple[Estimator, list[HistoryComparison]]:
+    def _validate_histories(self, atlas: ReducedModel) -> tuple[Estimator, list[HistoryComparison]]:
         """Validate over histories of loads, and calibrate their error estimate."""
-        rng = np.random.default_rng([self.scene.seed, 8])
-        atlas = self._untested(models, limits)
+        rng = stream(self.scene.seed, Stage.HISTORY_VALIDATION)
         histories = random_histories(atlas, self._courses, rng)
         tasks = {
             f"history-{i}": (Workshop.follow, *loads_of(presses))
@@ -481,13 +500,10 @@ class Pipeline:
         ]
         return calibrate_by_halves(rows, partial(calibrate_moments, quantities=ESTIMATED)), rows
 
-    def _validate_courses(
-        self, models: LocalModels, limits: Array
-    ) -> tuple[Estimator, list[CourseComparison]]:
+    def _validate_courses(self, atlas: ReducedModel) -> tuple[Estimator, list[CourseComparison]]:
         """Validate over histories of the tip, and calibrate their error estimate."""
-        rng = np.random.default_rng([self.scene.seed, 9])
-        atlas = self._untested(models, limits)
-        courses = random_courses(self.surface, limits, self.scene, self._courses, rng)
+        rng = stream(self.scene.seed, Stage.TIP_HISTORY_VALIDATION)
+        courses = random_courses(self.surface, atlas.limits, self.scene, self._courses, rng)
         tasks = {f"course-{i}": (Workshop.follow_tip, *course) for i, course in enumerate(courses)}
         found = self._full_histories("full histories under the tip", tasks, "usf")
         rows = [
@@ -510,17 +526,14 @@ class Pipeline:
         )
         return [found[name] for name in tasks]
 
-    def _validate(
-        self, models: LocalModels, limits: Array
-    ) -> tuple[Estimator, dict[str, Any], list[Comparison]]:
+    def _validate(self, atlas: ReducedModel) -> tuple[Estimator, dict[str, Any], list[Comparison]]:
         """Validate on random loads, and calibrate the error estimate with them.
 
         What validation says of the estimate is of one calibrated on the other half of the loads.
         """
-        rng = np.random.default_rng([self.scene.seed, 3])
+        rng = stream(self.scene.seed, Stage.VALIDATION)
         count, least = self.scene.training.samples, fewer(LEAST, self.scene.tolerance)
-        loads = random_loads(self.workshop.surface, limits, self.scene, count, rng)
-        atlas = self._untested(models, limits)
+        loads = random_loads(self.surface, atlas.limits, self.scene, count, rng)
         rows: list[Comparison] = []
         for start in range(0, count, BATCH):
             batch = {f"sample-{start + i}": load for i, load in enumerate(loads[start:][:BATCH])}
@@ -543,7 +556,7 @@ class Pipeline:
 
     def _mesh_error(self, limits: Array) -> dict[str, Any]:
         """Press at half the range on finer and other meshes."""
-        rng = np.random.default_rng([self.scene.seed, 5])
+        rng = stream(self.scene.seed, Stage.MESH_ERROR)
         tasks = {}
         count = fewer(REFINED_LOADS, self.scene.tolerance)
         for i, point in enumerate(spread_points(self.surface, count, rng)):
@@ -559,6 +572,21 @@ class Pipeline:
 
     def _range_at(self, points: Array, limits: Array) -> Array:
         return np.array([self.surface.locate(x, limits)[3] for x in points])
+
+    def _ask(
+        self,
+        path: Path,
+        title: str,
+        function: Callable[..., float],
+        rows: Sequence[tuple[Any, ...]],
+    ) -> Array:
+        """Values (k,) of a function of the reduced model; see ``Workshop.ask``."""
+        tasks = {
+            f"{title}-{i}": (Workshop.ask, path, function, rows[i : i + PLACES])
+            for i in range(0, len(rows), PLACES)
+        }
+        found = self._stage(title, tasks, lambda values: {"values": values})
+        return np.concatenate([found[name]["values"] for name in tasks])
 
     def _stage(
         self,
@@ -581,8 +609,7 @@ class Pipeline:
             "patches": len(layout.centres),
             "regions": int(layout.region.max()) + 1,
             "ritz_footprints": len(layout.ritz),
-            "wide_modes": models.modes.shape[2],
-            "narrow_modes": NARROW,
+            "modes": models.modes.shape[2],
             "cubature_points_median": float(np.median(points)),
             "cubature_points_max": int(points.max()),
             "quadrature_points": self.workshop.model.weights.size,
@@ -603,15 +630,8 @@ class Pipeline:
             "python": platform.python_version(),
             "git_commit": commit,
             "seed": self.scene.seed,
-            "content_key": content_key(self.scene),
+            "content_key": self.checkpoint.key,
         }
-
-    def _untested(self, models: LocalModels, limits: Array) -> ReducedModel:
-        """An atlas without error estimates."""
-        return ReducedModel(
-            self.scene.name, self.scene, {}, self.workshop.body, self.surface, limits, models,
-            Estimators(),
-        )  # fmt: skip
 
     def _write(
         self,
@@ -647,14 +667,17 @@ class Pipeline:
             "patch_pressures": Dataset(models.pressures, "kPa", "load scale of local models"),
             "patch_modes": Dataset(models.whole, "patch_mix", "modes in the basis of the region"),
             "patch_mix": Dataset(models.mix, one, "makes orthonormal modes of them", compress=True),
-            "patch_path": Dataset(
-                models.path.astype(np.float16), one, "derivatives along a load path, polynomials"
-            ),
             "patch_defect": Dataset(
                 models.defect.astype(np.float16), "mN", "force that cubature misses, polynomials"
             ),
             "patch_guess": Dataset(
-                models.guess.astype(np.float16), one, "first guess beyond the linear response"
+                models.guess.astype(np.float16), one, "answer beyond the linear one, polynomials"
+            ),
+            "patch_directions": Dataset(
+                models.directions.astype(np.float16), one, "in which the tangent changes"
+            ),
+            "patch_change": Dataset(
+                models.change.astype(np.float16), one, "change of the tangent there, polynomials"
             ),
             "patch_residuals": Dataset(
                 models.residuals, one, "log of the residual in the full model, polynomials"
@@ -710,12 +733,18 @@ class Pipeline:
                 "tip_viscous_deviatoric": Dataset(
                     viscous.deviatoric, one, "the same in the modes of the tip"
                 ),
-                "tip_viscous_overlap": Dataset(
-                    viscous.overlap.astype(np.float16), one, "products of these, by viscous_pairs"
-                ),
             }
-        documents["provenance"]["wall_seconds"] = round(sum(self.seconds.values()), 1)
+        documents["provenance"]["wall_seconds"] = round(time.perf_counter() - self.started, 1)
         write_artifact(path, self.scene.text, documents, datasets)
+
+
+def _tell(title: str, share: Array) -> None:
+    """Say where a search has lowered limits, and to which share of what they were."""
+    tqdm.write(
+        f"{title}: load range lowered on {np.mean(share < 1):.1%} of the surface, "
+        f"to {share.min():.0%} of what it was",
+        file=sys.stderr,
+    )
 
 
 def _accurate(rows: Sequence[Comparison], tolerance: Tolerance) -> bool:

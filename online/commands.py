@@ -45,9 +45,7 @@ _option = partial(click.option, show_default=True, show_envvar=True)
     "the command line is there for all to read.",
 )
 @_option(
-    "--public/--no-public",
-    default=False,
-    help="Serve other machines even though no token is set.",
+    "--public/--no-public", default=False, help="Serve other machines even though no token is set."
 )
 @_option(
     "--origin",
@@ -62,7 +60,8 @@ _option = partial(click.option, show_default=True, show_envvar=True)
     "--rate-limit",
     type=click.FloatRange(0),
     default=Settings.rate_limit,
-    help="Requests per second and client address; more are refused. 0: no limit.",
+    help="Requests per second and client address; more are refused. As many may come at once after "
+    "a pause; of a session only the opening counts. 0: no limit.",
 )
 @_option(
     "--max-wait",
@@ -74,13 +73,14 @@ _option = partial(click.option, show_default=True, show_envvar=True)
     "--max-body",
     type=click.IntRange(1024),
     default=Settings.max_body,
-    help="Most bytes of a request.",
+    help="Most bytes of a request; a query needs some hundred.",
 )
 @_option(
     "--max-json-numbers",
     type=click.IntRange(0),
     default=Settings.max_json_numbers,
-    help="Most numbers in a JSON answer's fields; the binary formats have no such limit.",
+    help="Most numbers in a JSON answer's fields, each of which keeps others waiting for 25 ns; "
+    "the binary formats have no such limit.",
 )
 @_option(
     "--max-sessions",
@@ -94,11 +94,7 @@ _option = partial(click.option, show_default=True, show_envvar=True)
     default=Settings.session_idle,
     help="Seconds after which a session that sends nothing is closed.",
 )
-@_option(
-    "--echo/--no-echo",
-    default=False,
-    help="Answer /echo, for palpate latency --session.",
-)
+@_option("--echo/--no-echo", default=False, help="Answer /echo, for palpate loadtest --echo.")
 @_option("--log-format", type=click.Choice(FORMATS), default=Settings.log_format)
 @_option("--log-level", type=click.Choice(LEVELS), default=Settings.log_level)
 @_option("--access-log/--no-access-log", default=False, help="Log every request.")
@@ -117,36 +113,6 @@ def serve(host: str, port: int, public: bool, **settings: Any) -> None:
     from palpate.online.serve.process import serve
 
     serve(Settings(**settings), host, port, public)
-
-
-@click.command()
-@click.argument("url")
-@click.argument("scene")
-@click.option("--rounds", type=click.IntRange(min=1), default=3000, show_default=True)
-@click.option("--session", is_flag=True, help="Measure the steps of a session; needs an --echo.")
-@click.option("--token", envvar="PALPATE_TOKEN", show_envvar=True)
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def latency(
-    url: str, scene: str, rounds: int, session: bool, token: str | None, as_json: bool
-) -> None:
-    """Measure what a running service at URL adds to a solve of SCENE.
-
-    Medians in µs over ROUNDS turns of an empty request, a solve without fields and one with all
-    fields in binary. The ratios are what is left of a round trip without the solve (and the
-    recovery of the fields), over the empty one.
-
-    With --session: over turns of a step of a session and an echo of frames of the same sizes,
-    which a service started with --echo gives. The ratio is what is left of a step without its
-    solve, over the echo.
-    """
-    from palpate.online.loadtest.latency import measure, measure_session
-
-    report = (measure_session if session else measure)(url, scene, rounds, token)
-    if as_json:
-        click.echo(json.dumps(report))
-        return
-    for name, value in report.items():
-        click.echo(f"{name:<16}{value:8.2f}")
 
 
 @click.command()
@@ -206,6 +172,12 @@ def latency(
     show_default=True,
     help="How deep the tools press, mm.",
 )
+@click.option(
+    "--echo",
+    is_flag=True,
+    help="Measure what the service adds to a solve, too: send as many frames again that are only "
+    "echoed (by a service started with --echo), and as many queries that are only checked.",
+)
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the paths.")
 @click.option("--token", envvar="PALPATE_TOKEN", show_envvar=True)
 @click.option(
@@ -220,7 +192,7 @@ def loadtest(outputs: tuple[str, ...], out: Path | None, as_json: bool, **plan: 
     Sessions move a tip over the whole accessible surface of SCENE at up to 50 mm/s, in and out of
     contact; queries press random places. A generator that never sleeps sends each message when it
     is due, whatever became of those before. Windows of 0.25 s in which the machine's host took
-    time or the generator was late are not clean; latencies are told with and without them. For
+    time or the generator was late are not clean; latencies are given with and without them. For
     Linux and macOS.
 
     \b
@@ -228,6 +200,7 @@ def loadtest(outputs: tuple[str, ...], out: Path | None, as_json: bool, **plan: 
       palpate loadtest http://127.0.0.1:8000 --sessions 4 --queries-per-second 20
       palpate loadtest http://127.0.0.1:8000 --sessions 0 --queries-per-second 200 --region none
       palpate loadtest http://127.0.0.1:8000 --sessions 4 --overload 10 --out overload.png
+      palpate loadtest http://127.0.0.1:8000 --rate 200 --queries-per-second 50 --echo
     """
     from palpate.online.loadtest.report import table
     from palpate.online.loadtest.run import Plan, run
@@ -246,7 +219,7 @@ def loadtest(outputs: tuple[str, ...], out: Path | None, as_json: bool, **plan: 
 @click.argument("artifact", type=click.Path(dir_okay=False, path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def replay(recording: Path, artifact: Path, as_json: bool) -> None:
-    """Answer a recorded session anew and compare, bit for bit.
+    """Answer a recorded session again and compare, bit for bit.
 
     RECORDING is what a client of a session wrote (`record=` of client.http); ARTIFACT the one
     that was served. The exit code is 1 if any reply differs. The same answers to the bit need the

@@ -15,7 +15,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from io import BufferedRandom, BufferedReader
 from pathlib import Path
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from palpate.shared.errors import PalpateError
 
 FORMAT = "palpate-artifact"
-FORMAT_VERSION = 6
+FORMAT_VERSION = 7
 
 SEAL_BYTES = 512
 """The smallest user block that HDF5 offers."""
@@ -104,8 +104,8 @@ def write_artifact(
         temporary.unlink(missing_ok=True)
 
 
-def read_artifact(path: Path) -> Artifact:
-    """Read and verify an artifact.
+def read_artifact(path: Path, names: Collection[str] | None = None) -> Artifact:
+    """Read and verify an artifact, with all of its arrays or only those named.
 
     Raises
     ------
@@ -116,7 +116,7 @@ def read_artifact(path: Path) -> Artifact:
         with path.open("rb") as file:
             _check_seal(file, path)
         with h5py.File(path, "r") as opened:
-            return _read(opened, path)
+            return _read(opened, path, names)
     except ArtifactError:
         raise
     except OSError as error:
@@ -145,9 +145,10 @@ def _digest_of_rest(file: BufferedReader | BufferedRandom) -> str:
     return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _read(file: h5py.File, path: Path) -> Artifact:
+def _read(file: h5py.File, path: Path, names: Collection[str] | None) -> Artifact:
     arrays = {}
-    for key, stored in file.items():
+    for key in file if names is None else names:
+        stored = file[key]
         arrays[key] = stored[()]
         if digest(arrays[key]) != stored.attrs["sha256"]:
             raise ArtifactError(f"{path}: altered: dataset {key!r} does not match its checksum")

@@ -13,9 +13,10 @@ from palpate.shared.errors import PalpateError
 
 EXAMPLE = """\b
 Example, from a scene to an answer:
-  palpate train quick --out artifacts/quick.h5
-  palpate info artifacts/quick.h5
-  palpate solve artifacts/quick.h5 --at 0 0 10 --pressure 2
+  palpate scene quick                                   every key of the scene, explained
+  palpate train quick                                   writes artifacts/quick.h5
+  palpate info quick
+  palpate solve quick --at 5 5 8 --pressure 1.5
   palpate serve --artifacts artifacts
 """
 
@@ -57,8 +58,9 @@ class _Commands(click.Group):
 def main() -> None:
     """Press soft tissue in real time.
 
-    A scene says what is pressed, by what and how accurately; train turns it into an artifact,
-    serve answers loads on it over HTTP. Units are mm, mN, kPa and s throughout.
+    A scene is a text file that says what is pressed, by what and how accurately. The command train
+    makes an artifact of it, which solve, serve and the others answer from. ARTIFACT is its file, or
+    the name of the scene. Units are mm, mN, kPa and s throughout.
 
     Set PALPATE_DEBUG=1 to see where an error came from.
     """

@@ -5,6 +5,8 @@ query for the sixty arrays it needs.  Inside compiled code a tuple travels array
 function to the next, which takes longer to compile.  A ``Bound`` value is one pointer for both.
 """
 
+import inspect
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from numba import njit, types
@@ -15,6 +17,14 @@ from numba.extending import intrinsic, overload
 
 @structref.register
 class _BoundType(types.StructRef):
+    """Type of a bound named tuple: its fields' types and the tuple's class, ``kind``."""
+
+    def __init__(self, fields, kind):
+        self.kind = kind
+        super().__init__(fields)
+        # tuples of two classes with the same fields are two types
+        types.Type.__init__(self, f"Bound({kind.__module__}.{kind.__qualname__}){self._fields}")
+
     def preprocess_fields(self, fields):
         """Drop literal types: they would compile a kernel anew for every value."""
         return tuple((name, types.unliteral(kind)) for name, kind in fields)
@@ -43,12 +53,14 @@ def _fill(typingctx, bound, content):
 
 
 def _new(content):
-    """Make a ``Bound`` of a named tuple, in compiled code."""
+    """Make a ``Bound`` of a named tuple that is none yet, in compiled code."""
 
 
 @overload(_new)
 def _new_compiled(content):
-    kind = _BoundType(zip(content.fields, content.types, strict=True))
+    if isinstance(content, _BoundType):
+        return lambda content: content
+    kind = _BoundType(zip(content.fields, content.types, strict=True), content.instance_class)
 
     def new(content):
         # the compiler passes the typing context
@@ -68,3 +80,29 @@ def bind(content: NamedTuple) -> Any:
     return bind_compiled(
         type(content)(*(bind(part) if hasattr(part, "_fields") else part for part in content))
     )
+
+
+def kind_of(value: types.Type) -> type | None:
+    """Class of the named tuple, bound or not, that a value of this numba type is."""
+    if isinstance(value, types.NamedTuple):
+        return value.instance_class
+    return value.kind if isinstance(value, _BoundType) else None
+
+
+def by_type(piece: Callable[..., Any], table: Mapping[type, Callable[..., Any]]) -> None:
+    """Compile calls of ``piece`` as calls of the function for the type of their first argument.
+
+    Parameters
+    ----------
+    piece : function
+        Names the arguments and says what is done; never run itself.
+    table : mapping of type to function
+        Of the classes of named tuples, bound or not; the functions have the arguments of ``piece``.
+    """
+
+    def choose(*args: types.Type) -> Callable[..., Any] | None:
+        kind = kind_of(args[0])
+        return None if kind is None else table.get(kind)
+
+    choose.__signature__ = inspect.signature(piece)  # type: ignore[attr-defined]
+    overload(piece, jit_options={"error_model": "numpy"})(choose)

@@ -2,15 +2,20 @@
 
 A scene is one TOML file. `load_scene` reads it, `parse_scene` reads its text (an artifact keeps the
 text verbatim, and nothing else is needed to get the scene back). Numbers are in mm, kPa, s and
-degrees. Whatever is wrong is refused with a `SceneError` that names the field.
+degrees. Keys that are absent get defaults; lengths among them are multiples of the endoscope's
+radius. Whatever is wrong is refused with one `SceneError` that names every field at fault.
+
+The descriptions of the fields are the documentation of the keys: `palpate scene` prints them.
 """
 
 from __future__ import annotations
 
 import difflib
 import tomllib
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import (
     BaseModel,
@@ -18,13 +23,22 @@ from pydantic import (
     Field,
     PrivateAttr,
     ValidationError,
+    ValidationInfo,
+    field_validator,
     model_validator,
 )
+from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
 from palpate.shared.errors import PalpateError
 
 ElementName = Literal["hex8", "hex8-mean-dilatation", "hex8-fbar", "hex20"]
+Element = Annotated[
+    ElementName,
+    Field(
+        description="hex20 or hex8, which locks; full model only: hex8-mean-dilatation, hex8-fbar"
+    ),
+]
 
 Positive = Annotated[float, Field(gt=0)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]
@@ -33,6 +47,7 @@ Divisions = tuple[
     Annotated[int, Field(ge=1, le=500)],
     Annotated[int, Field(ge=1, le=500)],
 ]
+CHOSEN = "the coarsest mesh whose error is at most three times the tolerance"
 Point2 = tuple[float, float]
 Range = tuple[float, float]
 
@@ -41,27 +56,24 @@ class SceneError(PalpateError):
     """A scene that cannot be used; the message names the file, the field and what is allowed."""
 
 
-class _Part(BaseModel):
+class Part(BaseModel):
     """A table of the scene file: immutable, strict about types, closed to unknown keys."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
-    @model_validator(mode="before")
-    @classmethod
-    def _refuse_unknown_keys(cls, data: Any) -> Any:
-        """Say which valid name an unknown key is nearest to, which `extra="forbid"` cannot."""
-        valid = list(cls.model_fields)
-        for key in data if isinstance(data, dict) else ():
-            if key not in valid:
-                near = difflib.get_close_matches(key, valid, n=1, cutoff=0.5)
-                hint = f"did you mean {near[0]!r}?" if near else f"valid are {', '.join(valid)}"
-                raise PydanticCustomError(
-                    "unknown_key", "unknown key '{key}'; {hint}", {"key": key, "hint": hint}
-                )
-        return data
+
+def _in_radii(multiple: float, description: str) -> Any:
+    """Field of a length (mm) that is a multiple of the endoscope's radius unless it is given."""
+    extra: Any = {"absent": f"{multiple:g} radii of the endoscope", "radii": multiple}
+    return Field(description=description, json_schema_extra=extra)
 
 
-class Extrusion(_Part):
+def _chosen(absent: str, description: str) -> Any:
+    """Field that may be absent; what stands for it then is no value, but said in words."""
+    return Field(None, description=description, json_schema_extra={"absent": absent})
+
+
+class Extrusion(Part):
     """A cross-section in the x-z plane, extruded along y.
 
     The four corners split the outline into the sides `lip` (from the last corner to the first),
@@ -69,22 +81,23 @@ class Extrusion(_Part):
     `posterior` (y = 0) and `anterior` (y = length).
     """
 
-    kind: Literal["extrusion"]
+    kind: Literal["extrusion"] = Field(
+        description="section along y; sides: lip, outer, tip, inner, posterior, anterior"
+    )
     section: str = Field(min_length=1, description="CSV file of the outline, beside the scene file")
     corners: tuple[Point2, Point2, Point2, Point2] = Field(
-        description="(x, z) mm: lip-outer, outer-tip, tip-inner and inner-lip corner"
+        description="(x, z), mm: lip-outer, outer-tip, tip-inner, inner-lip corner"
     )
-    length: Positive = Field(description="mm, along y")
-    element: ElementName
-    divisions: Divisions | None = Field(
-        None,
-        description="elements [along the section, through it, along y]; chosen if absent",
+    length: Positive = Field(description="length along y, mm")
+    element: Element = "hex20"
+    divisions: Divisions | None = _chosen(
+        CHOSEN, "elements [along the section, through it, along y]"
     )
     grading: float = Field(
         1.0,
         ge=1,
         le=3,
-        description="thins the elements towards the outer side: depth = (layer / layers)^grading",
+        description="depth over thickness = (layer / layers)^grading: thin layers outside",
     )
 
     @property
@@ -93,15 +106,13 @@ class Extrusion(_Part):
         return ("lip", "tip", "posterior", "anterior", "inner", "outer")
 
 
-class Block(_Part):
+class Block(Part):
     """A box with one corner at the origin; its sides are named as seen along +y."""
 
-    kind: Literal["block"]
-    size: tuple[Positive, Positive, Positive] = Field(description="[x, y, z] mm")
-    element: ElementName
-    divisions: Divisions | None = Field(
-        None, description="elements along [x, y, z]; chosen if absent"
-    )
+    kind: Literal["block"] = Field(description="box; sides: left, right, front, back, bottom, top")
+    size: tuple[Positive, Positive, Positive] = Field(description="lengths along [x, y, z], mm")
+    element: Element = "hex20"
+    divisions: Divisions | None = _chosen(CHOSEN, "elements along [x, y, z]")
 
     @property
     def sides(self) -> tuple[str, ...]:
@@ -116,16 +127,16 @@ def divisions_of(geometry: Extrusion | Block) -> Divisions:
     return geometry.divisions
 
 
-class Tissue(_Part):
+class Tissue(Part):
     """What the body is made of."""
 
-    law: Literal["neo-hookean"]
+    law: Literal["neo-hookean"] = Field(description="elastic law; neo-hookean is FEAP's")
     young: Positive = Field(description="Young's modulus at rest, kPa")
     poisson: float = Field(ge=0, lt=0.5, description="Poisson's ratio at rest")
     prony: tuple[tuple[Fraction, Positive], ...] = Field(
         (),
         max_length=6,
-        description="[[share, time constant in s], ...]: what the isochoric stress loses with time",
+        description="[[share of the isochoric stress that is lost, time constant in s], ...]",
     )
 
     @model_validator(mode="after")
@@ -140,13 +151,15 @@ class Tissue(_Part):
         return self
 
 
-class Patch(_Part):
+class Patch(Part):
     """The part of one side of the body whose points lie within the given ranges."""
 
-    side: str
-    x: Range | None = Field(None, description="[from, to] mm")
-    y: Range | None = Field(None, description="[from, to] mm")
-    z: Range | None = Field(None, description="[from, to] mm")
+    side: str = Field(
+        description="side of the body, such as top of a block or outer of an extrusion"
+    )
+    x: Range | None = _chosen("all of it", "[from, to] mm")
+    y: Range | None = _chosen("all of it", "[from, to] mm")
+    z: Range | None = _chosen("all of it", "[from, to] mm")
 
     @model_validator(mode="after")
     def _ranges_ascend(self) -> Patch:
@@ -159,29 +172,32 @@ class Patch(_Part):
         return self
 
 
-class Endoscope(_Part):
+class Endoscope(Part):
     """The instrument that presses."""
 
-    radius: Positive = Field(description="of the pressed footprint, and of the tip, mm")
-    max_tilt: float = Field(ge=0, lt=90, description="of the load from the inward normal, degrees")
-    reach: Positive = Field(description="largest distance of a queried position from the body, mm")
-    tip: bool = Field(False, description="whether to train it as a rigid spherical tip, too")
-
-
-class Load(_Part):
-    """How hard it presses."""
-
-    max_indentation: Fraction = Field(
-        description="largest displacement over local thickness; training finds the pressure that "
-        "causes it at every contact point, pressed along the normal"
+    radius: Positive = Field(description="radius of the pressed footprint, and of the tip, mm")
+    max_tilt: float = Field(
+        ge=0, lt=90, description="largest angle of a load to the inward normal, degrees"
+    )
+    reach: Positive = _in_radii(1.5, "largest distance of a queried position from the body, mm")
+    tip: bool = Field(
+        False, description="whether to train for a rigid spherical tip too, for sessions"
     )
 
 
-class Tolerance(_Part):
+class Load(Part):
+    """How hard it presses."""
+
+    max_indentation: Fraction = Field(
+        description="largest displacement over local thickness; sets the range of pressures"
+    )
+
+
+class Tolerance(Part):
     """The errors a query may have against the full model on the same mesh."""
 
-    displacement: Fraction = Field(description="relative L2 error over all nodes")
-    von_mises: Fraction = Field(description="relative L2 error over all unclamped nodes")
+    displacement: Fraction = Field(0.01, description="relative L2 error over all nodes")
+    von_mises: Fraction = Field(0.02, description="relative L2 error over all unclamped nodes")
 
     @property
     def looseness(self) -> float:
@@ -192,48 +208,63 @@ class Tolerance(_Part):
         return max(1.0, min(self.displacement / 0.01, self.von_mises / 0.02))
 
 
-class Budget(_Part):
+class Budget(Part):
     """The time a query may take."""
 
-    query: Positive = Field(description="time for one cold query, s")
+    query: Positive = Field(150e-6, description="time for one cold query, s")
 
 
-class Size(_Part):
+class Size(Part):
     """How large a reduced model is."""
 
-    patch_spacing: Positive = Field(description="of the centres of local models, mm")
-    modes: int = Field(ge=20, le=400, multiple_of=4, description="of a local model's wide space")
-    cubature_points: int = Field(ge=16, le=5000, multiple_of=16, description="of a local model")
-    region_modes: int = Field(ge=4, le=2000, description="of a region")
+    patch_spacing: Positive = Field(description="distance of the centres of local models, mm")
+    modes: int = Field(ge=20, le=400, multiple_of=4, description="number of modes of a local model")
+    cubature_points: int = Field(
+        ge=16, le=5000, multiple_of=16, description="number of points of a local model"
+    )
+    region_modes: int = Field(ge=4, le=2000, description="number of modes of a region")
 
 
-class Training(_Part):
+class Training(Part):
     """How the reduced model is trained."""
 
-    limit_spacing: Positive = Field(description="of points where the largest pressure is found, mm")
-    region_spacing: Positive = Field(description="of the regions that share a basis, mm")
-    blend: Positive = Field(description="width over which neighbouring local models blend, mm")
-    samples: int = Field(ge=60, description="full solutions that validate and calibrate, at most")
-    size: Size | None = Field(
-        None, description="of the reduced model; if absent, the smallest that meets the tolerance"
+    limit_spacing: Positive = _in_radii(
+        2.0, "distance of points where the largest pressure is found, mm"
+    )
+    region_spacing: Positive = _in_radii(3.75, "distance of the regions that share a basis, mm")
+    blend: Positive = _in_radii(0.1, "width over which neighbouring local models blend, mm")
+    samples: int = Field(
+        360, ge=60, description="most full solutions to validate by; fewer if they suffice"
+    )
+    size: Size | None = _chosen(
+        "the smallest that meets the tolerance", "how large the reduced model is"
     )
 
 
-class Scene(_Part):
+class Scene(Part):
     """A whole scene. `text` is the TOML it was read from, `folder` where its files lie."""
 
-    name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$", description="names the artifact and its URL")
-    description: str
-    seed: int = Field(ge=0)
-    geometry: Annotated[Extrusion | Block, Field(discriminator="kind")]
-    tissue: Tissue
+    name: str = Field(
+        pattern=r"^[a-z0-9][a-z0-9-]*$",
+        description="names the artifact and its URL: a to z, 0 to 9 and -",
+    )
+    description: str = Field(
+        description="one line for people", json_schema_extra={"absent": "the name"}
+    )
+    seed: int = Field(1, ge=0, description="seed of all random numbers of training")
+    geometry: Annotated[Extrusion | Block, Field(discriminator="kind")] = Field(
+        description="the shape of the body"
+    )
+    tissue: Tissue = Field(description="what the body is made of")
     support: Patch = Field(description="what is held fixed")
     surface: Patch = Field(description="what the endoscope can touch")
-    endoscope: Endoscope
-    load: Load
-    tolerance: Tolerance
-    budget: Budget
-    training: Training
+    endoscope: Endoscope = Field(description="the instrument that presses")
+    load: Load = Field(description="how hard it presses")
+    tolerance: Tolerance = Field(
+        description="errors against the full model on the same mesh; a looser one is faster"
+    )
+    budget: Budget = Field(description="the time that a query may take")
+    training: Training = Field(description="how the reduced model is trained")
 
     _text: str = PrivateAttr("")
     _folder: Path | None = PrivateAttr(None)
@@ -248,17 +279,71 @@ class Scene(_Part):
         """Where the files named by the scene lie; None for a scene without files at hand."""
         return self._folder
 
-    @model_validator(mode="after")
-    def _sides_exist(self) -> Scene:
-        for name in ("support", "surface"):
-            side = getattr(self, name).side
-            if side not in self.geometry.sides:
-                raise PydanticCustomError(
-                    "side",
-                    "{name}.side is '{side}', but the sides of this body are {sides}",
-                    {"name": name, "side": side, "sides": ", ".join(self.geometry.sides)},
-                )
-        return self
+    @model_validator(mode="before")
+    @classmethod
+    def _derive(cls, data: dict[str, Any]) -> dict[str, Any]:
+        """Fill in what follows from the name and the radius; an absent table is an empty one."""
+        tables: dict[str, Any] = {
+            name: {} for name, field in cls.model_fields.items() if kinds_of(field)
+        }
+        data = {"description": str(data.get("name", ""))} | tables | data
+        given = data["endoscope"]
+        radius = given.get("radius") if isinstance(given, dict) else None
+        # a wrong radius is an error by itself, and no reason for errors of what follows from it
+        if not (isinstance(radius, int | float) and 0 < radius < 1e300):
+            radius = 1.0
+        for name, part in (("endoscope", Endoscope), ("training", Training)):
+            if isinstance(data[name], dict):
+                lengths = {
+                    key: float(f"{said['radii'] * radius:.6g}")
+                    for key, field in part.model_fields.items()
+                    if "radii" in (said := _said(field))
+                }
+                data[name] = lengths | data[name]
+        return data
+
+    @field_validator("support", "surface")
+    @classmethod
+    def _side_exists(cls, patch: Patch, info: ValidationInfo) -> Patch:
+        geometry = info.data.get("geometry")
+        if geometry is not None and patch.side not in geometry.sides:
+            raise PydanticCustomError(
+                "side",
+                "side is '{side}', but the sides of this body are {sides}",
+                {"side": patch.side, "sides": ", ".join(geometry.sides)},
+            )
+        return patch
+
+
+def _said(field: FieldInfo) -> dict[str, Any]:
+    """What a field says of itself beyond pydantic's own attributes."""
+    return field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
+
+
+def absent(field: FieldInfo) -> str | None:
+    """What stands for an absent key in words, None where it must not be absent or has a value."""
+    return _said(field).get("absent")
+
+
+def kinds_of(field: FieldInfo) -> list[type[Part]]:
+    """Kinds of table that a field may hold, none if it holds a value."""
+    kinds = get_args(field.annotation) or (field.annotation,)
+    return [kind for kind in kinds if isinstance(kind, type) and issubclass(kind, Part)]
+
+
+@cache
+def _tables() -> dict[tuple[str, ...], type[Part]]:
+    """Every kind of table of a scene by its path; where there are several, the last is the kind."""
+    return dict(_walk(Scene, ()))
+
+
+def _walk(part: type[Part], path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], type[Part]]]:
+    yield path, part
+    for name, field in part.model_fields.items():
+        for kind in kinds_of(field):
+            tag = field.discriminator
+            own = get_args(kind.model_fields[tag].annotation) if isinstance(tag, str) else ()
+            yield from _walk(kind, (*path, name, *own))
 
 
 def load_scene(path: Path | str) -> Scene:
@@ -293,8 +378,9 @@ def parse_scene(text: str, folder: Path | None = None, source: str = "scene") ->
     except tomllib.TOMLDecodeError as error:
         raise SceneError(f"{source}: not TOML: {error}") from error
     except ValidationError as error:
-        lines = "; ".join(_explain(dict(detail)) for detail in error.errors(include_url=False))
-        raise SceneError(f"{source}: {lines}") from error
+        faults = [_explain(dict(detail)) for detail in error.errors(include_url=False)]
+        between = "\n  " if len(faults) > 1 else " "
+        raise SceneError(between.join([f"{source}:", *faults])) from error
     scene._text = text
     scene._folder = folder
     return scene
@@ -311,9 +397,18 @@ def _tuples(value: Any) -> Any:
 
 def _explain(detail: dict[str, Any]) -> str:
     """One pydantic complaint as `field.path = value: what is wrong`."""
+    tables, loc, kind = _tables(), detail["loc"], detail["type"]
     # The tag of a discriminated union is in pydantic's path, but not in the file.
-    parts = [str(part) for part in detail["loc"] if part not in ("extrusion", "block")]
-    path = ".".join(parts) or "scene"
-    value = detail["input"]
-    shown = "" if isinstance(value, dict) else f" = {value!r}"
+    steps = [loc[i] for i in range(len(loc)) if loc[:i] in tables or loc[: i + 1] not in tables]
+    path = ".".join(map(str, steps)) or "scene"
+    table = tables.get(loc[:-1])
+    if table and kind == "extra_forbidden":
+        near = difflib.get_close_matches(loc[-1], table.model_fields, n=1, cutoff=0.5)
+        return f"{path}: unknown key" + (f"; did you mean {near[0]!r}?" if near else "")
+    if table and kind == "missing":
+        return f"{path}: missing ({table.model_fields[loc[-1]].description})"
+    if kind == "union_tag_not_found":
+        kinds = ", ".join(own[-1] for own in tables if own and own[:-1] == loc)
+        return f"{path}.{detail['ctx']['discriminator'].strip(chr(39))}: missing (one of {kinds})"
+    shown = "" if isinstance(detail["input"], dict) else f" = {detail['input']!r}"
     return f"{path}{shown}: {detail['msg']}"

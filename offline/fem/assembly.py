@@ -19,17 +19,45 @@ import numpy as np
 from numba import njit
 
 from palpate.shared.mechanics import tissue, viscosity
+from palpate.shared.mechanics.tensors import (
+    add,
+    cofactor,
+    combine,
+    ddot,
+    det,
+    dot,
+    load_packed,
+    scale,
+    store,
+    store_packed,
+    transposed,
+    unit,
+    unpacked,
+)
 
 
 @njit(cache=True, error_model="numpy")
-def _deformation_gradient(conn, grad, u, F):
-    F[:] = 0.0
-    F[0] = F[4] = F[8] = 1.0
+def _deformation_gradient(conn, grad, u):
+    """Deformation gradient at a point, a tensor."""
+    f0 = f4 = f8 = 1.0
+    f1 = f2 = f3 = f5 = f6 = f7 = 0.0
     for a in range(len(conn)):
-        for i in range(3):
-            ui = u[3 * conn[a] + i]
-            for j in range(3):
-                F[3 * i + j] += ui * grad[a, j]
+        x, y, z = u[3 * conn[a]], u[3 * conn[a] + 1], u[3 * conn[a] + 2]
+        g, h, k = grad[a, 0], grad[a, 1], grad[a, 2]
+        f0, f1, f2 = f0 + x * g, f1 + x * h, f2 + x * k
+        f3, f4, f5 = f3 + y * g, f4 + y * h, f5 + y * k
+        f6, f7, f8 = f6 + z * g, f7 + z * h, f8 + z * k
+    return f0, f1, f2, f3, f4, f5, f6, f7, f8
+
+
+@njit(cache=True, error_model="numpy")
+def _add_point_force(conn, grad, w, P, r):
+    """``r += w B^T P`` for one point."""
+    for a in range(len(conn)):
+        g, h, k, dof = grad[a, 0], grad[a, 1], grad[a, 2], 3 * conn[a]
+        r[dof] += w * (P[0] * g + P[1] * h + P[2] * k)
+        r[dof + 1] += w * (P[3] * g + P[4] * h + P[5] * k)
+        r[dof + 2] += w * (P[6] * g + P[7] * h + P[8] * k)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -39,23 +67,16 @@ def standard_residual(conn, grad, weight, mu, lam, u, r):
     conn (e, n) int32; grad (e, q, n, 3) 1/mm; weight (e, q) mm^3; mu, lam (e,) kPa;
     u, r (3 nodes,) mm and mN.
     """
-    F, P = np.empty(9), np.empty(9)
     energy, smallest = 0.0, np.inf
     for e in range(len(conn)):
         for q in range(weight.shape[1]):
-            _deformation_gradient(conn[e], grad[e, q], u, F)
-            W, J = tissue.stress(F, mu[e], lam[e], P)
+            F = _deformation_gradient(conn[e], grad[e, q], u)
+            J, square, P = tissue.first_piola(F, mu[e], lam[e])
             smallest = min(smallest, J)
             if not J > 0.0:
                 return tissue.INVERTED, smallest
-            w = weight[e, q]
-            energy += w * W
-            for a in range(conn.shape[1]):
-                for i in range(3):
-                    f = 0.0
-                    for j in range(3):
-                        f += P[3 * i + j] * grad[e, q, a, j]
-                    r[3 * conn[e, a] + i] += w * f
+            energy += weight[e, q] * tissue.energy(J, square, mu[e], lam[e])
+            _add_point_force(conn[e], grad[e, q], weight[e, q], P, r)
     return energy, smallest
 
 
@@ -107,13 +128,11 @@ def scatter_faces(K, slots, data):
 def standard_tangent(conn, grad, weight, mu, lam, u, slots, data):
     """Add the tangent stiffness at ``u`` to CSR ``data`` (mN/mm); slots (e, 3n, 3n) int32."""
     n = conn.shape[1]
-    F, Finv, A = np.empty(9), np.empty(9), np.empty((9, 9))
-    G, C, K = np.empty((3, n)), np.empty((9, n)), np.empty((3, 3, n, n))
+    A, G, C, K = np.empty((9, 9)), np.empty((3, n)), np.empty((9, n)), np.empty((3, 3, n, n))
     for e in range(len(conn)):
         K[:] = 0.0
         for q in range(weight.shape[1]):
-            _deformation_gradient(conn[e], grad[e, q], u, F)
-            tissue.tangent(F, mu[e], lam[e], Finv, A)
+            tissue.tangent(_deformation_gradient(conn[e], grad[e, q], u), mu[e], lam[e], A)
             _add_point_tangent(grad[e, q], A, weight[e, q], G, C, K)
         _scatter(K, slots[e], data)
 
@@ -121,17 +140,14 @@ def standard_tangent(conn, grad, weight, mu, lam, u, slots, data):
 @njit(cache=True, error_model="numpy")
 def _dilatation(conn, theta_grad, theta_weight, u, g):
     """Element dilatation theta = sum c_r J_r and its gradient g = d theta / du (3n,)."""
-    F, Finv = np.empty(9), np.empty(9)
     theta = 0.0
     g[:] = 0.0
+    own = np.arange(len(conn))
     for r in range(len(theta_weight)):
-        _deformation_gradient(conn, theta_grad[r], u, F)
-        J = tissue.inverse_and_jacobian(F, Finv)
-        theta += theta_weight[r] * J
-        for a in range(len(conn)):
-            for i in range(3):
-                for j in range(3):
-                    g[3 * a + i] += theta_weight[r] * J * Finv[3 * j + i] * theta_grad[r, a, j]
+        F = _deformation_gradient(conn, theta_grad[r], u)
+        C = cofactor(F)
+        theta += theta_weight[r] * det(F, C)
+        _add_point_force(own, theta_grad[r], theta_weight[r], C, g)
     return theta
 
 
@@ -139,8 +155,7 @@ def _dilatation(conn, theta_grad, theta_weight, u, g):
 def dilatation_residual(conn, grad, weight, theta_grad, theta_weight, mu, lam, u, r):
     """As ``standard_residual`` for elements with one dilatation; theta_grad (e, t, n, 3)."""
     n = conn.shape[1]
-    F, Finv, P, g, f = np.empty(9), np.empty(9), np.empty(9), np.empty(3 * n), np.empty(3 * n)
-    Fbar = np.empty(9)
+    g, f, own = np.empty(3 * n), np.empty(3 * n), np.arange(n)
     energy, smallest = 0.0, np.inf
     for e in range(len(conn)):
         theta = _dilatation(conn[e], theta_grad[e], theta_weight[e], u, g)
@@ -150,30 +165,46 @@ def dilatation_residual(conn, grad, weight, theta_grad, theta_weight, mu, lam, u
         f[:] = 0.0
         by_theta = 0.0
         for q in range(weight.shape[1]):
-            _deformation_gradient(conn[e], grad[e, q], u, F)
-            J = tissue.inverse_and_jacobian(F, Finv)
+            F = _deformation_gradient(conn[e], grad[e, q], u)
+            C = cofactor(F)
+            J = det(F, C)
             smallest = min(smallest, J)
             if not J > 0.0:
                 return tissue.INVERTED, smallest
-            alpha = (theta / J) ** (1.0 / 3.0)
-            for i in range(9):
-                Fbar[i] = alpha * F[i]
-            W, _ = tissue.stress(Fbar, mu[e], lam[e], P)
-            w = weight[e, q]
-            energy += w * W
-            p = 0.0  # P : F / 3
-            for i in range(9):
-                p += P[i] * F[i] / 3.0
+            alpha, w = (theta / J) ** (1.0 / 3.0), weight[e, q]
+            bar, square, P = tissue.first_piola(scale(alpha, F), mu[e], lam[e])
+            energy += w * tissue.energy(bar, square, mu[e], lam[e])
+            p = ddot(P, F) / 3.0
             by_theta += w * alpha * p / theta
-            for i in range(3):
-                for j in range(3):
-                    stress = w * alpha * (P[3 * i + j] - p * Finv[3 * j + i])
-                    for a in range(n):
-                        f[3 * a + i] += stress * grad[e, q, a, j]
+            _add_point_force(own, grad[e, q], w * alpha, combine(1.0, P, -p / J, C), f)
         for a in range(n):
             for i in range(3):
                 r[3 * conn[e, a] + i] += f[3 * a + i] + by_theta * g[3 * a + i]
     return energy, smallest
+
+
+@njit(cache=True, error_model="numpy")
+def _fixed_dilatation_tangent(F, alpha, mu, lam, A):
+    """Write the tangent ``psi_FF`` of ``dilatation_tangent`` (9, 9) kPa to ``A``.
+
+    Returns the stress ``P`` at ``alpha F``, its derivative along ``alpha F``, and ``F^-T``.
+    """
+    Fbar = scale(alpha, F)
+    _, _, P = tissue.first_piola(Fbar, mu, lam)
+    Tbar, geometric, bulk = tissue.linearise(Fbar, mu, lam)
+    T, once = scale(alpha, Tbar), ddot(P, F)
+    for k in range(9):
+        H = unit(k)
+        third = ddot(T, H) / 3.0
+        # of alpha (P - P:F/3 T), with dalpha = -alpha third and dT = -T H^T T
+        dP = tissue.increment(Tbar, geometric, bulk, mu, scale(alpha, combine(1.0, H, -third, F)))
+        along = third * once / 3.0 - (ddot(dP, F) + ddot(P, H)) / 3.0
+        D = add(
+            combine(1.0, dP, -third, P),
+            combine(along, T, once / 3.0, dot(T, dot(transposed(H), T))),
+        )
+        store(scale(alpha, D), A[k], 0, 1)
+    return P, tissue.increment(Tbar, geometric, bulk, mu, Fbar), T
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -184,116 +215,67 @@ def dilatation_tangent(conn, grad, weight, theta_grad, theta_weight, mu, lam, u,
     psi_tt g g^T] + (sum w psi_t) d2 theta/du2.
     """
     n = conn.shape[1]
-    F, Finv, P, Fbar = np.empty(9), np.empty(9), np.empty(9), np.empty(9)
-    A, H = np.empty((9, 9)), np.empty((9, 9))
-    AF, mixed, g, Bm = np.empty(9), np.empty(9), np.empty(3 * n), np.empty(3 * n)
-    G, C, K = np.empty((3, n)), np.empty((9, n)), np.empty((3, 3, n, n))
+    g, mixed, own = np.empty(3 * n), np.empty(3 * n), np.arange(n)
+    A, G, C, K = np.empty((9, 9)), np.empty((3, n)), np.empty((9, n)), np.empty((3, 3, n, n))
     for e in range(len(conn)):
         K[:] = 0.0
         theta = _dilatation(conn[e], theta_grad[e], theta_weight[e], u, g)
         by_theta, by_theta2 = 0.0, 0.0
-        Bm[:] = 0.0
+        mixed[:] = 0.0
         for q in range(weight.shape[1]):
-            _deformation_gradient(conn[e], grad[e, q], u, F)
-            J = tissue.inverse_and_jacobian(F, Finv)
-            alpha = (theta / J) ** (1.0 / 3.0)
-            for i in range(9):
-                Fbar[i] = alpha * F[i]
-            tissue.stress(Fbar, mu[e], lam[e], P)
-            tissue.tangent(Fbar, mu[e], lam[e], Finv, A)
-            for i in range(9):
-                Finv[i] *= alpha  # back to F^-1
-            w = weight[e, q]
-            PF, FAF = 0.0, 0.0
-            for i in range(9):
-                AF[i] = 0.0
-                for j in range(9):
-                    AF[i] += A[i, j] * F[j]
-            for i in range(9):
-                PF += P[i] * F[i]
-                FAF += F[i] * AF[i]
-            # dFbar = alpha dF + alpha/3 (dtheta/theta - L) F,  L = F^-T : dF
-            a2 = alpha * alpha
-            for i in range(9):
-                li = Finv[3 * (i % 3) + i // 3]
-                mixed[i] = (
-                    a2 / 3.0 * (AF[i] - FAF / 3.0 * li) + alpha / 3.0 * (P[i] - PF / 3.0 * li)
-                ) / theta
-                for j in range(9):
-                    lj = Finv[3 * (j % 3) + j // 3]
-                    swap = Finv[3 * (i % 3) + j // 3] * Finv[3 * (j % 3) + i // 3]
-                    H[i, j] = (
-                        a2 * (A[i, j] - (AF[i] * lj + li * AF[j]) / 3.0 + FAF / 9.0 * li * lj)
-                        - alpha / 3.0 * (P[i] * lj + li * P[j])
-                        + alpha * PF * (li * lj / 9.0 + swap / 3.0)
-                    )
-            _add_point_tangent(grad[e, q], H, w, G, C, K)
-            by_theta += w * alpha * PF / (3.0 * theta)
-            by_theta2 += w * (a2 * FAF / 9.0 + alpha * PF * (1.0 / 9.0 - 1.0 / 3.0)) / theta**2
-            for a in range(n):
-                for i in range(3):
-                    for j in range(3):
-                        Bm[3 * a + i] += w * mixed[3 * i + j] * grad[e, q, a, j]
+            F, w = _deformation_gradient(conn[e], grad[e, q], u), weight[e, q]
+            alpha = (theta / det(F, cofactor(F))) ** (1.0 / 3.0)
+            P, by_scale, T = _fixed_dilatation_tangent(F, alpha, mu[e], lam[e], A)
+            _add_point_tangent(grad[e, q], A, w, G, C, K)
+            once, twice = ddot(P, F), ddot(by_scale, F)
+            by_theta += w * alpha * once / (3.0 * theta)
+            by_theta2 += w * alpha * (twice - 2.0 * once) / (9.0 * theta**2)
+            both = combine(1.0, add(P, by_scale), -(once + twice) / 3.0, T)
+            _add_point_force(own, grad[e, q], w * alpha / (3.0 * theta), both, mixed)
         for r in range(theta_weight.shape[1]):
-            _deformation_gradient(conn[e], theta_grad[e, r], u, F)
-            J = tissue.inverse_and_jacobian(F, Finv)
-            for i in range(9):
-                for j in range(9):
-                    H[i, j] = (
-                        Finv[3 * (i % 3) + i // 3] * Finv[3 * (j % 3) + j // 3]
-                        - Finv[3 * (i % 3) + j // 3] * Finv[3 * (j % 3) + i // 3]
-                    )
-            _add_point_tangent(theta_grad[e, r], H, by_theta * theta_weight[e, r] * J, G, C, K)
+            F = _deformation_gradient(conn[e], theta_grad[e, r], u)
+            cofactors = cofactor(F)
+            J = det(F, cofactors)
+            T = scale(1.0 / J, cofactors)
+            for k in range(9):
+                H = unit(k)
+                store(combine(ddot(T, H), T, -1.0, dot(T, dot(transposed(H), T))), A[k], 0, 1)
+            _add_point_tangent(theta_grad[e, r], A, by_theta * theta_weight[e, r] * J, G, C, K)
         for i in range(3):
             for k in range(i, 3):
                 for a in range(n):
                     p, r = 3 * a + i, by_theta2 * g[3 * a + i]
                     for b in range(n):
                         s = 3 * b + k
-                        K[i, k, a, b] += Bm[p] * g[s] + g[p] * Bm[s] + r * g[s]
+                        K[i, k, a, b] += mixed[p] * g[s] + g[p] * mixed[s] + r * g[s]
         _scatter(K, slots[e], data)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def predict(history, weights, B):
-    """``viscosity.predict`` at every point: history (e, q, terms + 1, 7), B (e, q, 7)."""
-    for e in range(len(B)):
-        for q in range(B.shape[1]):
-            viscosity.predict(history[e, q], weights, B[e, q])
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def advance(conn, grad, u, weights, history):
-    """``viscosity.advance`` to the displacement ``u`` at every point, in place."""
-    F, Finv, m = np.empty(9), np.empty(9), np.empty(viscosity.COMPONENTS)
+def drive(conn, grad, u, m):
+    """Write ``viscosity.driven`` at every point (e, q, 6) of the displacement ``u``."""
     for e in range(len(conn)):
         for q in range(grad.shape[1]):
-            _deformation_gradient(conn[e], grad[e, q], u, F)
-            viscosity.driving(F, Finv, m)
-            viscosity.advance(history[e, q], m, weights)
+            F = _deformation_gradient(conn[e], grad[e, q], u)
+            store_packed(viscosity.driven(F), m[e, q], 0, 1)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def viscous_residual(conn, grad, weight, mu, B, u, r):
     """Add the force of the past at ``u``, where nothing is inverted, to ``r``; return its energy.
 
-    B (e, q, 7), see ``mechanics.viscosity``; else as ``standard_residual``.
+    B (e, q, 6), see ``mechanics.viscosity``; else as ``standard_residual``.
     """
-    F, Finv, P = np.empty(9), np.empty(9), np.empty(9)
     energy = 0.0
     for e in range(len(conn)):
         for q in range(weight.shape[1]):
-            _deformation_gradient(conn[e], grad[e, q], u, F)
-            J = tissue.inverse_and_jacobian(F, Finv)
-            P[:] = 0.0
-            w = weight[e, q]
-            energy += w * viscosity.add_stress(F, B[e, q], mu[e], J, P)
-            for a in range(conn.shape[1]):
-                for i in range(3):
-                    f = 0.0
-                    for j in range(3):
-                        f += P[3 * i + j] * grad[e, q, a, j]
-                    r[3 * conn[e, a] + i] += w * f
+            F = _deformation_gradient(conn[e], grad[e, q], u)
+            J = det(F, cofactor(F))
+            modulus = mu[e] * J ** (-2.0 / 3.0)
+            past = unpacked(load_packed(B[e, q], 0, 1))
+            contraction, P = viscosity.overstress(F, past, J, modulus)
+            energy += weight[e, q] * 0.5 * modulus * contraction
+            _add_point_force(conn[e], grad[e, q], weight[e, q], P, r)
     return energy
 
 
@@ -301,25 +283,12 @@ def viscous_residual(conn, grad, weight, mu, B, u, r):
 def viscous_tangent(conn, grad, weight, mu, B, u, slots, data):
     """Add the tangent of ``viscous_residual`` to CSR ``data`` (mN/mm)."""
     n = conn.shape[1]
-    F, Finv, FB, A = np.empty(9), np.empty(9), np.empty(9), np.empty((9, 9))
-    G, C, K = np.empty((3, n)), np.empty((9, n)), np.empty((3, 3, n, n))
+    A, G, C, K = np.empty((9, 9)), np.empty((3, n)), np.empty((9, n)), np.empty((3, 3, n, n))
     for e in range(len(conn)):
         K[:] = 0.0
         for q in range(weight.shape[1]):
-            _deformation_gradient(conn[e], grad[e, q], u, F)
+            F = _deformation_gradient(conn[e], grad[e, q], u)
             A[:] = 0.0
-            viscosity.add_tangent(F, B[e, q], mu[e], Finv, FB, A)
+            viscosity.add_tangent(F, unpacked(load_packed(B[e, q], 0, 1)), mu[e], A)
             _add_point_tangent(grad[e, q], A, weight[e, q], G, C, K)
         _scatter(K, slots[e], data)
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def dissipated_power(conn, grad, weight, mu, u, history, weights, tau):
-    """Integral (mN mm/s) of ``viscosity.dissipation``; history (e, q, terms + 1, 7)."""
-    F = np.empty(9)
-    power = 0.0
-    for e in range(len(conn)):
-        for q in range(weight.shape[1]):
-            _deformation_gradient(conn[e], grad[e, q], u, F)
-            power += weight[e, q] * viscosity.dissipation(F, history[e, q], weights, tau, mu[e])
-    return power

@@ -19,6 +19,7 @@ from tqdm import tqdm
 from palpate.offline.fem.mesh import build_mesh
 from palpate.offline.fem.refine import refined
 from palpate.offline.reduce.sampling import spread_points
+from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.workshop import Workshop
 from palpate.shared.scene import Block, Divisions, Scene, SceneError, divisions_of, parse_scene
 
@@ -51,7 +52,7 @@ def with_mesh(scene: Scene) -> tuple[Scene, dict[str, Any] | None]:
     Raises
     ------
     SceneError
-        If the text has no table ``[geometry]`` to write them to.
+        If the text has its geometry as an inline table, which they cannot be written to.
     """
     if scene.geometry.divisions is not None:
         return scene, None
@@ -74,13 +75,13 @@ def with_mesh(scene: Scene) -> tuple[Scene, dict[str, Any] | None]:
 
 def _divided(scene: Scene, divisions: Divisions) -> Scene:
     """The same scene with divisions, in its text as well."""
-    line = f"divisions = {list(divisions)}   # chosen by training\n"
-    text, found = re.subn(
-        r"^\[geometry\].*\n", lambda m: m[0] + line, scene.text, count=1, flags=re.M
-    )
-    if not found:
-        raise SceneError("geometry.divisions: needed where there is no table [geometry]")
-    return parse_scene(text, scene.folder)
+    table = re.search(r"^\[geometry\].*\n", scene.text, flags=re.M)
+    start, key = (table.end(), "divisions") if table else (0, "geometry.divisions")
+    line = f"{key} = {list(divisions)}   # chosen by training\n"
+    try:
+        return parse_scene(scene.text[:start] + line + scene.text[start:], scene.folder)
+    except SceneError as error:
+        raise SceneError("geometry.divisions: needed where geometry is an inline table") from error
 
 
 def _candidates(scene: Scene) -> list[Divisions]:
@@ -106,7 +107,7 @@ def _candidates(scene: Scene) -> list[Divisions]:
 def _try(scene: Scene) -> MeshTrial:
     """Press a mesh and one of more than six times its degrees of freedom at the same places."""
     workshop, reference = Workshop(scene), Workshop(refined(scene))
-    rng = np.random.default_rng([scene.seed, 6])
+    rng = stream(scene.seed, Stage.MESH_CHOICE)
     errors = []
     for point in spread_points(workshop.surface, PLACES, rng):
         x, normal, _ = workshop.surface.project(point)

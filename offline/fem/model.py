@@ -22,6 +22,7 @@ from palpate.shared.errors import PalpateError
 from palpate.shared.geometry.quadrature import volume_quadrature
 from palpate.shared.mechanics import newton, sphere, viscosity
 from palpate.shared.mechanics.sphere import Tip, TipSurface, Touching, room_for
+from palpate.shared.mechanics.tensors import SYMMETRIC
 from palpate.shared.mechanics.tissue import lame
 from palpate.shared.scene import ElementName, Scene
 
@@ -71,7 +72,16 @@ class History:
     """What tissue remembers; see ``mechanics.viscosity``."""
 
     displacement: Array  # (nodes, 3) mm, the last
-    points: Array  # (e, q, terms + 1, 7), at quadrature points
+    points: Array  # (terms + 1, e, q, 6), at quadrature points
+
+
+def predicted(history: History, weights: viscosity.Weights) -> Array:
+    """``B`` of ``mechanics.viscosity`` (e, q, 6) at the end of a step with these weights."""
+    points = history.points
+    B = np.empty(points.shape[1:])
+    loss = viscosity.predict(points.reshape(len(points), -1), weights, B.reshape(-1))
+    B[..., :3] -= loss
+    return B
 
 
 class TipContact:
@@ -189,18 +199,15 @@ class FullModel:
         if not self.prony:
             return self
         other = replace(self, prony=())
-        other._past = np.zeros((*self.weights.shape, viscosity.COMPONENTS))
-        at_rest, weights = self.at_rest.points, viscosity.step_weights(self.prony, np.inf)
-        assembly.predict(at_rest, weights, other._past)
+        other._past = predicted(self.at_rest, viscosity.step_weights(self.prony, np.inf))
         return other
 
     @property
     def at_rest(self) -> History:
         """Tissue that nothing has happened to."""
-        terms = len(self.prony) + 1
         return History(
             np.zeros((len(self.mesh.nodes), 3)),
-            np.zeros((*self.weights.shape, terms, viscosity.COMPONENTS)),
+            np.zeros((len(self.prony) + 1, *self.weights.shape, SYMMETRIC)),
         )
 
     def _theta_points(self) -> tuple[Array, Array] | None:
@@ -416,7 +423,7 @@ class FullModel:
             start = history.displacement
         with self._remembering(history, dt) as weights:
             found = self.solve(load, start, least=self._least_residual(history))
-        return found, self._advanced(history, found.displacement, weights)
+        return found, self.advanced(history, found.displacement, weights)
 
     def touch_step(
         self,
@@ -440,26 +447,26 @@ class FullModel:
             start = history.displacement
         with self._remembering(history, dt) as weights:
             found = self.touch(contact, position, approach, start)
-        return found, self._advanced(history, found.displacement, weights)
+        return found, self.advanced(history, found.displacement, weights)
 
     @contextmanager
     def _remembering(self, history: History, dt: float) -> Iterator[viscosity.Weights]:
         """Solve with what a history exerts ``dt`` after its end; gives the weights of the step."""
         weights = viscosity.step_weights(self.prony, dt)
-        self._past = np.zeros((*self.weights.shape, viscosity.COMPONENTS))
-        assembly.predict(history.points, weights, self._past)
+        self._past = predicted(history, weights)
         try:
             yield weights
         finally:
             self._past, self._at_rest = None, False
 
-    def _advanced(
+    def advanced(
         self, history: History, displacement: Array, weights: viscosity.Weights
     ) -> History:
-        """A history that has gone a step further, to a displacement (nodes, 3) mm."""
+        """History that has gone a step further, to a displacement (nodes, 3) mm."""
         points = history.points.copy()
-        u = displacement.reshape(-1)
-        assembly.advance(self.connectivity, self.gradients, u, weights, points)
+        m = np.empty(points.shape[1:])
+        assembly.drive(self.connectivity, self.gradients, displacement.reshape(-1), m)
+        viscosity.advance(m.reshape(-1), weights, points.reshape(len(points), -1))
         return History(displacement, points)
 
     def _least_residual(self, history: History) -> float:
@@ -471,19 +478,6 @@ class FullModel:
         )  # fmt: skip
         none = ROUND_OFF * self.young * self.weights.sum() ** (2 / 3)
         return max(TOLERANCE * float(np.linalg.norm(force[self.free])), float(none))
-
-    def energies(self, history: History) -> tuple[float, float]:
-        """Stored energy (mN mm) and dissipated power (mN mm/s) at the end of a history."""
-        u = history.displacement.reshape(-1)
-        weights = viscosity.step_weights(self.prony, 0.0)
-        past = np.zeros((*self.weights.shape, viscosity.COMPONENTS))
-        assembly.predict(history.points, weights, past)
-        args = (self.connectivity, self.gradients, self.weights, self.mu)
-        stored, _ = self.internal(u, self._force)
-        stored += assembly.viscous_residual(*args, past, u, self._force)
-        stored -= 1.5 * float(np.einsum("e,eq,eq->", self.mu, self.weights, past[..., 6]))
-        tau = np.array([tau for _, tau in self.prony])
-        return stored, assembly.dissipated_power(*args, u, history.points, weights, tau)
 
     def touch(
         self,

@@ -1,1 +1,1 @@
-"""The methods that a speed-accuracy chart sets side by side; see ``offline.methods.method``."""
+"""The methods that the studies compare; see ``offline.methods.method``."""

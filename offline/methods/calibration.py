@@ -10,16 +10,16 @@ from palpate.offline.reduce.sampling import random_points
 from palpate.offline.run.workshop import Workshop
 
 LOADS = 24
-"""Small loads, at points all over the surface and normal to it."""
+"""Number of small loads, normal to the surface at points all over it."""
 
 RESIDUAL = 1e-3
-"""Of the crude model's answers, relative to the load."""
+"""Residual of the crude model's answers, relative to the load."""
 
 
 def stiffening(workshop: Workshop, mesh: Tetrahedra, body: Elastic) -> float:
-    """Factor by which a body should be stiffer to answer small loads as the full model does.
+    """Factor on a body's stiffness with which it answers small loads as the full model does.
 
-    The one whose answers are nearest, in least squares over all loads and nodes of the scene.
+    It minimises the sum of squared differences over all loads and nodes of the scene.
     """
     rng = np.random.default_rng(workshop.scene.seed)
     body.linearise(np.zeros((3, len(mesh.nodes))))

@@ -1,58 +1,55 @@
 """Every method by name: ``build("pod", 40, training)``.
 
-A training context holds what methods learn from, and makes what several of them share only once.
+A new method is a file in this folder and a line in ``BUILDERS``.  ``Training`` holds what methods
+learn from, and computes what several of them share only once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
-from scipy.spatial import cKDTree
 
 from palpate.offline.fem.model import FullModel
 from palpate.offline.methods.cubatures import PointForces, point_forces
-from palpate.offline.methods.deim import Deim, force_modes, sample
-from palpate.offline.methods.full import Full
-from palpate.offline.methods.galerkin import Cubature, Galerkin, GalerkinAtHand, GalerkinModel
-from palpate.offline.methods.method import Case, Method
+from palpate.offline.methods.deim import Deim, PlainNewton, force_modes, sample
+from palpate.offline.methods.full import Full, Remeshed
+from palpate.offline.methods.galerkin import Galerkin, GalerkinAtHand, GalerkinInTime
+from palpate.offline.methods.galerkin_model import Cubature, GalerkinModel
+from palpate.offline.methods.lattice import scaled
+from palpate.offline.methods.mass_spring import MassSpring
+from palpate.offline.methods.method import Case, Method, Snapshots
 from palpate.offline.methods.regression import Linear, Regression, compliance
-from palpate.offline.methods.shipped import Shipped
+from palpate.offline.methods.shipped import Shipped, ShippedInTime, TipInTime, Warm
 from palpate.offline.methods.spaces import Inner, krylov, mass, modal, pod, static_derivatives
+from palpate.offline.methods.tensor_mass import Law, TensorMass
 from palpate.offline.reduce.ritz import TANGENTIAL
 from palpate.offline.reduce.sampling import spread_points, tangents
-from palpate.offline.run.workshop import Load, Workshop
+from palpate.offline.run.workshop import Workshop
 from palpate.shared.errors import PalpateError
 from palpate.shared.model import ReducedModel
+from palpate.shared.scene import Scene
 
 Array = NDArray[np.float64]
 
 FOOTPRINTS = 128
-"""Footprints over the surface; the first of them are spread as well."""
+"""Footprints whose loads make bases: spread over the surface, and so are the first few of them."""
 
 MOMENTS = 3
-"""Blocks of a Krylov basis: a third of the loads that one of static responses (ritz) takes."""
+"""Blocks of a Krylov basis, which therefore takes a third of the loads of a ritz basis."""
 
 POINTS_PER_MODE, ELEMENTS_PER_MODE = 6, 2
-"""What an empirical cubature may cost."""
+"""Most points, or elements, of an empirical cubature."""
 
 SAMPLES_PER_MODE = 3
 """Sampled dofs per force mode where the internal force is fitted instead of interpolated."""
 
 CASES = 100
-"""Snapshots whose loads teach a cubature, or an interpolation of the force."""
-
-
-@dataclass(frozen=True)
-class Snapshots:
-    """Full solutions: loads, and displacements (k, 3 n) mm."""
-
-    loads: Sequence[Load]
-    displacements: Array
+"""Snapshots whose loads train a cubature."""
 
 
 @dataclass(frozen=True)
@@ -64,14 +61,20 @@ class Training:
     workshop : Workshop
     snapshots : Snapshots
     atlas : ReducedModel, optional
-        The artifact of the same mesh, for the method that is it.
+        The artifact of the same mesh, for the methods that query it.
     seed : int
+    scene : Scene, optional
+        With its files, for the full model on other meshes.
+    in_time : bool
+        Whether the methods that can are built to remember what happened before.
     """
 
     workshop: Workshop
     snapshots: Snapshots
     atlas: ReducedModel | None = None
     seed: int = 0
+    scene: Scene | None = None
+    in_time: bool = False
 
     @property
     def model(self) -> FullModel:
@@ -85,6 +88,13 @@ class Training:
     def rng(self, *stage: int) -> np.random.Generator:
         """Random numbers of a stage, the same whatever was built before."""
         return np.random.default_rng([self.seed, *stage])
+
+    @property
+    def artifact(self) -> ReducedModel:
+        """The artifact's reduced model; ``PalpateError`` if there is none."""
+        if self.atlas is None:
+            raise PalpateError("artifact: the training context has none")
+        return self.atlas
 
     @cached_property
     def mass(self) -> csr_matrix:
@@ -113,8 +123,7 @@ class Training:
     @cached_property
     def compliance(self) -> Array:
         """All modes of the linear responses to what can load the surface."""
-        nodes = np.unique(self.workshop.body.boundary.nodes[_within_reach(self.workshop)])
-        return compliance(self.model, nodes)
+        return compliance(self.workshop)
 
     def point_forces(self, basis: Array) -> PointForces:
         """What a cubature of a basis is fitted to."""
@@ -125,96 +134,66 @@ class Training:
 
 
 Builder = Callable[[int, Training], Method]
-"""Makes a method of a size, its unknowns, where there is a choice; fewer if there are no more."""
 
 
-def build(name: str, size: int, training: Training) -> Method:
-    """Make the method of this name (``BUILDERS``) and size, its number of unknowns.
+def build(name: str, size: float, training: Training) -> Method:
+    """Make a method.
 
-    The full model and the artifact come in one size only, and take no notice of it.
+    Parameters
+    ----------
+    name : str
+        A key of ``BUILDERS``.
+    size : float
+        Number of unknowns, or fewer if there are no more; for the methods of ``MESHED``, the
+        factor on the divisions of the scene's mesh.  The artifact comes in one size only.
+    training : Training
     """
-    return BUILDERS[name](size, training)
+    return MESHED[name](size, training) if name in MESHED else BUILDERS[name](int(size), training)
 
 
 # --- one basis for the whole surface -------------------------------------------------------------
 
 
-def _galerkin(family: str, training: Training, basis: Array, cubature: Cubature) -> Galerkin:
-    label = f"{basis.shape[1]} modes, {len(cubature.points)} points"
-    return Galerkin(family, label, training.model, basis, cubature)
+def _every_point(training: Training, basis: Array) -> Method:
+    return (GalerkinInTime if training.in_time else Galerkin)(training.workshop, basis)
 
 
-def _full(family: str, training: Training, basis: Array) -> Galerkin:
-    return _galerkin(family, training, basis, Cubature.full(training.model))
+def _krylov(size: int, training: Training, moments: int = MOMENTS) -> Method:
+    loads = training.loads(-(-size // (3 * moments)))
+    return _every_point(training, krylov(training.model, training.mass, loads, size))
 
 
-def _modal(size: int, training: Training) -> Method:
-    return _full("modal", training, modal(training.model, size))
-
-
-def _ritz(size: int, training: Training) -> Method:
-    loads = training.loads(-(-size // 3))
-    return _full("ritz", training, krylov(training.model, training.mass, loads, size))
-
-
-def _krylov(size: int, training: Training) -> Method:
-    loads = training.loads(-(-size // (3 * MOMENTS)))
-    return _full("krylov", training, krylov(training.model, training.mass, loads, size))
-
-
-def _pod(size: int, training: Training) -> Method:
-    return _full("pod", training, training.pod(size))
-
-
-def _pod_euclidean(size: int, training: Training) -> Method:
-    return _full("pod-euclidean", training, training.pod(size, "euclidean"))
-
-
-def _pod_ecm(size: int, training: Training) -> Method:
+def _pod_ecm(size: int, training: Training, points: int = POINTS_PER_MODE) -> Method:
     basis = training.pod(size)
-    forces = training.point_forces(basis)
-    cubature = forces.by_point(POINTS_PER_MODE * basis.shape[1], training.rng(size))
-    return _galerkin("pod-ecm", training, basis, cubature)
+    most = points * basis.shape[1]
+    cubature = training.point_forces(basis).by_point(most, training.rng(size))
+    return Galerkin(training.workshop, basis, cubature)
 
 
 def _pod_ecsw(size: int, training: Training) -> Method:
     basis = training.pod(size)
-    forces = training.point_forces(basis)
-    cubature = forces.by_element(ELEMENTS_PER_MODE * basis.shape[1], training.rng(size))
-    return _galerkin("pod-ecsw", training, basis, cubature)
+    most = ELEMENTS_PER_MODE * basis.shape[1]
+    cubature = training.point_forces(basis).by_element(most, training.rng(size))
+    return Galerkin(training.workshop, basis, cubature)
 
 
-def _deim(size: int, training: Training) -> Method:
-    return _interpolated("pod-deim", size, training, 1)
-
-
-def _gappy(size: int, training: Training) -> Method:
-    return _interpolated("pod-gappy", size, training, SAMPLES_PER_MODE)
-
-
-def _interpolated(family: str, size: int, training: Training, per_mode: int) -> Method:
+def _deim(size: int, training: Training, per_mode: int = 1) -> Method:
     model, basis = training.model, training.pod(size)
-    known = training.snapshots.displacements[:, model.free].astype(float)
-    modes = force_modes(model, known, basis.shape[1])
-    samples = sample(modes, per_mode)
-    label = f"{basis.shape[1]} modes, {len(samples.dofs)} sampled dofs"
-    return Deim(family, label, model, basis, modes, samples)
+    snapshots = training.snapshots.displacements[:, model.free].astype(float)
+    modes = force_modes(model, snapshots, basis.shape[1])
+    return Deim(training.workshop, basis, modes, sample(modes, per_mode))
 
 
 # --- a basis for the load at hand ----------------------------------------------------------------
 
 
 def _ritz_at_hand(size: int, training: Training) -> Method:
-    model, M = training.own_model(), training.mass
-    load = np.zeros((len(training.workshop.mesh.nodes), 3))
+    model, M, nodes = training.own_model(), training.mass, len(training.workshop.mesh.nodes)
 
     def space(case: Case) -> Array:
-        load[:] = 0.0
-        load[case.nodes] = case.forces
-        return krylov(model, M, load.reshape(-1, 1)[model.free], size)
+        return krylov(model, M, case.load(nodes).reshape(-1, 1)[model.free], size)
 
-    label = f"{size} vectors of the load at hand"
-    return GalerkinAtHand("ritz-at-hand", label, model, size, space)
+    return GalerkinAtHand(training.workshop, size, space)
 
 
 def _derivatives(size: int, training: Training) -> Method:
@@ -223,8 +202,7 @@ def _derivatives(size: int, training: Training) -> Method:
     def space(case: Case) -> Array:
         return static_derivatives(model, loads_about(workshop, case)[model.free], size)
 
-    label = f"{size} vectors of the load at hand"
-    return GalerkinAtHand("derivatives", label, model, size, space)
+    return GalerkinAtHand(workshop, size, space)
 
 
 def loads_about(workshop: Workshop, case: Case) -> Array:
@@ -240,53 +218,47 @@ def loads_about(workshop: Workshop, case: Case) -> Array:
     return total.reshape(-1, 3)
 
 
-# --- no reduced equilibrium ----------------------------------------------------------------------
+# --- all of them ---------------------------------------------------------------------------------
 
 
-def _linear(size: int, training: Training) -> Method:
-    return Linear(training.model, training.compliance[:, :size])
+def _full(factor: float, training: Training) -> Method:
+    if factor == 1:
+        return Full(training.workshop)
+    if training.scene is None:
+        raise PalpateError("full: other meshes need the scene with its files")
+    return Remeshed(training.scene, factor)
 
 
-def _within_reach(workshop: Workshop) -> NDArray[np.int64]:
-    """Integration points of the boundary that some footprint can cover."""
-    vertices = cKDTree(workshop.surface.vertices)
-    # no point of a triangle is farther from a vertex than its longest edge
-    corners = workshop.surface.vertices[workshop.surface.triangles]
-    edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
-    distance, _ = vertices.query(workshop.body.boundary.points)
-    return np.flatnonzero(distance <= workshop.scene.endoscope.radius + edge)
-
-
-def _rbf(size: int, training: Training) -> Method:
-    known = training.snapshots
-    basis = training.pod(size)
-    return Regression(training.model, basis, known.loads, known.displacements)
-
-
-def _whole(size: int, training: Training) -> Method:
-    return Full(training.own_model())
-
-
-def _shipped(size: int, training: Training) -> Method:
-    if training.atlas is None:
-        raise PalpateError("artifact: the training context has none")
-    return Shipped(training.atlas)
+def _tensor_mass(factor: float, training: Training, law: Law) -> Method:
+    return TensorMass(training.workshop, scaled(training.workshop.scene, factor), law)
 
 
 BUILDERS: dict[str, Builder] = {
-    "modal": _modal,
-    "ritz": _ritz,
+    "modal": lambda size, t: _every_point(t, modal(t.model, size)),
+    "ritz": partial(_krylov, moments=1),
     "krylov": _krylov,
-    "pod": _pod,
-    "pod-euclidean": _pod_euclidean,
+    "pod": lambda size, t: _every_point(t, t.pod(size)),
+    "pod-euclidean": lambda size, t: _every_point(t, t.pod(size, "euclidean")),
+    "pod, no line search": lambda size, t: PlainNewton.galerkin(t.workshop, t.pod(size)),
     "pod-ecm": _pod_ecm,
+    "pod-ecm, 1 point a mode": partial(_pod_ecm, points=1),
     "pod-ecsw": _pod_ecsw,
     "pod-deim": _deim,
-    "pod-gappy": _gappy,
+    "pod-gappy": partial(_deim, per_mode=SAMPLES_PER_MODE),
     "ritz-at-hand": _ritz_at_hand,
     "derivatives": _derivatives,
-    "linear": _linear,
-    "regression": _rbf,
-    "full": _whole,
-    "artifact": _shipped,
+    "linear": lambda size, t: Linear(t.workshop, t.compliance[:, :size]),
+    "regression": lambda size, t: Regression(t.workshop, t.pod(size), t.snapshots),
+    "artifact": lambda size, t: (ShippedInTime if t.in_time else Shipped)(t.artifact),
+    "artifact, warm": lambda size, t: Warm(t.artifact),
+    "artifact, tip": lambda size, t: TipInTime(t.artifact),
 }
+"""Methods whose size is their number of unknowns."""
+
+MESHED: dict[str, Callable[[float, Training], Method]] = {
+    "full": _full,
+    "mass-spring": lambda factor, t: MassSpring(t.workshop, scaled(t.workshop.scene, factor)),
+    "tensor-mass linear": partial(_tensor_mass, law="linear"),
+    "tensor-mass nonlinear": partial(_tensor_mass, law="st-venant-kirchhoff"),
+}
+"""Methods with a mesh of their own, whose size is the factor on the divisions of the scene's."""

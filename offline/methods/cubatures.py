@@ -1,4 +1,4 @@
-"""Empirical cubatures of a reduced model: which quadrature points are summed, with what weight.
+"""Empirical cubatures of a reduced model: quadrature points and their weights.
 
 - by point (ECM: Hernandez, Caicedo & Ferrer 2017): few points of positive weight;
 - by element (ECSW: Farhat, Avery, Chapman & Cortial 2014): few elements, whose points all get the
@@ -6,8 +6,8 @@
 
 Both reproduce, over training states, what the tissue law adds to the force of linear elasticity.
 The states are equilibria of the reduced model *and* random departures from them.  In equilibrium
-the internal force is the load, whatever the tissue does: points fitted to nothing else answer for
-the load and leave the tangent, and so the next Newton step, to chance.
+the internal force equals the load, whatever the tissue does: points fitted to equilibria alone
+reproduce the load but not the tangent, and with it the next Newton step.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.methods.galerkin import Cubature, GalerkinModel
+from palpate.offline.methods.galerkin_model import Cubature, GalerkinModel, stress_points
 from palpate.offline.methods.method import Case
 from palpate.offline.reduce.cubature import compress, nonnegative
-from palpate.shared.reduced.press import LANES, nonlinear_stress
+from palpate.shared.reduced.points import LANES
 
 Array = NDArray[np.float64]
 
@@ -29,15 +29,15 @@ OFF_EQUILIBRIUM = 0.1
 """Size of a departure from equilibrium, relative to each mode's part in the state."""
 
 LOOKS = 16
-"""Random combinations that stand for the modes' forces in one state; their errors add up alike."""
+"""Random combinations of the modes' forces in one state, which are fitted instead of the forces."""
 
 EQUATIONS = 2
-"""Equations that are kept per cubature point, or element, allowed."""
+"""Equations kept for every cubature point, or element, allowed."""
 
 
 @dataclass(frozen=True)
 class PointForces:
-    """What every quadrature point adds to the sums that a cubature is to reproduce.
+    """Contribution of every quadrature point to the sums that a cubature has to reproduce.
 
     Attributes
     ----------
@@ -52,12 +52,12 @@ class PointForces:
     per_element: int
 
     def by_point(self, most: int, rng: np.random.Generator) -> Cubature:
-        """At most so many points, each with a weight of its own."""
+        """Cubature of at most ``most`` points, each with a weight of its own."""
         chosen, factors = _fit(self.contributions, most, rng)
         return Cubature(chosen, factors * self.weights[chosen])
 
     def by_element(self, most: int, rng: np.random.Generator) -> Cubature:
-        """All points of at most so many elements, their weights times one factor per element."""
+        """Cubature of at most ``most`` elements: all their points, one factor each."""
         sums = self.contributions.reshape(-1, self.per_element, self.contributions.shape[1])
         elements, factors = _fit(sums.sum(axis=1), most, rng)
         points = (self.per_element * elements[:, None] + np.arange(self.per_element)).ravel()
@@ -70,7 +70,7 @@ def point_forces(
     """Forces at every point in and off the equilibria of cases.
 
     They are weighted with the square root of the compliance at equilibrium, relative to the
-    answer: an error in their sum is then a relative error of displacement in the energy norm.
+    answer: an error of their sum is then a relative error of displacement in the energy norm.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def point_forces(
     per_element : int
         Quadrature points of an element.
     cases : iterable of Case
-        Those without an equilibrium teach nothing.
+        Those without an equilibrium are skipped.
     rng : numpy.random.Generator
     """
     columns = []
@@ -87,7 +87,7 @@ def point_forces(
         if not reduced.solve(case)[0]:
             continue
         q = reduced.content.q.copy()
-        L = np.tril(reduced.content.system.factor)
+        L = np.tril(reduced.content.problem.correction.factor)
         departure = OFF_EQUILIBRIUM * np.abs(q) * rng.standard_normal(len(q))
         for state in (q, q + departure):
             looks = np.linalg.solve(L.T, rng.standard_normal((len(q), LOOKS)))
@@ -96,7 +96,7 @@ def point_forces(
             if forces is not None:
                 columns.append(forces)
     count = len(reduced.points)
-    weights = reduced.content.system.weights[:count]
+    weights = reduced.content.problem.points.weights[:count]
     return PointForces(np.hstack(columns)[:count], weights, per_element)
 
 
@@ -104,13 +104,10 @@ def _contributions(
     reduced: GalerkinModel, q: Array, looks: NDArray[np.floating]
 ) -> NDArray[np.float32] | None:
     """Nonlinear forces (c, k) along ``looks`` (m, k) at coordinates q; None beyond inversion."""
-    system = reduced.content.system
-    H = q.astype(np.float32) @ system.gradients
-    P, (J, trace, linear) = np.empty_like(H), np.empty((3, len(system.weights)))
-    nonlinear_stress(H, system.weights, system.mu, system.lam, J, trace, linear, P)
-    if not J.min() > 0.0:
+    problem = reduced.content.problem
+    if not stress_points(problem, q) > 0.0:
         return None
-    work = (looks.T.astype(np.float32) @ system.gradients) * P
+    work = (looks.T.astype(np.float32) @ problem.points.gradients) * problem.work.P
     tiles = work.reshape(len(work), -1, 9, LANES).sum(axis=2)
     return np.ascontiguousarray(tiles.reshape(len(work), -1).T)
 
@@ -118,6 +115,6 @@ def _contributions(
 def _fit(
     contributions: NDArray[np.float32], most: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], Array]:
-    """Few rows and the positive factors with which they make up the sums of all."""
+    """Few rows, and the positive factors with which they reproduce the sums of all rows."""
     size = min(EQUATIONS * most, *contributions.shape)
     return nonnegative(*compress(contributions, size, rng), most)

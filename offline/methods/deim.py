@@ -27,25 +27,28 @@ from numba import njit
 from numpy.typing import NDArray
 
 from palpate.offline.fem.model import FullModel
-from palpate.offline.methods.galerkin import (
+from palpate.offline.methods.galerkin_model import (
     MAX_ITERATIONS,
     TOLERANCE,
     Content,
     Cubature,
     GalerkinModel,
+    linearise_points,
     point_gradients,
     reduce_load,
+    stress_points,
 )
-from palpate.offline.methods.method import Answer, Case
+from palpate.offline.methods.method import Answer, Case, Memoryless
+from palpate.offline.run.workshop import Workshop
 from palpate.shared.compiled import bind
-from palpate.shared.reduced.press import increments, linearise, nonlinear_stress, project, superpose
+from palpate.shared.reduced.points import project
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Where the internal force is sampled, and what its values there are worth.
+    """Where the internal force is sampled, and how its modes are fitted to the samples.
 
     Attributes
     ----------
@@ -103,67 +106,76 @@ class _Content(NamedTuple):
 def _newton(content, nodes, forces):
     """Plain Newton's method from rest: (converged, iterations), and ``q``."""
     test, q, work = content.test, content.trial.q, content.trial.newton
-    s = content.trial.system
-    reduce_load(content.trial.modes, nodes, forces, s.load)
-    q[:] = s.load
+    s = content.trial.problem
+    reduce_load(content.trial.modes, nodes, forces, s.load.f)
+    q[:] = s.load.f
     residual = work[0]
-    target = max(TOLERANCE * math.sqrt(np.dot(s.load, s.load)), 1e-12)
+    target = max(TOLERANCE * math.sqrt(np.dot(s.load.f, s.load.f)), 1e-12)
     for iteration in range(1, MAX_ITERATIONS):
-        superpose(s.gradients, q, s.H)
-        nonlinear_stress(s.H, s.weights, s.mu, s.lam, s.J, s.trace, s.linear, s.P)
-        if not s.J.min() > 0.0:
+        if not stress_points(s, q) > 0.0:
             return False, iteration
-        project(test, s.P, residual)
+        project(test, s.work.P, residual)
         for i in range(len(q)):
-            residual[i] += q[i] - s.load[i]
+            residual[i] += q[i] - s.load.f[i]
         if math.sqrt(np.dot(residual, residual)) <= target:
             return True, iteration
-        linearise(s.H, s.weights, s.mu, s.lam, s.state)
-        increments(s.state, s.gradients, s.increments)
-        s.tangent[:] = np.dot(test, s.increments.T)
+        linearise_points(s)
+        s.correction.whole[:] = np.dot(test, s.correction.products.T)
         for i in range(len(q)):
-            s.tangent[i, i] += 1.0
-        q -= np.linalg.solve(s.tangent, residual)
+            s.correction.whole[i, i] += 1.0
+        q -= np.linalg.solve(s.correction.whole, residual)
     return False, MAX_ITERATIONS
 
 
-class PlainNewton:
-    """A reduced model whose steps are taken whole, whatever comes; see ``offline.methods.method``.
+class PlainNewton(Memoryless):
+    """A reduced model by Newton's method without a line search: every step is taken whole.
 
-    With the trial functions as test functions it is a Galerkin model without a line search.
+    With the trial functions as test functions it is a Galerkin method.  The state is the modes'
+    coordinates.
 
     Parameters
     ----------
-    family, label : str
+    workshop : Workshop
     unknowns : int
+    label : str
     reduced : GalerkinModel
+        With its basis.
     test : ndarray, shape (>= m, 9 c), float32
-        Gradients of the test functions, as those of the modes.
+        Gradients of the test functions, in the layout of those of the modes.
     """
 
     def __init__(
         self,
-        family: str,
-        label: str,
+        workshop: Workshop,
         unknowns: int,
+        label: str,
         reduced: GalerkinModel,
         test: NDArray[np.float32],
     ) -> None:
-        self.family, self.label, self.unknowns = family, label, unknowns
+        super().__init__(workshop, unknowns, label)
         self._reduced = reduced
         self._bound = bind(_Content(reduced.content, test))
 
-    def solve(self, case: Case) -> Answer:
-        """Solve from rest; the state is the modes' coordinates."""
+    @classmethod
+    def galerkin(cls, workshop: Workshop, basis: Array) -> PlainNewton:
+        """Galerkin's method in a basis (free dofs, m), with every quadrature point."""
+        model, m = workshop.model, basis.shape[1]
+        reduced = GalerkinModel(model, m, Cubature.full(model))
+        reduced.adopt(basis)
+        return cls(workshop, m, "no line search", reduced, reduced.content.problem.points.gradients)
+
+    def step(self, state: Array | None, case: Case, dt: float = 0.0) -> Answer:
+        """See ``Method``."""
         try:
             converged, iterations = _newton(self._bound, case.nodes, case.forces)
         except np.linalg.LinAlgError:  # a singular tangent, or none that is finite
             converged, iterations = False, MAX_ITERATIONS
-        return Answer(self._reduced.content.q.copy(), converged, converged, iterations)
+        found = self._reduced.content.q.copy() if converged else state
+        return Answer(found, converged, converged, iterations)
 
-    def displacement(self, answer: Answer) -> Array:
-        """Nodal displacement (n, 3) mm."""
-        return (self._reduced.content.modes @ answer.state).reshape(-1, 3)
+    def field(self, state: Array) -> Array:
+        """See ``Memoryless``."""
+        return self._reduced.displacement(state)
 
 
 class Deim(PlainNewton):
@@ -171,8 +183,7 @@ class Deim(PlainNewton):
 
     Parameters
     ----------
-    family, label : str
-    model : FullModel
+    workshop : Workshop
     basis : ndarray, shape (free dofs, m), mm
         Orthonormal in the energy at rest.
     modes : ndarray, shape (free dofs, k)
@@ -180,25 +191,18 @@ class Deim(PlainNewton):
     samples : Samples
     """
 
-    def __init__(
-        self,
-        family: str,
-        label: str,
-        model: FullModel,
-        basis: Array,
-        modes: Array,
-        samples: Samples,
-    ) -> None:
-        unknowns = basis.shape[1]
+    def __init__(self, workshop: Workshop, basis: Array, modes: Array, samples: Samples) -> None:
+        model, unknowns = workshop.model, basis.shape[1]
         self.points = _points_touched(model, samples.dofs)
         weights = model.weights.ravel()[self.points]
         reduced = GalerkinModel(model, unknowns, Cubature(self.points, weights))
         reduced.adopt(basis)
         functions = np.zeros((3 * len(model.mesh.nodes), unknowns))
         functions[model.free[samples.dofs]] = (basis.T @ modes @ samples.fit).T
-        test = np.zeros_like(reduced.content.system.gradients)
+        test = np.zeros_like(reduced.content.problem.points.gradients)
         point_gradients(model.connectivity, model.gradients, self.points, functions, test)
-        super().__init__(family, label, unknowns, reduced, test)
+        label = f"{unknowns} modes, {len(samples.dofs)} sampled dofs"
+        super().__init__(workshop, unknowns, label, reduced, test)
 
 
 def _points_touched(model: FullModel, dofs: NDArray[np.int64]) -> NDArray[np.int64]:

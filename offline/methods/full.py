@@ -1,40 +1,114 @@
-"""The full model as a method: exact on its mesh, and slow."""
+"""The full model as a method, on the scene's mesh and on others: exact on its mesh, and slow."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.fem.model import FullModel, NoEquilibrium
-from palpate.offline.methods.method import Answer, Case
+from palpate.offline.fem.model import History, NoEquilibrium
+from palpate.offline.methods.lattice import coordinates, interpolation, lattice
+from palpate.offline.methods.method import Answer, Case, Memoryless, Method
+from palpate.offline.run.workshop import Load, Workshop
+from palpate.shared.scene import Scene, divisions_of
 
 Array = NDArray[np.float64]
 
 
-class Full:
-    """Newton's method on every free dof, in one jump from rest if that converges.
+class Full(Method):
+    """Newton's method on every free degree of freedom.
+
+    Elastic tissue is solved from rest, in one jump if that converges; visco-elastic tissue steps
+    on from its history.
 
     Parameters
     ----------
-    model : FullModel
+    workshop : Workshop
     """
 
-    family = label = "full"
+    label = "full"
 
-    def __init__(self, model: FullModel) -> None:
-        self.unknowns = len(model.free)
-        self._model = model
+    def __init__(self, workshop: Workshop) -> None:
+        self.unknowns = len(workshop.model.free)
+        self._workshop, self._model = workshop, workshop.model
 
-    def solve(self, case: Case) -> Answer:
-        """Solve from rest; the state is the nodal displacement."""
-        load = np.zeros((len(self._model.mesh.nodes), 3))
-        load[case.nodes] = case.forces
+    def at_rest(self) -> History:
+        """See ``Method``."""
+        return self._model.at_rest
+
+    def step(self, state: History, case: Case, dt: float = 0.0) -> Answer:
+        """See ``Method``."""
+        load = case.load(len(state.displacement))
         try:
-            found = self._model.solve(load)
+            if self._model.prony:
+                found, after = self._model.step(state, load, dt)
+            else:
+                found = self._model.solve(load)
+                after = History(found.displacement, state.points)
         except NoEquilibrium:
-            return Answer(np.zeros_like(load), False, False)
+            return Answer(state, False, False)
+        return Answer(after, True, True, found.iterations)
+
+    def displacement(self, state: History) -> Array:
+        """See ``Method``."""
+        return state.displacement
+
+    def von_mises(self, state: History) -> Array:
+        """See ``Method``."""
+        if self._model.prony:
+            return self._workshop.von_mises_after(state)
+        return self._workshop.von_mises(state.displacement)
+
+
+# --- the same body in other meshes ---------------------------------------------------------------
+
+
+def divided(scene: Scene, factor: float) -> Scene:
+    """A scene with the divisions of its mesh times a factor, rounded up."""
+    divisions = tuple(int(np.ceil(factor * n)) for n in divisions_of(scene.geometry))
+    geometry = scene.geometry.model_copy(update={"divisions": divisions})
+    return scene.model_copy(update={"geometry": geometry})
+
+
+class Remeshed(Memoryless):
+    """Full model of a scene in another mesh, compared at the nodes of the scene's own.
+
+    It finds the nodes that a contact loads by itself; other methods are given them.
+
+    Parameters
+    ----------
+    scene : Scene
+        With its own mesh.
+    factor : float
+        By which the divisions of the mesh are multiplied.
+    """
+
+    def __init__(self, scene: Scene, factor: float) -> None:
+        other = divided(scene, factor)
+        self._other = Workshop(other)
+        label = f"mesh of {' x '.join(map(str, divisions_of(other.geometry)))}"
+        super().__init__(Workshop(scene), len(self._other.model.free), label)
+        at = coordinates(self.workshop.mesh, lattice(scene))
+        self._to_scene = interpolation(at, lattice(other), self._other.mesh.elements)
+
+    def step(self, state: Array | None, case: Case, dt: float = 0.0) -> Answer:
+        """See ``Method``; the state is the displacement of the other mesh's nodes."""
+        load = np.sum([self._load(contact) for contact in case.contacts], axis=0)
+        try:
+            found = self._other.model.solve(load)
+        except NoEquilibrium:
+            return Answer(state, False, False)
         return Answer(found.displacement, True, True, found.iterations)
 
-    def displacement(self, answer: Answer) -> Array:
-        """Nodal displacement (n, 3) mm."""
-        return np.asarray(answer.state, dtype=float)
+    def _load(self, contact: Load) -> Array:
+        """Nodal forces (m, 3) mN on the other mesh, pressed where the scene's own mesh is.
+
+        The accessible surface of the other mesh ends at other faces: projected onto that, a
+        contact on the rim would move.
+        """
+        x, normal, _ = self.workshop.surface.project(contact.position)
+        nodal = self._other.unit_load_at(x, normal)
+        return contact.pressure * nodal[:, None] * contact.direction
+
+    def field(self, state: Array) -> Array:
+        """See ``Memoryless``."""
+        return np.asarray(self._to_scene @ state)

@@ -6,16 +6,15 @@ Szekely & Harders (IEEE TVCG 13, 2007), who choose those whose linearised stiffn
 nearest to that of the finite element model, ``min || K - sum_s k_s b_s b_s^T ||`` in the Frobenius
 norm with ``b_s`` (3 m,) the elongation of a spring by nodal displacements.  They do so for one
 element at a time, and regular ones have closed forms: ``2 sqrt(2) / 25 E l`` for a tetrahedron of
-edge ``l``.  Here it is done for the assembled matrix of linear tetrahedra, the mean of the two
-cuts, and with ``k_s >= 0`` for stability: in elements as flat as the turbinate's, stiffnesses added
-up from elements are negative in places, and cut off at zero they leave a body that is much too soft
-in some directions, with three times the error.
+edge ``l``.  Here the matrix is the assembled one of linear tetrahedra, the mean of the two cuts,
+with ``k_s >= 0`` for stability.  In elements as flat as the turbinate's, stiffnesses added up from
+single elements are negative in places; cut off at zero they leave a body that is much too soft in
+some directions, with three times the error.
 
 A limit of the method, whatever its springs: a network of central forces obeys Cauchy's relation,
 ``lambda = mu``, so that its Poisson's ratio is 1/4.  The network is therefore identified from
-tissue of that ratio; tissue of .45, which gives way sideways, it cannot be.  What can be made up
-for is the overall stiffness, by a factor that gives small loads the full model's answer in the
-mean.
+tissue of that ratio and cannot represent tissue of .45.  Only the overall stiffness can be
+corrected: by the factor with which small loads get the full model's answer in the mean.
 """
 
 from __future__ import annotations
@@ -26,8 +25,9 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix
 
 from palpate.offline.methods.calibration import stiffening
-from palpate.offline.methods.relaxation import TOLERANCE, Ints, Relaxed, Stencil
-from palpate.offline.methods.tetrahedra import Divisions, Tetrahedra, edges_of, gradients
+from palpate.offline.methods.lattice import Divisions, Ints
+from palpate.offline.methods.relaxation import TOLERANCE, Relaxed, Stencil
+from palpate.offline.methods.tetrahedra import Tetrahedra, edges_of, gradients
 from palpate.offline.run.workshop import Workshop
 from palpate.shared.mechanics.tissue import lame
 
@@ -50,14 +50,12 @@ class MassSpring(Relaxed):
     ----------
     workshop : Workshop
     divisions : tuple of 3 int
-        Cells along the axes of the scene's lattice; see ``offline.methods.tetrahedra``.
+        Cells along the axes of the scene's lattice; see ``offline.methods.lattice``.
     young : float, optional
         kPa; if absent, such that small loads get the full model's answer in the mean.
     tolerance : float
         Residual of an answer relative to its load.
     """
-
-    family = "mass-spring"
 
     def __init__(
         self,
@@ -70,7 +68,7 @@ class MassSpring(Relaxed):
         springs = Springs.identified(mesh, tissue if young is None else young)
         if young is None:
             springs = springs.stiffened(stiffening(workshop, mesh, springs))
-        super().__init__(mesh, springs, f"{len(springs.ends)} springs", tolerance)
+        super().__init__(workshop, mesh, springs, f"{len(springs.ends)} springs", tolerance)
 
 
 class Springs:
@@ -195,23 +193,22 @@ def _internal(ends, vectors, lengths, stiffness, u, force):
 
     The elongation is computed from ``|v + w|^2 - |v|^2 = w . (2 v + w)``, free of cancellation.
     """
-    energy = 0.0
+    energy, x = 0.0, np.empty(3)
     for s in range(len(ends)):
         a, b = ends[s, 0], ends[s, 1]
-        v0, v1, v2 = vectors[s, 0], vectors[s, 1], vectors[s, 2]
-        w0, w1, w2 = u[0, b] - u[0, a], u[1, b] - u[1, a], u[2, b] - u[2, a]
-        x0, x1, x2 = v0 + w0, v1 + w1, v2 + w2
-        length = np.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
-        longer = (w0 * (v0 + x0) + w1 * (v1 + x1) + w2 * (v2 + x2)) / (length + lengths[s])
+        square, longer = 0.0, 0.0
+        for i in range(3):
+            w = u[i, b] - u[i, a]
+            x[i] = vectors[s, i] + w
+            square += x[i] * x[i]
+            longer += w * (vectors[s, i] + x[i])
+        length = np.sqrt(square)
+        longer /= length + lengths[s]
         energy += 0.5 * stiffness[s] * longer * longer
         tension = stiffness[s] * longer / length
-        f0, f1, f2 = tension * x0, tension * x1, tension * x2
-        force[0, a] -= f0
-        force[1, a] -= f1
-        force[2, a] -= f2
-        force[0, b] += f0
-        force[1, b] += f1
-        force[2, b] += f2
+        for i in range(3):
+            force[i, a] -= tension * x[i]
+            force[i, b] += tension * x[i]
     return energy
 
 

@@ -1,14 +1,16 @@
-"""What every method of deforming tissue has in common: it answers a case.
+"""What every method of deforming tissue has in common: it answers loads, one after the other.
 
-A study asks many methods the same cases.  ``solve`` is what is timed: everything that depends on
-the load and that a user waits for, but no field of mesh size.  ``displacement`` recovers the field.
+A study asks many methods the same cases.  ``Method.step`` is what is timed: everything that depends
+on the load and that a user waits for, but no field of mesh size.  ``displacement`` and
+``von_mises`` recover the fields.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,17 +22,17 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Case:
-    """Footprints that press at once, and the nodal forces they amount to.
+    """Footprints that press at the same time, and the nodal forces they amount to.
 
     Attributes
     ----------
     contacts : tuple of Load
     nodes : ndarray, shape (k,), int
-        The nodes that are loaded.
+        The loaded nodes.
     forces : ndarray, shape (k, 3), mN
-        On those.
+        On the loaded nodes.
     shares : ndarray, shape (contacts, k), mN
-        What each contact presses them with, in its direction.
+        The part of each contact, in its direction.
     radius : float, optional
         Of the footprints, mm; the scene's if absent.
     """
@@ -57,20 +59,40 @@ class Case:
         directions = np.array([contact.direction for contact in contacts])
         return cls(contacts, nodes, shares.T @ directions, shares, radius)
 
+    @classmethod
+    def of_tip(cls, position: Array, direction: Array) -> Case:
+        """Case of the rigid tip with its centre at a position; its nodal forces are not known."""
+        return cls((Load(position, direction, 0.0),), np.empty(0, np.int64), np.empty((0, 3)))
+
+    def load(self, nodes: int) -> Array:
+        """Nodal forces (nodes, 3) mN of the whole body."""
+        load = np.zeros((nodes, 3))
+        load[self.nodes] = self.forces
+        return load
+
+
+@dataclass(frozen=True)
+class Snapshots:
+    """Full solutions to learn from: loads, and displacements (k, 3 n) mm."""
+
+    loads: Sequence[Load]
+    displacements: Array
+
 
 @dataclass(frozen=True)
 class Answer:
-    """What a method makes of a case.
+    """Result of a method's step.
 
     Attributes
     ----------
     state : object
-        Whatever ``Method.displacement`` needs.
+        State of the body at the end of the step: its fields are recovered from it, and the next
+        step starts from it.  Without an answer, the state before the step.
     converged : bool
-        Whether the method itself reports an answer at all.
+        Whether the method reports an answer at all.
     trusted : bool
-        Whether it vouches for it: in range, and estimated within the scene's tolerance.  Methods
-        that cannot tell vouch for whatever converged.
+        Whether it vouches for the answer: in range, and estimated to be within the scene's
+        tolerance.  Methods that cannot tell vouch for every answer that converged.
     iterations : int
     refused : bool
         Whether it declined the case instead of trying.
@@ -83,27 +105,83 @@ class Answer:
     refused: bool = False
 
 
-class Method(Protocol):
+class Method(ABC):
     """A way to answer cases.
 
     Attributes
     ----------
-    family : str
-        ``"pod"``, ``"mass-spring"``, ...; one colour on a chart.
     label : str
-        Of this size, for people.
+        Describes the size of the method, for people.
     unknowns : int
-        Numbers solved for per query.
+        Numbers solved for in a step.
     """
 
-    family: str
     label: str
     unknowns: int
 
-    def solve(self, case: Case) -> Answer:
-        """Answer a case from rest; never raises for a case it cannot answer."""
-        ...
+    @abstractmethod
+    def at_rest(self) -> Any:
+        """State of a body to which nothing has happened."""
 
-    def displacement(self, answer: Answer) -> Array:
+    @abstractmethod
+    def step(self, state: Any, case: Case, dt: float = 0.0) -> Answer:
+        """Answer a case that is reached ``dt`` (s) after a state, which is not changed.
+
+        A load without an answer is reported, not raised.
+
+        Raises
+        ------
+        ValueError
+            If the method knows time and ``dt`` is negative or not a number.
+        """
+
+    @abstractmethod
+    def displacement(self, state: Any) -> Array:
         """Nodal displacement (n, 3) mm."""
-        ...
+
+    @abstractmethod
+    def von_mises(self, state: Any) -> Array:
+        """Nodal von Mises stress (n,) kPa."""
+
+    def solve(self, case: Case) -> Answer:
+        """Answer a case from rest: one step of no time."""
+        return self.step(self.at_rest(), case)
+
+    def follow(self, steps: Iterable[tuple[Case, float]]) -> list[Any]:
+        """States at the ends of steps, cases with times (s), one after the other from rest."""
+        states = [self.at_rest()]
+        for case, dt in steps:
+            states.append(self.step(states[-1], case, dt).state)
+        return states[1:]
+
+
+class Memoryless(Method):
+    """A method for elastic tissue: its answer depends on the case alone, not on state or time.
+
+    Its state is None at rest and otherwise whatever ``field`` needs.
+
+    Parameters
+    ----------
+    workshop : Workshop
+    unknowns : int
+    label : str
+    """
+
+    def __init__(self, workshop: Workshop, unknowns: int, label: str) -> None:
+        self.workshop, self.unknowns, self.label = workshop, unknowns, label
+
+    def at_rest(self) -> Any:
+        """See ``Method``."""
+        return None
+
+    @abstractmethod
+    def field(self, state: Any) -> Array:
+        """Nodal displacement (n, 3) mm of an answer."""
+
+    def displacement(self, state: Any) -> Array:
+        """See ``Method``."""
+        return np.zeros_like(self.workshop.mesh.nodes) if state is None else self.field(state)
+
+    def von_mises(self, state: Any) -> Array:
+        """See ``Method``."""
+        return self.workshop.von_mises(self.displacement(state))

@@ -3,70 +3,83 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from palpate.offline.fem.model import FullModel
-from palpate.offline.methods.galerkin import reduce_load
-from palpate.offline.methods.method import Answer, Case
+from palpate.offline.methods.galerkin_model import reduce_load
+from palpate.offline.methods.method import Answer, Case, Memoryless, Snapshots
 from palpate.offline.reduce.ritz import energy_pod
-from palpate.offline.run.workshop import Load
-from palpate.offline.studies.baselines import HELD_BACK, KERNELS, LENGTHS
+from palpate.offline.run.workshop import Load, Workshop
 
 Array = NDArray[np.float64]
 
+LENGTHS = (1.0, 2.0, 4.0, 8.0, 16.0)
+"""Millimetres on the surface that weigh as much as a unit of direction, or of median pressure."""
 
-def compliance(model: FullModel, nodes: NDArray[np.integer]) -> Array:
-    """Modes (free dofs, <= 3 k) of the linear responses to forces on nodes (k,), main ones first.
+HELD_BACK = 5
+"""One in this many samples is held back to choose kernel and lengths by."""
 
-    All of them hold every response exactly, and few hold the smooth ones that footprints cause.
-    Being orthonormal in the energy at rest they are also all that a query needs: ``V V^T f`` is the
-    best that they can make of ``K^-1 f``.
+
+def compliance(workshop: Workshop) -> Array:
+    """Modes (free dofs, m) of the linear responses to whatever can load the surface.
+
+    All of them hold every response exactly, and the leading ones the smooth responses to
+    footprints.  Since they are orthonormal in the energy at rest, ``V V^T f`` is the best
+    approximation of ``K^-1 f`` in them: a query needs nothing else.
     """
+    model = workshop.model
+    nodes = np.unique(workshop.body.boundary.nodes[_within_reach(workshop)])
     loaded = np.flatnonzero(np.isin(model.free // 3, nodes))
     unit = np.zeros((len(model.free), len(loaded)))
     unit[loaded, np.arange(len(loaded))] = 1.0
     return energy_pod(model, model.solve_linear(unit), len(loaded))[0]
 
 
-class Linear:
-    """Superposition of compressed nodal compliances; see ``offline.methods.method``.
+def _within_reach(workshop: Workshop) -> NDArray[np.int64]:
+    """Integration points of the boundary that some footprint can cover."""
+    vertices = cKDTree(workshop.surface.vertices)
+    # no point of a triangle is farther from a vertex than its longest edge
+    corners = workshop.surface.vertices[workshop.surface.triangles]
+    edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
+    distance, _ = vertices.query(workshop.body.boundary.points)
+    return np.flatnonzero(distance <= workshop.scene.endoscope.radius + edge)
 
-    It has an answer to any load, and no way to tell that it is wrong.
+
+class Linear(Memoryless):
+    """Superposition of compressed nodal compliances; the state is the modes' coordinates.
+
+    It answers every load, and cannot tell when its answer is wrong.
 
     Parameters
     ----------
-    model : FullModel
+    workshop : Workshop
     basis : ndarray, shape (free dofs, m), mm
-        Of ``compliance``.
+        The leading modes of ``compliance``.
     """
 
-    family = "linear"
+    def __init__(self, workshop: Workshop, basis: Array) -> None:
+        super().__init__(workshop, basis.shape[1], f"{basis.shape[1]} modes")
+        self._modes = np.zeros((workshop.mesh.nodes.size, self.unknowns))
+        self._modes[workshop.model.free] = basis
 
-    def __init__(self, model: FullModel, basis: Array) -> None:
-        self.unknowns = basis.shape[1]
-        self.label = f"{self.unknowns} modes"
-        self._modes = np.zeros((3 * len(model.mesh.nodes), self.unknowns))
-        self._modes[model.free] = basis
-
-    def solve(self, case: Case) -> Answer:
-        """Coordinates of the linear response."""
+    def step(self, state: Array | None, case: Case, dt: float = 0.0) -> Answer:
+        """See ``Method``."""
         q = np.empty(self.unknowns)
         reduce_load(self._modes, case.nodes, case.forces, q)
         return Answer(q, True, True)
 
-    def displacement(self, answer: Answer) -> Array:
-        """Nodal displacement (n, 3) mm."""
-        return (self._modes @ answer.state).reshape(-1, 3)
+    def field(self, state: Array) -> Array:
+        """See ``Memoryless``."""
+        return (self._modes @ state).reshape(-1, 3)
 
 
 # --- radial basis functions ----------------------------------------------------------------------
 
-_DEGREE = {"linear": 1, "thin_plate_spline": 2, "cubic": 3}
-"""Power of the distance in a kernel of ``scipy.interpolate.RBFInterpolator``."""
+KERNELS = {"linear": 1, "thin_plate_spline": 2, "cubic": 3}
+"""Power of the distance in the kernels of ``scipy.interpolate.RBFInterpolator``."""
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -108,7 +121,7 @@ class Interpolant:
     features : ndarray, shape (k, 7)
         Contact point (mm), direction, pressure (kPa).
     values : ndarray, shape (k, m)
-        Interpolated per pressure: that takes the main trend off the kernels.
+        Interpolated per unit of pressure, which removes the main trend.
     kernel : {"linear", "thin_plate_spline", "cubic"}
     lengths : (float, float)
         Millimetres that weigh as much as a unit of direction, and of median pressure.
@@ -123,7 +136,7 @@ class Interpolant:
         # on a flat surface a coordinate never changes, and polynomials in it cannot be told apart
         _, spread, axes = np.linalg.svd(scaled - scaled.mean(axis=0), full_matrices=False)
         self._axes = scales[:, None] * axes[spread > 1e-6 * spread[0]].T
-        self._degree = _DEGREE[kernel]
+        self._degree = KERNELS[kernel]
         self._centres = features @ self._axes
         k, d = self._centres.shape
         system = np.zeros((k + d + 1, k + d + 1))
@@ -137,19 +150,14 @@ class Interpolant:
     def __call__(self, features: Array) -> Array:
         """Values (m,) at features (7,)."""
         _evaluate(
-            features,
-            self._axes,
-            self._centres,
-            self._degree,
-            self._coefficients,
-            self._basis,
+            features, self._axes, self._centres, self._degree, self._coefficients, self._basis,
             self._values,
-        )
+        )  # fmt: skip
         return self._values.copy()
 
 
 def fit_interpolant(features: Array, values: Array) -> Interpolant:
-    """Interpolant of the kernel and lengths that serve best on samples held back."""
+    """Interpolant with the kernel and lengths of least error on samples held back."""
     back = np.arange(len(features)) % HELD_BACK == 0
 
     def error(kernel: str, lengths: tuple[float, float]) -> float:
@@ -162,44 +170,37 @@ def fit_interpolant(features: Array, values: Array) -> Interpolant:
     return Interpolant(features, values, *min(choices, key=lambda choice: error(*choice)))
 
 
-class Regression:
-    """Coordinates of POD modes by radial basis functions in the load; no mechanics.
+class Regression(Memoryless):
+    """Coordinates of POD modes by radial basis functions of the load; no mechanics.
 
-    For a single contact; it refuses several.  It has an answer to any load.
+    It refuses several contacts and answers every single one.  The state is the coordinates.
 
     Parameters
     ----------
-    model : FullModel
+    workshop : Workshop
     basis : ndarray, shape (free dofs, m), mm
         Orthonormal in the energy at rest.
-    loads : sequence of Load
-    displacements : ndarray, shape (k, 3 n), mm
-        Of the full model under the loads.
+    snapshots : Snapshots
     """
 
-    family = "regression"
-
-    def __init__(
-        self, model: FullModel, basis: Array, loads: Sequence[Load], displacements: Array
-    ) -> None:
-        self.unknowns = basis.shape[1]
-        self.label = f"{self.unknowns} modes of {len(loads)} samples"
-        self._basis, self._free = basis, model.free
-        self._nodes = len(model.mesh.nodes)
-        coordinates = displacements[:, model.free] @ (model.rest_stiffness @ basis)
-        given = np.array([_features(load) for load in loads])
+    def __init__(self, workshop: Workshop, basis: Array, snapshots: Snapshots) -> None:
+        m = basis.shape[1]
+        super().__init__(workshop, m, f"{m} modes of {len(snapshots.loads)} samples")
+        model, self._basis = workshop.model, basis
+        coordinates = snapshots.displacements[:, model.free] @ (model.rest_stiffness @ basis)
+        given = np.array([_features(load) for load in snapshots.loads])
         self._interpolant = fit_interpolant(given, coordinates)
 
-    def solve(self, case: Case) -> Answer:
-        """Interpolate; the state is the modes' coordinates."""
+    def step(self, state: Array | None, case: Case, dt: float = 0.0) -> Answer:
+        """See ``Method``."""
         if len(case.contacts) != 1:
-            return Answer(np.zeros(self.unknowns), False, False, refused=True)
+            return Answer(state, False, False, refused=True)
         return Answer(self._interpolant(_features(case.contacts[0])), True, True)
 
-    def displacement(self, answer: Answer) -> Array:
-        """Nodal displacement (n, 3) mm."""
-        u = np.zeros(3 * self._nodes)
-        u[self._free] = self._basis @ answer.state
+    def field(self, state: Array) -> Array:
+        """See ``Memoryless``."""
+        u = np.zeros(self.workshop.mesh.nodes.size)
+        u[self.workshop.model.free] = self._basis @ state
         return u.reshape(-1, 3)
 
 

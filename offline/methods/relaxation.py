@@ -1,11 +1,11 @@
-"""Relaxation: what surgical trainers do to bring a mesh of points to rest under a load.
+"""Relaxation: how surgical trainers bring a mesh of points to rest under a load.
 
 Trainers step a damped motion, explicitly or, since Baraff & Witkin (SIGGRAPH 1998), implicitly with
-conjugate gradients, until it comes to rest.  Where it rests depends on neither mass nor damping, so
-here they are left out: an implicit step of infinite length is Newton's, whose linear system
-preconditioned conjugate gradients solve only as well as it deserves (Dembo, Eisenstat & Steihaug
-1982; Nocedal & Wright, Numerical Optimization, algorithm 7.1), and the potential decides how much
-of the step is taken.  Nothing is factorised but 3 x 3 blocks.
+conjugate gradients, until it comes to rest.  The position at rest depends on neither mass nor
+damping, so here they are left out: an implicit step of infinite length is a step of Newton's
+method.  Preconditioned conjugate gradients solve its linear system inexactly (Dembo, Eisenstat &
+Steihaug 1982; Nocedal & Wright, Numerical Optimization, algorithm 7.1), and a line search on the
+potential shortens the step.  Only 3 x 3 blocks are factorised.
 
 Points are numbered with the free ones first; vectors over points are (3, ...), axis by axis, and
 the tangent is one 3 x 3 tensor for each point and each of its neighbours: first neighbours of all
@@ -14,19 +14,19 @@ points, then second ones, and so on, so that vector instructions take many point
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from palpate.offline.methods.method import Answer, Case
+from palpate.offline.methods.lattice import Ints
+from palpate.offline.methods.method import Answer, Case, Memoryless
 from palpate.offline.methods.tetrahedra import Tetrahedra
+from palpate.offline.run.workshop import Workshop
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
-Ints = NDArray[np.int64]
 
 TOLERANCE = 3e-3
 """Residual relative to the load: on the turbinate, displacements are then within 1 % in the median,
@@ -42,25 +42,13 @@ ROUND_OFF = 1e-12
 """Relative error with which a potential is known."""
 
 
-@dataclass(frozen=True)
-class Rest:
-    """Where a relaxation ended.
+class Rest(NamedTuple):
+    """Where a relaxation ended."""
 
-    Attributes
-    ----------
-    displacement : ndarray, shape (3, m), mm
-        Of all points; clamped ones stay.
-    residual : float
-        Relative to the load, both in the Euclidean norm of the free points' forces.
-    converged : bool
-    iterations : int
-        Of conjugate gradients.
-    """
-
-    displacement: Array
-    residual: float
+    displacement: Array  # (3, m) mm, of all points; clamped ones stay
+    residual: float  # over the load, in the Euclidean norm of the free points' forces
     converged: bool
-    iterations: int
+    iterations: int  # of conjugate gradients
 
 
 class Elastic(Protocol):
@@ -86,11 +74,14 @@ class Elastic(Protocol):
         ...
 
 
-class Relaxed:
-    """A method whose answer is a body of tetrahedra's corners, relaxed from rest.
+class Relaxed(Memoryless):
+    """A body of points at the corners of tetrahedra, relaxed from rest.
+
+    The state is the displacement (3, m) mm of the points.
 
     Parameters
     ----------
+    workshop : Workshop
     mesh : Tetrahedra
     body : Elastic
     label : str
@@ -98,20 +89,23 @@ class Relaxed:
         Residual of an answer relative to its load.
     """
 
-    def __init__(self, mesh: Tetrahedra, body: Elastic, label: str, tolerance: float) -> None:
-        self.mesh, self.body, self.label, self.tolerance = mesh, body, label, tolerance
-        self.unknowns = 3 * mesh.free
+    def __init__(
+        self, workshop: Workshop, mesh: Tetrahedra, body: Elastic, label: str, tolerance: float
+    ) -> None:
+        super().__init__(workshop, 3 * mesh.free, label)
+        self.mesh, self.body, self.tolerance = mesh, body, tolerance
         self._load = np.zeros((3, len(mesh.nodes)))
 
-    def solve(self, case: Case) -> Answer:
-        """Relax from rest."""
+    def step(self, state: Array | None, case: Case, dt: float = 0.0) -> Answer:
+        """See ``Method``."""
         self.mesh.load(case, self._load)
         rest = relax(self.body, self._load, self.tolerance)
-        return Answer(rest.displacement, rest.converged, rest.converged, rest.iterations)
+        found = rest.displacement if rest.converged else state
+        return Answer(found, rest.converged, rest.converged, rest.iterations)
 
-    def displacement(self, answer: Answer) -> Array:
-        """Nodal displacement (n, 3) mm."""
-        return self.mesh.displacement(answer.state)
+    def field(self, state: Array) -> Array:
+        """See ``Memoryless``."""
+        return self.mesh.displacement(state)
 
 
 class Stencil:
@@ -202,16 +196,9 @@ class Stencil:
         iterations : int
         """
         return conjugate_gradients(
-            self.neighbours,
-            self.lengths,
-            self.tensors,
-            self._inverse,
-            load,
-            fraction,
-            most,
-            out,
+            self.neighbours, self.lengths, self.tensors, self._inverse, load, fraction, most, out,
             self._work,
-        )
+        )  # fmt: skip
 
 
 def relax(body: Elastic, load: Array, tolerance: float) -> Rest:
@@ -328,72 +315,37 @@ def _precondition(inverse, r, z):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def _dot(x, y):
-    total = np.float32(0.0)
-    for axis in range(3):
-        a, b = x[axis], y[axis]
-        for i in range(len(a)):
-            total += a[i] * b[i]
-    return total
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def _add(factor, x, y):
-    """``y += factor x`` of (3, f)."""
-    for axis in range(3):
-        a, b = x[axis], y[axis]
-        for i in range(len(a)):
-            b[i] += factor * a[i]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def _turn(factor, z, p):
-    """``p = z + factor p`` of (3, f)."""
-    for axis in range(3):
-        a, b = z[axis], p[axis]
-        for i in range(len(a)):
-            b[i] = a[i] + factor * b[i]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def conjugate_gradients(neighbours, lengths, tensors, inverse, load, fraction, most, out, work):
     """Preconditioned conjugate gradients; see ``Stencil.solve``.  Work (5, 3, f) is float32."""
     r, z, p, q, near = work[0], work[1], work[2], work[3], work[4]
-    scale = 0.0
-    for axis in range(3):
-        for i in range(load.shape[1]):
-            scale = max(scale, abs(load[axis, i]))
+    scale = np.abs(load).max()
     out[:] = 0.0
     if not scale > 0.0:
         return 0
-    for axis in range(3):
-        for i in range(load.shape[1]):
-            r[axis, i] = load[axis, i] / scale
-    p[:] = 0.0
-    target = fraction * fraction * _dot(r, r)
+    # the same as plain vectors
+    rs, zs, ps, qs = r.reshape(-1), z.reshape(-1), p.reshape(-1), q.reshape(-1)
+    x, f = out.reshape(-1), load.reshape(-1)
+    for i in range(len(f)):
+        rs[i] = f[i] / scale
+    ps[:] = 0.0
+    target = fraction * fraction * np.dot(rs, rs)
     rho, before = _precondition(inverse, r, z), np.float32(1.0)
     for iteration in range(most):
-        _turn(rho / before if iteration else np.float32(0.0), z, p)
+        turn = rho / before if iteration else np.float32(0.0)
+        for i in range(len(ps)):
+            ps[i] = zs[i] + turn * ps[i]
         product(neighbours, lengths, tensors, p, q, near)
-        curvature = _dot(p, q)
+        curvature = np.dot(ps, qs)
         if not curvature > 0.0:
             if iteration == 0:
-                _add_scaled(scale, p, out)
+                x += scale * ps
             return iteration + 1
         alpha = rho / curvature
-        _add_scaled(scale * alpha, p, out)
-        _add(-alpha, q, r)
-        if not _dot(r, r) > target:
+        for i in range(len(x)):
+            x[i] += scale * alpha * ps[i]
+            rs[i] -= alpha * qs[i]
+        if not np.dot(rs, rs) > target:
             return iteration + 1
         before = rho
         rho = _precondition(inverse, r, z)
     return most
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def _add_scaled(factor, x, y):
-    """``y += factor x`` of (3, f), single to double."""
-    for axis in range(3):
-        a, b = x[axis], y[axis]
-        for i in range(len(a)):
-            b[i] += factor * a[i]

@@ -13,8 +13,8 @@ space                   spans                                                  k
 ``pod``                 the main directions of full solutions                  what it was shown
 ======================= ====================================================== =====================
 
-The first two, and POD, are the MOD, RITZ and POD of Radermacher & Reese.  A mass matters to a
-quasi-static body only in that it makes a sequence of ever shorter waves out of one load.
+The first two, and POD, are the MOD, RITZ and POD of Radermacher & Reese.  In a quasi-static body
+the mass has one effect only: it makes a sequence of ever shorter waves out of one load.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ Array = NDArray[np.float64]
 Inner = Literal["energy", "euclidean"]
 
 EXHAUSTED = 1e-10
-"""Energy of what a vector adds to a space, relative to its own, that is round-off."""
+"""A vector adds only round-off to a space if it adds less than this share of its own energy."""
 
 MASS_POINTS = 3
-"""Gauss points per edge: of 2, a hex20's mass has no more than 8 x 3 of its 60 directions."""
+"""Gauss points per edge: with 2, the mass of a hex20 would have rank 24 instead of 60."""
 
 
 def mass(model: FullModel) -> csr_matrix:

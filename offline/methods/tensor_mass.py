@@ -13,8 +13,8 @@ displacements.
 
 Limits of the method, whatever its solver: linear tetrahedra are too stiff in bending, the more so
 the closer the tissue is to incompressible; linear elasticity is good for small displacements only,
-and St. Venant-Kirchhoff tissue collapses under compression.  Unless others are asked for, the
-elastic constants are the best found: those that make up for the stiffness.
+and St. Venant-Kirchhoff tissue collapses under compression.  The default elastic constants are the
+best that were found: they compensate for the stiffness of the elements.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from palpate.offline.methods.calibration import stiffening
-from palpate.offline.methods.relaxation import TOLERANCE, Ints, Relaxed, Stencil
-from palpate.offline.methods.tetrahedra import Divisions, Tetrahedra, gradients
+from palpate.offline.methods.lattice import Divisions, Ints
+from palpate.offline.methods.relaxation import TOLERANCE, Relaxed, Stencil
+from palpate.offline.methods.tetrahedra import Tetrahedra, edges_of, gradients
 from palpate.offline.run.workshop import Workshop
 from palpate.shared.mechanics.tissue import lame
 
@@ -38,7 +39,7 @@ POISSON = 0.25
 """Poisson's ratio with which linear tetrahedra come nearest to nearly incompressible tissue."""
 
 LINEAR_FORCING, FORCING = 1e-4, 0.1
-"""See ``offline.methods.relaxation.Elastic``; single precision reaches no less than the first."""
+"""See ``offline.methods.relaxation.Elastic``; single precision reaches no less than 1e-4."""
 
 
 class TensorMass(Relaxed):
@@ -49,7 +50,7 @@ class TensorMass(Relaxed):
     workshop : Workshop
     divisions : tuple of 3 int
         Cells along the axes of the scene's lattice, five tetrahedra each; see
-        ``offline.methods.tetrahedra``.
+        ``offline.methods.lattice``.
     law : {"linear", "st-venant-kirchhoff"}
     poisson : float
     young : float, optional
@@ -57,8 +58,6 @@ class TensorMass(Relaxed):
     tolerance : float
         Residual of an answer relative to its load.
     """
-
-    family = "tensor-mass"
 
     def __init__(
         self,
@@ -75,7 +74,7 @@ class TensorMass(Relaxed):
             young = workshop.scene.tissue.young * stiffening(workshop, mesh, trial)
         kind = LinearTetrahedra if law == "linear" else NonlinearTetrahedra
         label = f"{law}, {len(mesh.elements)} tetrahedra"
-        super().__init__(mesh, kind(mesh, young, poisson), label, tolerance)
+        super().__init__(workshop, mesh, kind(mesh, young, poisson), label, tolerance)
 
 
 class LinearTetrahedra:
@@ -119,7 +118,7 @@ class NonlinearTetrahedra:
     forcing = FORCING
 
     def __init__(self, mesh: Tetrahedra, young: float, poisson: float) -> None:
-        self.stencil = Stencil(mesh.edges, len(mesh.nodes), mesh.free)
+        self.stencil = Stencil(edges_of(mesh.elements), len(mesh.nodes), mesh.free)
         self._elements = mesh.elements.astype(np.int32)
         self._gradients, self._volumes = gradients(mesh.nodes, mesh.elements)
         self._lame = lame(young, poisson)
@@ -136,15 +135,8 @@ class NonlinearTetrahedra:
         """Tangent; see ``offline.methods.relaxation.Elastic``."""
         tensors = self.stencil.tensors
         tensors[:] = 0.0
-        _tangent(
-            self._elements,
-            self._gradients,
-            self._volumes,
-            *self._lame,
-            displacement,
-            self._ranks,
-            tensors,
-        )
+        mesh = self._elements, self._gradients, self._volumes
+        _tangent(*mesh, *self._lame, displacement, self._ranks, tensors)
         self.stencil.prepare()
 
 

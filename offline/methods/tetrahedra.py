@@ -1,9 +1,7 @@
 """Tetrahedra in the body of a scene, on a lattice as fine or as coarse as a method wants.
 
-The scene's own hexahedra, curved as they are, map the unit cube onto the body.  A lattice of the
-cube with other divisions is mapped by them, so that every size fills the same body; each of its
-cells is cut into five tetrahedra, alternately one way and the other, which then fit together.  With
-the divisions of a scene of hex20 doubled, all nodes of the scene are among those of the lattice.
+Each cell of the lattice (``offline.methods.lattice``) is cut into five tetrahedra, alternately one
+way and the other, so that they fit together.
 """
 
 from __future__ import annotations
@@ -17,15 +15,24 @@ from scipy.sparse import csr_matrix, diags
 from scipy.sparse.linalg import splu
 
 from palpate.offline.fem.mesh import Mesh
+from palpate.offline.methods.lattice import (
+    SAME,
+    Divisions,
+    Ints,
+    cells,
+    coordinates,
+    corners,
+    grid,
+    interpolation,
+    lattice,
+    shape_functions,
+)
 from palpate.offline.methods.method import Case
 from palpate.offline.run.workshop import Workshop
 from palpate.shared.errors import PalpateError
-from palpate.shared.geometry.elements import HEX_CORNERS, gauss, hexahedron, quadrilateral, shape
-from palpate.shared.scene import Extrusion, Scene, divisions_of
+from palpate.shared.geometry.elements import gauss, quadrilateral, shape
 
 Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Divisions = tuple[int, int, int]
 Cut = tuple[tuple[int, int, int, int], ...]
 
 EVEN: Cut = ((0, 1, 2, 5), (0, 2, 3, 7), (0, 5, 7, 4), (2, 7, 5, 6), (0, 2, 7, 5))
@@ -36,14 +43,11 @@ ODD: Cut = ((1, 3, 0, 4), (1, 2, 3, 6), (1, 6, 4, 5), (3, 4, 6, 7), (1, 3, 4, 6)
 EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 """Of a tetrahedron."""
 
-SAME = 1e-9
-"""Coordinates in the unit cube that differ by less are equal."""
-
 GAUSS = 8
-"""Points a side of a face at which it is integrated: the lattice's functions have kinks."""
+"""Gauss points per side of a face: the lattice's functions have kinks within it."""
 
 NEGLIGIBLE = 1e-5
-"""Share of a force too small to be carried over."""
+"""Share of a force that is too small to be carried over."""
 
 
 @dataclass(frozen=True)
@@ -59,12 +63,12 @@ class Tetrahedra:
     mirrored : ndarray, shape (t, 4), int
         The tetrahedra of the other way to cut the cells.
     free : int
-        How many of the nodes are.
+        Number of nodes that are not clamped.
     to_scene : csr_matrix, shape (n, m)
         Interpolates nodal values.
     carrier : csr_matrix, shape (n, m)
-        Its transpose carries forces over: those on the surface as the traction they stand for, for
-        which forces on a few nodes of a finer mesh are no substitute.
+        Its transpose carries forces over.  Those on the surface are carried as the traction they
+        stand for: forces on a few nodes of a finer mesh would not be the same load.
     """
 
     nodes: Array
@@ -84,15 +88,18 @@ class Tetrahedra:
             If the map turns a tetrahedron inside out.
         """
         mesh, own = workshop.mesh, lattice(workshop.scene)
-        nodes, clamped = _mapped(mesh, own, _grid(divisions) / np.array(divisions))
+        held, N = shape_functions(grid(divisions), own, mesh.elements)
+        nodes = np.einsum("qa,qai->qi", N, mesh.nodes[held])
+        # on a clamped face the functions of the other nodes vanish
+        clamped = np.einsum("qa,qa->q", N, mesh.clamped[held]) > 1.0 - SAME
         elements, mirrored = _cut(divisions, EVEN, ODD), _cut(divisions, ODD, EVEN)
         if not volumes(nodes, np.concatenate([elements, mirrored])).min() > 0.0:
             raise PalpateError(f"divisions: tetrahedra of {divisions} cells are inside out")
         order = np.lexsort((-np.bincount(edges_of(elements).ravel()), clamped))
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
-        at = _coordinates(mesh, own)
-        to_scene = _interpolation(at, divisions)[:, order]
+        at = coordinates(mesh, own)
+        to_scene = interpolation(at, divisions, corners(divisions))[:, order]
         return cls(
             nodes[order],
             rank[elements],
@@ -107,11 +114,6 @@ class Tetrahedra:
         """The tetrahedra of both ways to cut the cells, (2 t, 4)."""
         return np.concatenate([self.elements, self.mirrored])
 
-    @property
-    def edges(self) -> Ints:
-        """Pairs (e, 2) of nodes that an element joins, each once."""
-        return edges_of(self.elements)
-
     def load(self, case: Case, out: Array) -> None:
         """Write the nodal forces (3, m) mN that a case amounts to."""
         out[:] = 0.0
@@ -121,20 +123,6 @@ class Tetrahedra:
     def displacement(self, own: Array) -> Array:
         """Displacement (n, 3) mm of the scene's nodes from that of the mesh's own, (3, m)."""
         return np.asarray(self.to_scene @ own.T)
-
-
-def lattice(scene: Scene) -> Divisions:
-    """Hexahedra of a scene along the axes of its mesh's lattice (see ``fem.mesh``)."""
-    along, second, third = divisions_of(scene.geometry)
-    return (
-        (along, third, second) if isinstance(scene.geometry, Extrusion) else (along, second, third)
-    )
-
-
-def scaled(scene: Scene, factor: float) -> Divisions:
-    """Divisions of a scene's lattice times a factor, rounded up to a whole cell."""
-    along, second, third = (int(np.ceil(factor * n - SAME)) for n in lattice(scene))
-    return along, second, third
 
 
 def edges_of(elements: Ints) -> Ints:
@@ -160,61 +148,11 @@ def volumes(nodes: Array, elements: Ints) -> Array:
     return determinants / 6.0
 
 
-def _grid(divisions: Divisions) -> Ints:
-    """Points (m, 3) of a lattice, first index slowest."""
-    return np.moveaxis(np.indices(tuple(n + 1 for n in divisions)), 0, -1).reshape(-1, 3)
-
-
 def _cut(divisions: Divisions, even: Cut, odd: Cut) -> Ints:
     """Tetrahedra (t, 4) of a lattice, cells of even and odd index sum cut in different ways."""
-    cells = np.moveaxis(np.indices(divisions), 0, -1).reshape(-1, 3)
-    flip = cells.sum(axis=1) % 2 == 1
-    local = np.where(flip[:, None, None], np.array(odd), np.array(even)).reshape(len(cells), -1)
-    return np.take_along_axis(_corners(cells, divisions), local, axis=1).reshape(-1, 4)
-
-
-def _corners(cells: Ints, divisions: Divisions) -> Ints:
-    """Lattice points (c, 8) at the corners of cells (c, 3), in VTK's order."""
-    points = cells[:, None] + ((HEX_CORNERS + 1) / 2).astype(int)
-    return np.ravel_multi_index(tuple(np.moveaxis(points, -1, 0)), np.array(divisions) + 1)
-
-
-def _located(at: Array, divisions: Divisions) -> tuple[Ints, Array]:
-    """Cells (q, 3) that hold points (q, 3) of the unit cube, and where in [-1, 1]^3 they do."""
-    cells = np.minimum((at * divisions + SAME).astype(int), np.array(divisions) - 1)
-    return cells, 2.0 * (at * divisions - cells) - 1.0
-
-
-def _mapped(mesh: Mesh, own: Divisions, at: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Points (q, 3) mm of the body at coordinates (q, 3) in the unit cube; whether clamped (q,)."""
-    cells, local = _located(at, own)
-    elements = mesh.elements[np.ravel_multi_index(tuple(cells.T), own)]
-    N, _ = shape(hexahedron(mesh.elements.shape[1]), local)
-    # on a clamped face the functions of the other nodes vanish
-    clamped = np.einsum("qa,qa->q", N, mesh.clamped[elements]) > 1.0 - SAME
-    return np.einsum("qa,qai->qi", N, mesh.nodes[elements]), clamped
-
-
-def _coordinates(mesh: Mesh, own: Divisions) -> Array:
-    """Coordinates (n, 3) in the unit cube of a scene's nodes."""
-    reference = hexahedron(mesh.elements.shape[1])
-    cells = np.moveaxis(np.indices(own), 0, -1).reshape(-1, 3)
-    at = np.empty((len(mesh.nodes), 3))
-    at[mesh.elements] = (cells[:, None] + (reference + 1) / 2) / own
-    return at
-
-
-def _interpolation(at: Array, divisions: Divisions) -> csr_matrix:
-    """Matrix (q, m) that interpolates a lattice trilinearly at points (q, 3) of the unit cube."""
-    cells, local = _located(at, divisions)
-    N, _ = shape(HEX_CORNERS, local)
-    N[abs(N) < SAME] = 0.0
-    rows = np.repeat(np.arange(len(at)), 8)
-    columns = _corners(cells, divisions).ravel()
-    size = len(at), int(np.prod(np.array(divisions) + 1))
-    matrix = csr_matrix((N.ravel(), (rows, columns)), size)
-    matrix.eliminate_zeros()
-    return matrix
+    flip = cells(divisions).sum(axis=1) % 2 == 1
+    local = np.where(flip[:, None, None], np.array(odd), np.array(even)).reshape(len(flip), -1)
+    return np.take_along_axis(corners(divisions), local, axis=1).reshape(-1, 4)
 
 
 def _carrier(
@@ -237,7 +175,7 @@ def _carrier(
     values = csr_matrix((np.tile(N, (len(local), 1)).ravel(), (rows, columns)), size)
     weighted = values @ diags(area.ravel())
     where = np.einsum("qa,fai->fqi", N, at[mesh.faces]).reshape(-1, 3)
-    B = weighted @ _interpolation(where, divisions)[:, order]
+    B = weighted @ interpolation(where, divisions, corners(divisions))[:, order]
     carried = splu((weighted @ values.T).tocsc()).solve(B.toarray())
     carried[abs(carried) < NEGLIGIBLE] = 0.0
     inner = np.ones(len(mesh.nodes))

@@ -2,9 +2,9 @@
 
 The reduced internal force is a sum over quadrature points ``sum_q w_q G_q^T P_q``.  Points ``c``
 and weights ``x_c > 0`` are chosen by non-negative least squares so that ``sum_c x_c G_c^T P_c``
-equals the whole sum in training states, and the volume too (Hernandez, Caicedo & Ferrer 2017; An,
-Kim & James 2008).  States off equilibrium belong to the training: in equilibrium the sum is the
-load, whatever the tissue does, and says little about the points.
+equals the whole sum in training states (An, Kim & James 2008; Hernandez, Caicedo & Ferrer 2017, who
+add the volume, which is not done here).  States off equilibrium belong to the training: in
+equilibrium the sum is the load, whatever the tissue does, and says little about the points.
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr_delete, solve, solve_triangular
 
-from palpate.shared.reduced.press import LANES, nonlinear_stress
-from palpate.shared.reduced.press_in_time import add_past_stress
+from palpate.shared.reduced.points import LANES, add_past_stress, nonlinear_stress
 
 Array = NDArray[np.float64]
 
@@ -54,12 +53,23 @@ def compress(
     return A, A.sum(axis=1)
 
 
-def nonnegative(A: Array, b: Array, most: int) -> tuple[NDArray[np.int64], Array]:
+def combined(
+    columns: NDArray[np.float32], count: int, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """Random combinations (q, count) of columns (q, k), whose squares add up to about the same."""
+    noise = rng.standard_normal((columns.shape[1], count), dtype=np.float32)
+    return columns @ (noise / np.float32(np.sqrt(count)))
+
+
+def nonnegative(
+    A: NDArray[np.floating[Any]], b: Array, most: int
+) -> tuple[NDArray[np.int64], Array]:
     """Sparse non-negative solution of ``A x ~ b`` (Lawson & Hanson 1974, stopped early).
 
     Parameters
     ----------
     A : ndarray, shape (r, q)
+        In single precision it is searched twice as fast.
     b : ndarray, shape (r,)
     most : int
         Largest number of points.
@@ -70,7 +80,7 @@ def nonnegative(A: Array, b: Array, most: int) -> tuple[NDArray[np.int64], Array
         Columns with positive weight, ascending.
     weights : ndarray, shape (c,)
     """
-    norms = np.linalg.norm(A, axis=0)
+    norms, tiny = np.linalg.norm(A, axis=0), np.finfo(A.dtype).tiny
     usable = norms > 1e-12 * norms.max()
     chosen: list[int] = []
     x = np.empty(0)
@@ -79,12 +89,13 @@ def nonnegative(A: Array, b: Array, most: int) -> tuple[NDArray[np.int64], Array
     target = EXACT * np.linalg.norm(b)
     blocked = np.zeros(A.shape[1], dtype=bool)
     while np.linalg.norm(residual) > target and len(chosen) < min(most, len(b)):
-        gain = np.where(usable & ~blocked, A.T @ residual / np.maximum(norms, 1e-300), -np.inf)
+        gain = A.T @ residual.astype(A.dtype) / np.maximum(norms, tiny)
+        gain[~usable | blocked] = -np.inf
         gain[chosen] = -np.inf
         best = int(np.argmax(gain))
         if not gain[best] > 0:
             break
-        Q, R = _append(Q, R, A[:, best])
+        Q, R = _append(Q, R, A[:, best].astype(float))
         chosen.append(best)
         x = np.append(x, 0.0)
         while True:
@@ -141,7 +152,7 @@ def point_forces(
     mu, lam : ndarray, shape (c,), kPa
     state : ndarray, shape (r,)
     past : (ndarray, ndarray), shape (6 c,), optional
-        Of tissue that remembers: ``B`` and ``S`` of ``reduced.press_in_time.predict_points``.
+        Of tissue that remembers: ``B`` and ``S`` of ``reduced.points.predict_points``.
     """
     H = np.dot(gradients, state.astype(np.float32)).reshape(-1, LANES, 9)
     rows = np.ascontiguousarray(H.transpose(0, 2, 1)).reshape(-1)

@@ -1,10 +1,10 @@
-"""Training of one local model: modes, cubature, first guess."""
+"""Training of one local model: modes, cubature, first guess and first tangent."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,29 +20,24 @@ from palpate.offline.reduce.cubature import (
 from palpate.offline.reduce.ritz import RITZ_VECTORS, Footprint, local_modes, whole_numbers
 from palpate.offline.reduce.sampling import cone, fewer, tangents
 from palpate.offline.reduce.tip_models import TipResult, compile_tip_query, train_tip
-from palpate.shared.compiled import bind
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH, footprint, pressure_limit
-from palpate.shared.model import Body, LocalModels, State, assemble_patches
-from palpate.shared.reduced.press import (
-    ERROR_FEATURES,
-    FEATURES,
-    LANES,
-    LEADING,
-    NARROW,
-    PATH,
-    PATH_FEATURES,
+from palpate.shared.reduced.features import (
+    CHANGES,
+    CHANGING,
+    LOAD_FEATURES,
     RESIDUAL_FEATURES,
-    SECOND_FEATURES,
-    STATUS,
-    Patches,
-    Terms,
-    load_features,
-    query,
+    TANGENT_FEATURES,
     residual_features,
 )
+from palpate.shared.reduced.outcome import PRESS_FEATURES
+from palpate.shared.reduced.points import LANES, STATE, increments, linearise
+from palpate.shared.reduced.press import place, press
+from palpate.shared.reduced.terms import Elastic
+from palpate.shared.reduced.workspace import press_workspace
 from palpate.shared.scene import Scene, Size
+from palpate.shared.tables import Body, LocalModels, press_models
 
 Array = NDArray[np.float64]
 
@@ -71,19 +66,13 @@ DEFECT_LOADS, DEFECT_DAMPING = 240, 0.1
 """Equilibria that the defect is fitted to, and the damping of the fit: undamped it goes astray at
 the ends of the range, where it is largest."""
 
-GUESS_LOADS = 500
+GUESS_LOADS, GUESS_DAMPING = 500, 1e-2
+TANGENT_LOADS = 100
+"""Equilibria that the first guess is fitted to, and those of them at which the tangent is looked
+at; the damping of both fits."""
 
 NO_LIMIT = 1e100
 """Largest pressure, kPa, that a local model in training answers for."""
-
-PATH_LOADS, FITTED_TILT = 24, 45.0
-"""Directions of load to which a footprint's path derivatives are fitted, and their cone."""
-
-WIDE = 0.4
-"""Weight of the forces in the wide space, relative to those that displace the answer."""
-
-WIDE_SKETCH = 24
-"""Random combinations that stand for the forces in the wide space; their errors add up alike."""
 
 EQUATIONS = 300
 """Combinations of the reduced internal force that cubature is fitted to.
@@ -150,16 +139,17 @@ class PatchTask:
 
 @dataclass(frozen=True)
 class PatchResult:
-    """A trained patch; shapes as in ``shared.model.LocalModels``."""
+    """A trained patch; shapes as in ``shared.tables.LocalModels``."""
 
     frame: Array
     whole: NDArray[np.int16]
     mix: NDArray[np.float32]
     points: NDArray[np.int32]
     weights: Array
-    path: NDArray[np.float16]
     defect: NDArray[np.float16]
     guess: NDArray[np.float16]
+    directions: NDArray[np.float16]
+    change: NDArray[np.float16]
     residual: Array
     tip: TipResult | None = None
 
@@ -177,75 +167,87 @@ class PatchResult:
         return cls(**own, tip=TipResult(**tip) if tip else None)
 
 
+class Sample(NamedTuple):
+    """Answer of a local model to a training load."""
+
+    x: Array  # (3,) mm, contact point
+    normal: Array  # (3,) of the surface there
+    q: Array  # (r,)
+    load: Array  # (r,) mN, less what the cubature misses
+    compliance: Array  # (r, r) inverse tangent as far as the search has come to know it
+    features: Array  # (LOAD_FEATURES,) of the load
+    tangent_features: Array  # (TANGENT_FEATURES,)
+
+
 class LocalTrainer:
-    """A single-patch atlas that solves training loads, by the compiled query of the service."""
+    """One local model by itself, which solves training loads by the compiled query."""
 
     def __init__(self, scene: Scene, body: Body, surface: Surface, models: LocalModels) -> None:
         self.radius = scene.endoscope.radius
         self.models = models
-        self.patches: Patches = assemble_patches(body, models, scene)
-        self.state = State(self.patches, surface.clusters)
+        self.tables = press_models(body, models, scene)
         no_limit = np.tile(np.eye(LIMIT_FIELDS)[1:4].sum(0), (len(surface.vertices), 1))
         no_limit[:, 0] = NO_LIMIT
-        self.terms = bind(
-            Terms(
-                ground=surface.ground(no_limit),
-                reach=scene.endoscope.reach,
-                max_tilt=scene.endoscope.max_tilt,
-                residuals=models.residuals,
-                coefficients=np.zeros((2, ERROR_FEATURES)),
-            )
+        self._workspace = press_workspace(
+            self.tables, surface.ground(no_limit), scene.endoscope.max_tilt,
+            np.zeros((2, PRESS_FEATURES)), Elastic(),
+        )  # fmt: skip
+
+    def solve(self, x: Array, direction: Array, pressure: float) -> Sample | None:
+        """Solve a load independently of the last; None if there is no equilibrium."""
+        own = self._workspace
+        own.forget()
+        place(own.solver, x, direction)
+        press(own.solver, pressure, self.radius)
+        if own.outcome.status.item() != newton.CONVERGED:
+            return None
+        scratch = own.scratch
+        return Sample(
+            own.outcome.foot.copy(),
+            own.outcome.upward.copy(),
+            own.warm.q[0].copy(),
+            scratch.load.copy(),
+            own.warm.inverse[0].copy(),
+            scratch.features.copy(),
+            scratch.tangent_features.copy(),
         )
 
-    def solve(self, x: Array, direction: Array, pressure: float) -> bool:
-        """Solve a load from rest; False if there is no equilibrium."""
-        state = self.state
-        state.forget()
-        query(self.terms, state.bound, x, direction, pressure, self.radius)
-        return bool(state.outcome.scalars[STATUS] == newton.CONVERGED)
+    @property
+    def gradients(self) -> NDArray[np.float32]:
+        """Gradients (r, 9 c) of the modes at the points, in tiles, 1/mm."""
+        points = self.tables.points
+        return np.asarray(points.gradients[0] * points.steps[0][:, None])
+
+    @property
+    def law(self) -> tuple[Array, Array, Array]:
+        """Weights (mm^3) and Lame parameters (kPa) of the points, each (c,)."""
+        points = self.tables.points
+        return points.weights[0], points.mu[0], points.lam[0]
 
     def internal_forces(self, states: Array) -> Array:
         """What the law adds to linear elasticity's force: (k, r) in states (k, r)."""
-        patches = self.patches
-        rows = patches.gradients[0] * patches.steps[0][:, None]
-        law = patches.weights[0], patches.mu[0], patches.lam[0]
-        return nonlinear_forces(rows, *law, states)
+        return nonlinear_forces(self.gradients, *self.law, states)
 
-    @property
-    def wide(self) -> Array:
-        """Last answer (r,) in the wide space."""
-        return self.state.memory.wide[0].copy()
+    def tangent_changes(self, states: Array) -> Array:
+        """Tangents in states (k, r) less that at rest, (k, r, r)."""
+        rows = self.gradients
+        moduli = np.empty(STATE * len(self.law[0]), np.float32)
+        products, changes = np.empty_like(rows), []
+        for q in states.astype(np.float32):
+            linearise(q @ rows, *self.law, moduli)
+            increments(moduli, rows, products)
+            changes.append(rows @ products.T)
+        return np.array(changes, float)
 
     @property
     def nodal_modes(self) -> NDArray[np.float32]:
-        """Wide modes (r, 3 n) at the nodes."""
+        """Modes (r, 3 n) at the nodes."""
         modes = self.models.steps[0][:, None] * self.models.modes[0]
         return np.asarray(modes.T @ self.models.basis[0].astype(np.float32))
 
-    @property
-    def displacement(self) -> Array:
-        """Last answer at the nodes, (n, 3) mm."""
-        return np.asarray(self.wide @ self.nodal_modes).reshape(-1, 3)
-
-    @property
-    def load_size(self) -> float:
-        """Norm of the last load in the wide space."""
-        return float(np.linalg.norm(self.state.scratch.wide_load))
-
-    @property
-    def narrow_compliance(self) -> Array:
-        """``V L^-T`` (r, m): Cholesky factor L of the last tangent in the narrow space V."""
-        L = np.tril(self.state.scratch.factor)
-        V = np.zeros((self.patches.gradients.shape[1], len(L)))
-        V[:LEADING, :LEADING] = np.eye(LEADING)
-        V[:, LEADING:] = self.state.scratch.vectors.T
-        return np.asarray(np.linalg.solve(L, V.T).T)
-
-    @property
-    def beyond_linear(self) -> Array:
-        """Last answer (leading + PATH,) in the narrow space less the linear response."""
-        n = LEADING + PATH
-        return self.state.scratch.q[:n] - self.state.scratch.load[:n]
+    def displacement(self, q: Array) -> Array:
+        """Displacement of the nodes (n, 3) mm in a state (r,)."""
+        return np.asarray(q @ self.nodal_modes).reshape(-1, 3)
 
 
 def compile_query(scene: Scene, body: Body, surface: Surface) -> None:
@@ -257,14 +259,15 @@ def compile_query(scene: Scene, body: Body, surface: Surface) -> None:
         centres=surface.vertices[:1],
         frames=np.eye(3)[None],
         pressures=np.ones(1),
-        whole=np.zeros((1, LANES, NARROW), np.int16),
-        mix=np.zeros((1, NARROW, NARROW), np.float32),
+        whole=np.zeros((1, LANES, LANES), np.int16),
+        mix=np.zeros((1, LANES, LANES), np.float32),
         point_from=np.array([0, 1]),
         points=np.zeros(1, np.int32),
         weights=np.ones(1),
-        path=np.zeros((1, PATH_FEATURES, NARROW), np.float32),
-        defect=np.zeros((1, PATH_FEATURES, NARROW), np.float32),
-        guess=np.zeros((1, FEATURES, LEADING + PATH), np.float32),
+        defect=np.zeros((1, LOAD_FEATURES, LANES), np.float32),
+        guess=np.zeros((1, LOAD_FEATURES, LANES), np.float32),
+        directions=np.zeros((1, CHANGING, LANES), np.float32),
+        change=np.zeros((1, TANGENT_FEATURES, CHANGES), np.float32),
         residuals=np.zeros((1, RESIDUAL_FEATURES)),
         extent=1.0,
         blend=1.0,
@@ -310,9 +313,10 @@ def train_patch(
         mix=mix,
         points=np.arange(len(weights), dtype=np.int32),
         weights=weights,
-        path=_fit_path(leading.T @ ritz[:, :, :RITZ_VECTORS], task, frame).astype(np.float16),
-        defect=np.zeros((PATH_FEATURES, leading.shape[1]), np.float16),
-        guess=np.zeros((FEATURES, LEADING + PATH), np.float16),
+        defect=np.zeros((LOAD_FEATURES, task.size.modes), np.float16),
+        guess=np.zeros((LOAD_FEATURES, task.size.modes), np.float16),
+        directions=np.zeros((CHANGING, task.size.modes), np.float16),
+        change=np.zeros((TANGENT_FEATURES, CHANGES), np.float16),
         residual=np.zeros(RESIDUAL_FEATURES),
     )
     galerkin = local_trainer(scene, body, surface, region, task, everywhere)
@@ -322,10 +326,11 @@ def train_patch(
     points, chosen = _cubature(contributions, weights, equations, most, rng)
     result = replace(everywhere, points=points.astype(np.int32), weights=chosen)
     reduced = local_trainer(scene, body, surface, region, task, result)
-    defect = _fit_defect(galerkin, reduced, scene, task, frame, rng)
+    defect = _fit_defect(galerkin, reduced, scene, task, rng)
     result = replace(result, defect=defect.astype(np.float16))
     reduced = local_trainer(scene, body, surface, region, task, result)
-    guess = _fit_guess(reduced, scene, task, frame, rng)
+    samples = _answered(reduced, scene, task, random_load, GUESS_LOADS, rng)
+    directions, change = _fit_tangent(reduced, samples[:TANGENT_LOADS])
     residual = _fit_residual(model, reduced, body, scene, task, frame, rng)
     tip = None
     if scene.endoscope.tip:
@@ -333,7 +338,14 @@ def train_patch(
             model, body, surface, weights, reduced.models, region.orthonormal,
             task.contacts, task.normals, task.ranges[:, TIP_DEPTH], rng,
         )  # fmt: skip
-    return replace(result, guess=guess.astype(np.float16), residual=residual, tip=tip)
+    return replace(
+        result,
+        guess=_fit_guess(samples).astype(np.float16),
+        directions=directions.astype(np.float16),
+        change=change.astype(np.float16),
+        residual=residual,
+        tip=tip,
+    )
 
 
 def local_trainer(
@@ -361,9 +373,10 @@ def local_trainer(
             point_from=np.array([0, len(result.points)]),
             points=result.points,
             weights=result.weights,
-            path=result.path[None].astype(np.float32),
             defect=result.defect[None].astype(np.float32),
             guess=result.guess[None].astype(np.float32),
+            directions=result.directions[None].astype(np.float32),
+            change=result.change[None].astype(np.float32),
             residuals=np.zeros((1, RESIDUAL_FEATURES)),
             extent=task.extent,
             blend=task.blend,
@@ -379,38 +392,16 @@ def _expected(scene: Scene, ritz: Array, task: PatchTask, rng: np.random.Generat
     """
     parts = [FAINT * vectors for vectors in ritz]
     tilt = scene.endoscope.max_tilt
-    for place, vectors in zip(task.footprints, ritz, strict=True):
+    for pressed, vectors in zip(task.footprints, ritz, strict=True):
         directions = [
-            cone(place.normal, tilt, STATES // 2, rng, border) for border in (False, True)
+            cone(pressed.normal, tilt, STATES // 2, rng, border) for border in (False, True)
         ]
-        loads = place.pressure * np.sqrt(rng.random((STATES, 1))) * np.vstack(directions)
+        loads = pressed.pressure * np.sqrt(rng.random((STATES, 1))) * np.vstack(directions)
         for first in range(0, vectors.shape[1], RITZ_VECTORS):  # the relaxed tissue's, too
             own = vectors[:, first : first + RITZ_VECTORS]
-            one, two, three = place.path_derivatives(own, loads)
+            one, two, three = pressed.path_derivatives(own, loads)
             parts.append((one + two / 2 + three / 6).T / np.sqrt(STATES))
     return np.hstack(parts)
-
-
-def _fit_path(ritz: Array, task: PatchTask, frame: Array) -> Array:
-    """Second and third path derivative (PATH_FEATURES, r) from Ritz vectors (k, r, 19)."""
-    rng = np.random.default_rng(task.seed)
-    rows, second, third = [], [], []
-    features = np.zeros(FEATURES)
-    for place, vectors in zip(task.footprints, ritz, strict=True):
-        loads = place.pressure * cone(place.normal, FITTED_TILT, PATH_LOADS, rng)
-        for load in loads:
-            load_features(frame, task.centre, place.point, load / task.pressure, features)
-            rows.append(features[:PATH_FEATURES].copy())
-        _, two, three = place.path_derivatives(vectors, loads)
-        second.append(two)
-        third.append(three)
-    A = np.array(rows)
-    return np.vstack(
-        [
-            damped_fit(A[:, :SECOND_FEATURES], np.vstack(second)),
-            damped_fit(A[:, SECOND_FEATURES:], np.vstack(third)),
-        ]
-    )
 
 
 def _fit_residual(
@@ -428,12 +419,12 @@ def _fit_residual(
     for _ in range(fewer(RESIDUAL_LOADS, scene.tolerance)):
         x, direction, limit = _limit(scene, task, rng, border=False)
         share = np.sqrt(rng.random())
-        if reduced.solve(x, direction, share * limit):
-            outcome = reduced.state.outcome
-            footprint(body.boundary, outcome.point, outcome.normal, reduced.radius, nodal)
+        sample = reduced.solve(x, direction, share * limit)
+        if sample is not None:
+            footprint(body.boundary, sample.x, sample.normal, reduced.radius, nodal)
             residual_features(frame, task.centre, x, direction, share, features)
             rows.append(features.copy())
-            states.append(reduced.wide)
+            states.append(sample.q)
             loads.append((share * limit * nodal[:, None] * direction).ravel())
     answers = np.array(states) @ reduced.nodal_modes
     residuals = model.relative_residuals(answers[:, model.free], np.array(loads)[:, model.free])
@@ -471,21 +462,13 @@ def _answered(
     trainer: LocalTrainer,
     scene: Scene,
     task: PatchTask,
-    frame: Array,
     draw: Callable[[Scene, PatchTask, np.random.Generator], tuple[Array, Array, float]],
     count: int,
     rng: np.random.Generator,
-) -> Iterator[Array]:
-    """Features (FEATURES,) of drawn loads, each while the trainer's last answer is to that load.
-
-    Loads that it does not solve are left out.
-    """
-    features = np.zeros(FEATURES)
-    for _ in range(count):
-        x, direction, pressure = draw(scene, task, rng)
-        if trainer.solve(x, direction, pressure):
-            load_features(frame, task.centre, x, direction * pressure / task.pressure, features)
-            yield features
+) -> list[Sample]:
+    """Answers to drawn loads; those that it does not solve are left out."""
+    samples = [trainer.solve(*draw(scene, task, rng)) for _ in range(count)]
+    return [sample for sample in samples if sample is not None]
 
 
 def _limit(
@@ -501,35 +484,27 @@ def _limit(
 def _training_forces(
     trainer: LocalTrainer, scene: Scene, task: PatchTask, rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    """What each point (row) contributes to the wide forces that a query needs (columns).
+    """What each point (row) contributes to the internal force in and off equilibrium (columns).
 
-    First what displaces the answer: the internal force in and off equilibrium in the narrow space,
-    times the square root of the compliance there, so that its error is one of displacement in the
-    energy norm.  With less weight the same force in the wide space relative to the load, which
-    leads to the residual.
+    It is taken times the square root of the compliance there, so that its error is one of
+    displacement in the energy norm.
     """
     columns = []
-    patches = trainer.patches
-    gradients = _point_gradients(patches)
-    law = patches.weights[0], patches.mu[0], patches.lam[0]
-    for _ in range(fewer(LOADS, scene.tolerance)):
-        if not trainer.solve(*_training_load(scene, task, rng)):
-            continue
-        wide, load = trainer.wide, trainer.load_size
-        compliance = trainer.narrow_compliance / np.linalg.norm(wide)
-        departure = OFF_EQUILIBRIUM * np.abs(wide) * rng.standard_normal(len(wide))
-        for state in (wide, wide + departure):
-            force = point_forces(gradients, *law, state)
+    gradients = _by_point(trainer.gradients)
+    count = fewer(LOADS, scene.tolerance)
+    for sample in _answered(trainer, scene, task, _training_load, count, rng):
+        q = sample.q
+        looks = np.linalg.cholesky(sample.compliance) / np.linalg.norm(q)
+        departure = OFF_EQUILIBRIUM * np.abs(q) * rng.standard_normal(len(q))
+        for state in (q, q + departure):
+            force = point_forces(gradients, *trainer.law, state)
             if force is not None:
-                wide_part = rng.standard_normal((len(wide), WIDE_SKETCH)) / np.sqrt(WIDE_SKETCH)
-                looks = np.hstack([compliance, WIDE / load * wide_part])
                 columns.append(force @ looks.astype(np.float32))
     return np.hstack(columns)
 
 
-def _point_gradients(patches: Patches) -> NDArray[np.float32]:
-    """Gradients (c, 9, r) of the wide modes of a single patch."""
-    rows = patches.gradients[0] * patches.steps[0][:, None]
+def _by_point(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Gradients (c, 9, r) of modes, from those in tiles (r, 9 c)."""
     tiles = rows.reshape(len(rows), -1, 9, LANES)
     return np.ascontiguousarray(tiles.transpose(1, 3, 2, 0).reshape(-1, 9, len(rows)))
 
@@ -552,26 +527,33 @@ def _fit_defect(
     reduced: LocalTrainer,
     scene: Scene,
     task: PatchTask,
-    frame: Array,
     rng: np.random.Generator,
 ) -> Array:
-    """Force (PATH_FEATURES, r) that the cubature misses in equilibrium, relative to the answer."""
-    rows, states = [], []
-    for features in _answered(reduced, scene, task, frame, _training_load, DEFECT_LOADS, rng):
-        rows.append(features[:PATH_FEATURES].copy())
-        states.append(reduced.wide)
-    missed = galerkin.internal_forces(np.array(states)) - reduced.internal_forces(np.array(states))
+    """Force (LOAD_FEATURES, r) that the cubature misses in equilibrium, relative to the answer."""
+    samples = _answered(reduced, scene, task, _training_load, DEFECT_LOADS, rng)
+    states, rows = np.array([s.q for s in samples]), np.array([s.features for s in samples])
+    missed = galerkin.internal_forces(states) - reduced.internal_forces(states)
     scale = 1.0 / np.linalg.norm(states, axis=1, keepdims=True)
     kept = np.isfinite(missed).all(axis=1)
     return damped_fit((scale * rows)[kept], (scale * missed)[kept], DEFECT_DAMPING)
 
 
-def _fit_guess(
-    trainer: LocalTrainer, scene: Scene, task: PatchTask, frame: Array, rng: np.random.Generator
-) -> Array:
-    """Coefficients (features, m) of what equilibria add to the linear response."""
-    rows, targets = [], []
-    for features in _answered(trainer, scene, task, frame, random_load, GUESS_LOADS, rng):
-        rows.append(features.copy())
-        targets.append(trainer.beyond_linear)
-    return damped_fit(np.array(rows), np.array(targets))
+def _fit_guess(samples: Sequence[Sample]) -> Array:
+    """What equilibria add to the linear response (LOAD_FEATURES, r), relative to that."""
+    scale = np.array([[1.0 / np.linalg.norm(s.load)] for s in samples])
+    rows = np.array([s.features for s in samples])
+    added = np.array([s.q - s.load for s in samples])
+    return damped_fit(scale * rows, scale * added, GUESS_DAMPING)
+
+
+def _fit_tangent(reduced: LocalTrainer, samples: Sequence[Sample]) -> tuple[Array, Array]:
+    """Directions (CHANGING, r) in which equilibria change the tangent most, and how.
+
+    The change (TANGENT_FEATURES, CHANGES) is that of ``shared.tables.LocalModels``.
+    """
+    changes = reduced.tangent_changes(np.array([s.q for s in samples]))
+    U = np.linalg.svd(np.hstack(list(changes)), full_matrices=False)[0][:, :CHANGING]
+    rows, columns = np.tril_indices(CHANGING)
+    seen = (U.T @ changes @ U)[:, rows, columns]
+    features = np.array([s.tangent_features for s in samples])
+    return U.T, damped_fit(features, seen, GUESS_DAMPING)

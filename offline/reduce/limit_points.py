@@ -14,19 +14,20 @@ model is asked everywhere whether its answers depend on the way.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from tqdm import tqdm
 
 from palpate.offline.reduce.sampling import cone, random_points_and_rim, tangents
+from palpate.shared.answer import Answer
 from palpate.shared.errors import QueryError
+from palpate.shared.geometry.surface import Surface
 from palpate.shared.mechanics.footprint import TIP_DEPTH, pressure_limit
 from palpate.shared.model import ReducedModel
-from palpate.shared.reduced.touch import Touch
+from palpate.shared.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -65,62 +66,76 @@ SLIP_REACH = 1.0
 """As ``REACH``, of a tip: half its radius."""
 
 
+Rows = list[tuple[Any, ...]]
+Ask = Callable[[str, Callable[..., float], Rows], Iterable[float]]
+"""Values of a function of the reduced model at places, its further arguments; under a title."""
+
+
 class Search(NamedTuple):
     """How a limit is lowered."""
 
     title: str
     field: int  # of the limits
+    share: Callable[..., float]  # of the limit up to which the reduced model shows no fault
+    rows: Callable[[Iterable[Array]], Rows]  # its arguments at points, the contact first
     first: int  # contact points
-    closer: int  # more points near each at which less is bearable
+    closer: int  # more points near each whose limit is lowered
     reach: float  # mm
-    bearable: Callable[[int, Array, Array, Array], float]
-    """Share of the limit, of the i-th point, its normal and its limits."""
 
 
-def lowered_limits(atlas: ReducedModel, rng: np.random.Generator) -> Array:
-    """The atlas's load range (v, LIMIT_FIELDS), its pressures lowered where tissue gives way."""
+def lowered_limits(
+    surface: Surface, limits: Array, scene: Scene, patches: int, ask: Ask, rng: np.random.Generator
+) -> Array:
+    """Load range (v, LIMIT_FIELDS) whose pressures are lowered where tissue gives way."""
 
-    def bearable(i: int, x: Array, normal: Array, fields: Array) -> float:
-        direction = cone(normal, atlas.scene.endoscope.max_tilt, 1, rng, border=i % 2 == 0)[0]
-        return limit_load_share(atlas, x, direction, pressure_limit(fields, normal, direction))
-
-    count = PATHS_PER_PATCH * len(atlas.models.centres)
-    return _lowered(atlas, rng, Search("giving way", 0, count, CLOSER, REACH, bearable))
-
-
-def lowered_depths(atlas: ReducedModel, rng: np.random.Generator) -> Array:
-    """The same, depths of the tip lowered to where an answer does not depend on the way."""
-
-    def bearable(i: int, x: Array, normal: Array, fields: Array) -> float:
-        return path_independent_share(atlas, x, rng.uniform(0.0, 2.0 * np.pi))
-
-    count = CONTACTS_PER_PATCH * len(atlas.models.centres)
-    search = Search("slipping off", TIP_DEPTH, count, CONTACTS_CLOSER, SLIP_REACH, bearable)
-    return _lowered(atlas, rng, search)
-
-
-def _lowered(atlas: ReducedModel, rng: np.random.Generator, search: Search) -> Array:
-    surface, limits = atlas.surface, atlas.limits.copy()
-    vertices = cKDTree(surface.vertices)
-
-    def lacking(points: Iterator[Array] | Array, count: int) -> list[tuple[Array, float]]:
-        found = []
-        for i, point in enumerate(tqdm(points, search.title, count)):
-            x, normal, _, fields = surface.locate(point, atlas.limits)
-            share = search.bearable(i, x, normal, fields)
-            if share < 1.0:
-                found.append((x, share))
+    def rows(points: Iterable[Array]) -> Rows:
+        found: Rows = []
+        for i, point in enumerate(points):
+            x, normal, _, fields = surface.locate(point, limits)
+            direction = cone(normal, scene.endoscope.max_tilt, 1, rng, border=i % 2 == 0)[0]
+            found.append((x, direction, pressure_limit(fields, normal, direction)))
         return found
 
-    found = lacking(random_points_and_rim(surface, search.first, rng), search.first)
+    first = PATHS_PER_PATCH * patches
+    search = Search("giving way", 0, limit_load_share, rows, first, CLOSER, REACH)
+    return _lowered(surface, limits, search, ask, rng)
+
+
+def lowered_depths(
+    surface: Surface, limits: Array, patches: int, ask: Ask, rng: np.random.Generator
+) -> Array:
+    """The same, depths of the tip lowered to where an answer does not depend on the way."""
+
+    def rows(points: Iterable[Array]) -> Rows:
+        return [(surface.project(point)[0], rng.uniform(0.0, 2.0 * np.pi)) for point in points]
+
+    first = CONTACTS_PER_PATCH * patches
+    search = Search(
+        "slipping off", TIP_DEPTH, path_independent_share, rows, first, CONTACTS_CLOSER, SLIP_REACH
+    )
+    return _lowered(surface, limits, search, ask, rng)
+
+
+def _lowered(
+    surface: Surface, limits: Array, search: Search, ask: Ask, rng: np.random.Generator
+) -> Array:
+    vertices = cKDTree(surface.vertices)
+
+    def lacking(title: str, points: Iterable[Array]) -> list[tuple[Array, float]]:
+        rows = search.rows(points)
+        shares = ask(title, search.share, rows)
+        return [(row[0], s) for row, s in zip(rows, shares, strict=True) if s < 1.0]
+
+    found = lacking(search.title, random_points_and_rim(surface, search.first, rng))
     near = [rng.choice(vertices.query_ball_point(x, search.reach), search.closer) for x, _ in found]
     if near:
         closer = surface.vertices[np.concatenate(near)]
-        found += lacking(closer, len(closer))
+        found += lacking(f"{search.title}, closer", closer)
     share = np.ones(len(limits))
     for x, bearable in found:
         lowered = vertices.query_ball_point(x, search.reach)
         share[lowered] = np.minimum(share[lowered], bearable)
+    limits = limits.copy()
     limits[:, search.field] *= share
     return limits
 
@@ -129,9 +144,9 @@ def limit_load_share(atlas: ReducedModel, x: Array, direction: Array, limit: flo
     """Share of a pressure (kPa) up to which tissue yields gradually, with ``MARGIN``; at most 1."""
     moved = np.full(len(SHARES), np.nan)  # where it does not converge an answer says so itself
     for i, share in enumerate(SHARES):
-        solution = atlas.solve(x, share * limit, direction)
+        solution = atlas.press(x, share * limit, direction)
         if solution.converged:
-            moved[i] = sum(weight * np.linalg.norm(wide) for _, weight, wide in solution.patches)
+            moved[i] = sum(weight * np.linalg.norm(wide) for _, weight, wide in solution.parts)
     exponents = np.diff(np.log(moved)) / np.diff(np.log(SHARES))
     sudden = np.flatnonzero(np.diff(exponents) > SUDDEN)
     return float(SHARES[sudden[0] + 1]) / MARGIN if len(sudden) else 1.0
@@ -157,13 +172,13 @@ def path_independent_share(atlas: ReducedModel, x: Array, turn: float = 0.0) -> 
 def _depends_on_way(atlas: ReducedModel, x: Array, share: float, turn: float) -> bool:
     """Whether a tip that comes sliding finds another equilibrium than one pressed in."""
     pressed = atlas.touch(_over(atlas, x, share))
-    state = atlas.new_state()
+    state = atlas.new_warm()
     for angle in turn + 2.0 * np.pi * np.arange(WAYS) / WAYS:
         state.forget()
         slid = None
         for place in reversed(_way(atlas, x, angle)):
             try:
-                slid = atlas.touch(_over(atlas, place, share), state)
+                slid = atlas.touch(_over(atlas, place, share), warm=state)
             except QueryError:  # in a fold the tip's centre can be below the other side
                 continue
         if slid is not None and _apart(pressed, slid):
@@ -192,11 +207,11 @@ def _way(atlas: ReducedModel, x: Array, angle: float) -> list[Array]:
     return places
 
 
-def _apart(one: Touch, other: Touch) -> bool:
+def _apart(one: Answer, other: Answer) -> bool:
     """Whether answers to the same position are different equilibria, as far as they are known."""
     if not (one.converged and other.converged):
         return False
-    known = {k: q for k, _, q in other.patches}
-    both = [(weight, q, known[k]) for k, weight, q in one.patches if k in known]
+    known = {k: q for k, _, q in other.parts}
+    both = [(weight, q, known[k]) for k, weight, q in one.parts if k in known]
     away = sum(weight * np.linalg.norm(p - q) for weight, p, q in both)
     return bool(away > SAME * sum(weight * np.linalg.norm(p) for weight, p, _ in both))

@@ -143,6 +143,11 @@ def ladder(tissue: Tissue) -> tuple[Size, ...]:
     )
 
 
+def first_place(tolerance: Tolerance) -> int:
+    """Place on the ladder of the size that is tried first, negative where none is small enough."""
+    return PLACE + round(math.log(tolerance.looseness) / math.log(RUNG))
+
+
 def choose(
     sizes: Sequence[Size], tolerance: Tolerance, budget: Budget, attempt: Callable[[Size], Trial]
 ) -> Choice:
@@ -160,7 +165,7 @@ def choose(
     """
     trials: dict[int, Trial] = {}
     low, high = 0, len(sizes) - 1
-    guess = PLACE + round(math.log(tolerance.looseness) / math.log(RUNG))
+    guess = first_place(tolerance)
     while low < high:
         place = min(max(guess, low), high - 1)
         trials[place] = attempt(sizes[place])

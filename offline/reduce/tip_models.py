@@ -17,34 +17,34 @@ from numpy.typing import NDArray
 
 from palpate.offline.fem.model import FullModel, NoEquilibrium
 from palpate.offline.reduce.cubature import (
-    compress,
+    combined,
     damped_fit,
     linear_forces,
     nonnegative,
     point_forces,
 )
 from palpate.offline.reduce.sampling import farthest
-from palpate.offline.reduce.transfer import neighbours, overlaps
+from palpate.offline.reduce.transfer import FOLLOWED, NEXT, neighbours, overlaps
 from palpate.offline.reduce.viscous import deviatoric_of
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.mechanics import newton
+from palpate.shared.mechanics.footprint import LIMIT_FIELDS
+from palpate.shared.mechanics.sphere import FORCE, room_for
+from palpate.shared.mechanics.sphere import touch as press_faces
 from palpate.shared.mechanics.viscosity import step_weights
-from palpate.shared.model import Body, LocalModels, assemble_tips
-from palpate.shared.reduced.history import HISTORY_FEATURES, History, ViscousModels
-from palpate.shared.reduced.press import LANES, RESIDUAL_FEATURES
-from palpate.shared.reduced.press_in_time import SYMMETRIC, predict_points
-from palpate.shared.reduced.tip_history import TipTimeStepper, step
-from palpate.shared.reduced.touch import (
-    MAX_ITERATIONS,
-    STATUS,
-    TIP_ERROR_FEATURES,
+from palpate.shared.reduced.features import (
+    RESIDUAL_FEATURES,
     TIP_FEATURES,
-    LocalTips,
-    TipState,
-    query,
+    residual_features,
     tip_features,
 )
-from palpate.shared.reduced.touch_in_time import TipMemory
+from palpate.shared.reduced.outcome import TOUCH_FEATURES
+from palpate.shared.reduced.past import Memory, Remembering, opened, remembering
+from palpate.shared.reduced.points import LANES, SYMMETRIC, predict_points
+from palpate.shared.reduced.terms import Elastic
+from palpate.shared.reduced.touch import MAX_ITERATIONS, TouchModels, place, touch
+from palpate.shared.reduced.workspace import touch_workspace
+from palpate.shared.tables import Body, LocalModels, LocalTips, touch_models
 
 Array = NDArray[np.float64]
 Past = tuple[NDArray[np.float32], NDArray[np.float32]]
@@ -61,6 +61,9 @@ HISTORY_MODES, HISTORY_POINTS, HISTORY_NODAL = 52, 120, 64
 NODES = 0.6
 """Distance beyond the patch's extent within which nodes count, in radii of the tip."""
 
+NO_LIMIT = 1e9
+"""Millimetres: in training any depth is in range."""
+
 PRESSED, DEPTHS = 12, 3
 """Contacts that a patch learns from, and depths at each."""
 
@@ -76,17 +79,19 @@ STEP = 0.15
 DEPARTURE = 0.03
 """Size of the random departure from equilibrium, relative to each mode's part in the states."""
 
-EQUATIONS = 800
+EQUATIONS = 720
+"""Random combinations that stand for the equations of all training states."""
 
 RESPONSES, LINEAR = 40, 0.01
 """Random displacements in which the points have to do what linear elasticity does, and how much
 that counts beside a training state."""
 
-GUESSED = 240
-"""Answers that the first guess is fitted to."""
+ANSWERS = 48
+"""Answers of the trained model, and of how they change with the position, that the first guess is
+fitted to; they tell the residual in the full model, too."""
 
-NEIGHBOURS = 1.6
-"""Distance of centres, in extents of a patch, up to which one takes over the other's answer."""
+RESIDUAL_DAMPING = 0.15
+"""Of the fit of the residuals' logs: they scatter about any smooth function."""
 
 
 @dataclass(frozen=True)
@@ -97,10 +102,27 @@ class TipResult:
     points: NDArray[np.int32]
     weights: Array
     guess: NDArray[np.float16]
+    residual: Array
 
 
 class TipTrainer:
-    """Local models of the tip that solve training positions by the query of the service."""
+    """One local model of the tip that solves training positions by the compiled query.
+
+    Parameters
+    ----------
+    body : Body
+    surface : Surface
+        Accessible.
+    models : LocalModels
+        The local model by itself.
+    tips : LocalTips
+    tangent : LocalTips, optional
+        With the same modes; its points serve the tangent.
+    prony : sequence of (float, float)
+        Of tissue that remembers.
+    deviatoric : ndarray, shape (m, m), optional
+        Deviatoric part of its rest stiffness in the modes.
+    """
 
     def __init__(
         self,
@@ -109,16 +131,66 @@ class TipTrainer:
         models: LocalModels,
         tips: LocalTips,
         tangent: LocalTips | None = None,
+        prony: Sequence[tuple[float, float]] = (),
+        deviatoric: Array | None = None,
     ) -> None:
-        self.models = assemble_tips(body, models, tips, tangent)
-        depths = np.full((len(surface.vertices), 1), np.inf)
-        none = np.zeros((3, TIP_ERROR_FEATURES))
-        self.state = TipState(self.models, surface.ground(depths), none)
+        self.models = touch_models(body, models, tips, tangent)
+        self.radius = body.tip.radius
+        self._prony = prony
+        past: Elastic | Remembering = Elastic()
+        if deviatoric is not None:
+            points = self.models.points.weights.shape[1]
+            past = remembering(deviatoric[None].astype(np.float32), len(prony), points)
+        no_limit = np.full((len(surface.vertices), LIMIT_FIELDS), NO_LIMIT)
+        self._workspace = touch_workspace(
+            self.models, surface.ground(no_limit), np.zeros((3, TOUCH_FEATURES)), past
+        )
+        self.rest()
 
-    def solve(self, position: Array) -> bool:
-        """Solve a position, from the last one if that was solved."""
-        query(self.state.bound, position, MAX_ITERATIONS)
-        return bool(self.state.outcome.scalars[STATUS] == newton.CONVERGED)
+    def rest(self) -> None:
+        """Go back to where nothing has happened."""
+        own = self._workspace
+        own.forget()
+        self._most: tuple[float, float] | None = None
+        if isinstance(own.past, Remembering):
+            own.past.records[0] = 0.0
+            self._memory().share[-1] = 1.0
+            self._most = 0.0, 0.0
+
+    def solve(self, position: Array, dt: float = 0.0) -> _State | None:
+        """Go on to a position of the tip, in ``dt`` s; None where there is no equilibrium.
+
+        Elastic tissue goes there in one jump from the last answer.
+        """
+        own, most = self._workspace, MAX_ITERATIONS - 1
+        if isinstance(own.past, Remembering):
+            most = MAX_ITERATIONS
+            for mine, weights in zip(own.past.time, step_weights(self._prony, dt), strict=True):
+                mine[:] = weights
+        place(own.solver, position, position)
+        touch(own.solver, position, most)
+        outcome, warm = own.outcome, own.warm
+        if outcome.status.item() != newton.CONVERGED:
+            return None
+        state = _State(
+            position=position,
+            depth=outcome.depth.item(),
+            normal=outcome.upward.copy(),
+            q=warm.q[0].copy(),
+            factor=np.tril(warm.factor[0]),
+            coupling=warm.coupling[0].T.copy(),
+            force=outcome.force.copy(),
+        )
+        if self._most is None:
+            return state
+        size, pushed = float(np.linalg.norm(state.q)), float(np.linalg.norm(state.force))
+        self._most = max(self._most[0], size), max(self._most[1], pushed)
+        return replace(state, past=self._past(), most=self._most)
+
+    @property
+    def in_time(self) -> bool:
+        """Whether the tissue remembers."""
+        return isinstance(self._workspace.past, Remembering)
 
     @property
     def gradients(self) -> NDArray[np.float32]:
@@ -127,78 +199,18 @@ class TipTrainer:
         tiles = rows.reshape(len(rows), -1, 9, LANES)
         return np.ascontiguousarray(tiles.transpose(1, 3, 2, 0).reshape(-1, 9, len(rows)))
 
-    def last(self, position: Array, depth: float) -> _State:
-        """The last answer, which was to this position."""
-        memory = self.state.memory
-        return _State(
-            position=position,
-            depth=depth,
-            q=memory.q[0].copy(),
-            factor=np.tril(memory.factor[0]),
-            coupling=memory.coupling[0].T.copy(),
-            force=self.state.outcome.force.copy(),
-        )
+    def _memory(self) -> Memory:
+        past, points = self._workspace.past, self.models.points.weights.shape[1]
+        assert isinstance(past, Remembering)
+        memory: Memory = opened(past.records[0], len(self._prony), len(past.mean), points)
+        return memory
 
-
-class TipClock:
-    """A trainer of one model whose tissue remembers.
-
-    Parameters
-    ----------
-    trainer : TipTrainer
-    prony : sequence of (float, float)
-    deviatoric : ndarray, shape (m, m)
-        Of ``reduced.history.ViscousModels``.
-    """
-
-    def __init__(
-        self, trainer: TipTrainer, prony: Sequence[tuple[float, float]], deviatoric: Array
-    ) -> None:
-        self.trainer = trainer
-        self._prony = prony
-        law = trainer.models.points
-        self._mu, self._points = law.mu[0], law.weights.shape[1]
-        none = np.zeros((0, 2), np.int32)
-        viscous = ViscousModels(
-            deviatoric[None].astype(np.float32), none, np.zeros((0, *deviatoric.shape), np.float32)
-        )
-        self._stepper = TipTimeStepper(trainer.state.bound, viscous, prony, self._points)
-        self._unknown = np.zeros((3, HISTORY_FEATURES))
-        self.rest()
-
-    def rest(self) -> None:
-        """Go back to where nothing has happened."""
-        self._history = History()
-        self._most = 0.0, 0.0
-
-    def step(self, dt: float, position: Array, depth: float) -> _State | None:
-        """Go ``dt`` (s) on to a position of the tip; None where there is no equilibrium."""
-        touch, history = step(
-            self.trainer.state, self._stepper, self._history, dt,
-            step_weights(self._prony, dt), position, self._unknown, 0.0,
-        )  # fmt: skip
-        if not touch.converged:
-            return None
-        self._history = history
-        memory = self._stepper.opened(history.locals[0].record)
-        size, pushed = float(np.linalg.norm(memory.wide)), float(np.linalg.norm(touch.force))
-        self._most = max(self._most[0], size), max(self._most[1], pushed)
-        return _State(
-            position=position,
-            depth=depth,
-            q=memory.wide.copy(),
-            factor=np.tril(memory.factor[0]),
-            coupling=memory.coupling[0].T.copy(),
-            force=touch.force,
-            past=self._past(memory),
-            most=self._most,
-        )
-
-    def _past(self, memory: TipMemory) -> Past:
+    def _past(self) -> Past:
         """What the points remember now."""
+        memory, points = self._memory(), self.models.points
+        B, S = np.zeros((2, SYMMETRIC * points.weights.shape[1]), np.float32)
         now = step_weights(self._prony, 0.0)
-        B, S = np.zeros((2, SYMMETRIC * self._points), np.float32)
-        predict_points(memory.points, memory.linear, now, self._mu, B, S)
+        predict_points(memory.points, memory.linear, now, points.mu[0], B, S)
         return B, S
 
 
@@ -206,8 +218,9 @@ class TipClock:
 class _State:
     """Answer of a local model."""
 
-    position: Array  # (3,)
-    depth: float
+    position: Array  # (3,) mm
+    depth: float  # mm
+    normal: Array  # (3,) of the surface
     q: Array  # (m,)
     factor: Array  # (m, m)
     coupling: Array  # (m, 3)
@@ -280,12 +293,10 @@ def train_tip(
         models,
         _untrained(space, np.arange(len(weights)), weights),
         _untrained(space, models.points, models.weights),
+        model.prony,
+        deviatoric_of(model, models, space) if model.prony else None,
     )
-    if model.prony:
-        clock = TipClock(trainer, model.prony, deviatoric_of(model, models, space))
-        pressed = _press_in_time(clock, contacts, normals, depths, rng)
-    else:
-        pressed = _press(trainer, contacts, normals, depths, rng)
+    pressed = _press(trainer, contacts, normals, depths, rng)
     if not pressed:
         raise NoEquilibrium("endoscope.tip: no equilibrium found under it; is the load too large?")
     V = _modes(pressed, count)
@@ -294,22 +305,27 @@ def train_tip(
     gradients = trainer.gradients @ V.astype(np.float32)
     law = trainer.models.points
     forces = _training_forces(gradients, (law.weights[0], law.mu[0], law.lam[0]), states, rng)
-    A, b = compress(forces[: len(weights)], EQUATIONS, rng)
-    points, chosen = nonnegative(A, b, most)
-    chosen *= weights[points]
-    trained = TipTrainer(body, surface, models, _untrained(modes, points, chosen))
+    A = np.ascontiguousarray(forces[: len(weights)].T)
+    points, chosen = nonnegative(A, A.sum(axis=1, dtype=float), most)
+    # a first guess by what is known so far spares the answers that refine it half their iterations
+    guess = _fit_guess(trainer.models, states)
+    trained = _untrained(modes, points, chosen * weights[points], guess)
+    shares, answers = _answers(
+        TipTrainer(body, surface, models, trained), contacts, normals, depths, rng
+    )
     return TipResult(
         modes=modes,
-        points=points.astype(np.int32),
-        weights=chosen,
-        guess=_fit_guess(trained, contacts, normals, depths, rng).astype(np.float16),
+        points=trained.points,
+        weights=trained.weights,
+        guess=_fit_guess(trainer.models, answers).astype(np.float16),
+        residual=_fit_residual(model, body, models, trainer.models, modes, shares, answers),
     )
 
 
 def local_tips(model: FullModel, models: LocalModels, results: Sequence[TipResult]) -> LocalTips:
-    """Local models of the tip for all patches but for ``LocalTips.residuals``."""
+    """Local models of the tip for all patches."""
     modes = np.stack([r.modes for r in results])
-    pairs = neighbours(models, NEIGHBOURS * models.extent)
+    pairs = neighbours(models, (FOLLOWED if model.prony else NEXT) * models.extent)
     return LocalTips(
         modes=modes,
         point_from=np.concatenate([[0], np.cumsum([len(r.points) for r in results])]),
@@ -318,7 +334,7 @@ def local_tips(model: FullModel, models: LocalModels, results: Sequence[TipResul
         guess=np.stack([r.guess for r in results]).astype(np.float32),
         pairs=pairs,
         overlaps=overlaps(model, models, modes, pairs),
-        residuals=np.zeros((len(modes), RESIDUAL_FEATURES)),
+        residuals=np.stack([r.residual for r in results]),
     )
 
 
@@ -330,23 +346,28 @@ def compile_tip_query(
 ) -> None:
     """Compile what ``train_tip`` runs, on a model of nothing."""
     modes = np.zeros((models.basis.shape[1], 4))
-    trainer = TipTrainer(body, surface, models, _untrained(modes, models.points, models.weights))
+    tips = _untrained(modes, models.points, models.weights)
     over = surface.vertices[0] + 0.9 * body.tip.radius * surface.normals[0]
-    trainer.solve(over)
+    TipTrainer(body, surface, models, tips).solve(over)
     if prony:
-        TipClock(trainer, prony, np.zeros((4, 4))).step(0.0, over, 0.0)
+        TipTrainer(body, surface, models, tips, None, prony, np.zeros((4, 4))).solve(over)
 
 
 def _untrained(
-    modes: NDArray[np.floating[Any]], points: NDArray[np.integer[Any]], weights: Array
+    modes: NDArray[np.floating[Any]],
+    points: NDArray[np.integer[Any]],
+    weights: Array,
+    guess: Array | None = None,
 ) -> LocalTips:
-    """A model in modes (M, m) with given points and no first guess."""
+    """A model in modes (M, m) with given points, and no first guess unless it is given."""
+    if guess is None:
+        guess = np.zeros((TIP_FEATURES, modes.shape[1]))
     return LocalTips(
         modes=modes[None].astype(np.float32),
         point_from=np.array([0, len(points)]),
         points=points.astype(np.int32),
         weights=weights,
-        guess=np.zeros((1, TIP_FEATURES, modes.shape[1]), np.float32),
+        guess=guess[None].astype(np.float32),
         pairs=np.zeros((0, 2), np.int32),
         overlaps=np.zeros((0, modes.shape[1], modes.shape[1]), np.float32),
         residuals=np.zeros((1, RESIDUAL_FEATURES)),
@@ -382,40 +403,24 @@ def _press(
     depths: Array,
     rng: np.random.Generator,
 ) -> list[_State]:
-    """Push the tip in at contacts far apart, step by step to about the largest depth."""
-    states = []
-    for i in farthest(contacts, min(PRESSED, len(contacts))):
-        trainer.state.forget()
-        for share in (np.arange(DEPTHS) + rng.uniform(0.3, 1.0, DEPTHS)) / DEPTHS:
-            depth = float(share * depths[i])
-            position = contacts[i] + (trainer.state.radius - depth) * normals[i]
-            if not trainer.solve(position):
-                break
-            states.append(trainer.last(position, depth))
-    return states
+    """Push the tip in at contacts far apart, step by step to about the largest depth.
 
-
-def _press_in_time(
-    clock: TipClock,
-    contacts: Array,
-    normals: Array,
-    depths: Array,
-    rng: np.random.Generator,
-) -> list[_State]:
-    """Push the tip in at contacts far apart, hold it, slide to another contact and lift it."""
+    On tissue that remembers it is also held, slid to another contact, and lifted.
+    """
     states: list[_State] = []
-    radius = clock.trainer.state.radius
     for i in farthest(contacts, min(PRESSED, len(contacts))):
-        clock.rest()
-        course = []
+        trainer.rest()
+        steps = []
         for share in (np.arange(DEPTHS) + rng.uniform(0.3, 1.0, DEPTHS)) / DEPTHS:
-            course += [(i, share, QUICK), (i, share, 10 ** rng.uniform(-1.5, 0.5))]
-        near = np.flatnonzero(np.linalg.norm(contacts - contacts[i], axis=1) < ASIDE)
-        course += [(rng.choice(near), rng.uniform(0.3, 0.9), QUICK), (i, 0.0, QUICK)]
-        for place, share, dt in course:
-            depth = float(share * depths[place])
-            position = contacts[place] + (radius - depth) * normals[place]
-            state = clock.step(dt, position, depth)
+            steps.append((i, share, QUICK))
+            if trainer.in_time:
+                steps.append((i, share, 10 ** rng.uniform(-1.5, 0.5)))
+        if trainer.in_time:
+            near = np.flatnonzero(np.linalg.norm(contacts - contacts[i], axis=1) < ASIDE)
+            steps += [(rng.choice(near), rng.uniform(0.3, 0.9), QUICK), (i, 0.0, QUICK)]
+        for at, share, dt in steps:
+            depth = float(share * depths[at])
+            state = trainer.solve(contacts[at] + (trainer.radius - depth) * normals[at], dt)
             if state is None:
                 break
             states.append(state)
@@ -438,48 +443,110 @@ def _training_forces(
 
     Times the square root of the compliance, an error of the internal force counts by the
     displacement it causes in the energy norm; times the slope, by the change of the force on the
-    tool.
+    tool.  Random combinations stand for all of these.
 
     The model adds to linear elasticity what the points have beyond it.  Points of great weight do
     that well in training states and are far too stiff for linear elasticity in other directions, in
     which the potential then falls without end.  So the points shall have its stiffness, too.
     """
-    columns = []
+    columns, equations = [], 0
+    each = EQUATIONS // (2 * len(states))
     for state in states:
-        looks = np.hstack(
-            [
-                np.linalg.inv(state.factor).T / state.size,
-                state.slope / state.pushed,
-            ]
-        )
+        displacing = np.linalg.inv(state.factor).T / state.size
+        looks = np.hstack([displacing, state.slope / state.pushed])
         departure = DEPARTURE * np.abs(state.q) * rng.standard_normal(len(state.q))
         for q in (state.q, state.q + departure):
             force = point_forces(gradients, *law, q, state.past)
             if force is not None:
-                columns.append(force @ looks.astype(np.float32))
+                columns.append(force @ combined(looks.astype(np.float32), each, rng))
+                equations += looks.shape[1]
     forces = np.hstack(columns)
-    size = np.linalg.norm(forces.sum(axis=0)) / np.sqrt(forces.shape[1])
+    size = np.linalg.norm(forces.sum(axis=0)) / np.sqrt(equations)
     responses = rng.standard_normal((RESPONSES, gradients.shape[2]))
     responses *= LINEAR * size / np.linalg.norm(responses, axis=1, keepdims=True)
-    return np.hstack([forces, linear_forces(gradients, *law, responses)])
+    linear = linear_forces(gradients, *law, responses)
+    return np.hstack([forces, combined(linear, 2 * RESPONSES, rng)])
 
 
-def _fit_guess(
-    trainer: TipTrainer,
+def _fit_guess(models: TouchModels, states: list[_State]) -> Array:
+    """Polynomials (TIP_FEATURES, m) of the answers and of their change with the position."""
+    rows, answers = [], []
+    shifts = STEP * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
+    for state in states:
+        for shift in shifts:
+            features, depth = np.zeros(TIP_FEATURES), state.depth - shift @ state.normal
+            place = models.frames[0], models.centres[:, 0], state.position + shift
+            tip_features(*place, max(depth, 0.0), features)
+            rows.append(features)
+            answers.append(state.q + state.slope @ shift)
+    return damped_fit(np.array(rows), np.array(answers))
+
+
+def _answers(
+    trained: TipTrainer,
     contacts: Array,
     normals: Array,
     depths: Array,
     rng: np.random.Generator,
+) -> tuple[list[float], list[_State]]:
+    """Answers of a trained model all over its range, and their shares of the largest depth."""
+    shares, answers = [], []
+    for i in rng.integers(len(contacts), size=ANSWERS):
+        share = np.sqrt(rng.random())
+        position = contacts[i] + (trained.radius - share * depths[i]) * normals[i]
+        trained.rest()
+        answer = trained.solve(position)
+        if answer is not None:
+            shares.append(share)
+            answers.append(answer)
+    return shares, answers
+
+
+def _fit_residual(
+    model: FullModel,
+    body: Body,
+    models: LocalModels,
+    placed: TouchModels,
+    modes: NDArray[np.float32],
+    shares: list[float],
+    answers: list[_State],
 ) -> Array:
-    """Polynomials (TIP_FEATURES, m) of the answers, over all contacts and depths."""
-    models, features = trainer.models, np.zeros(TIP_FEATURES)
-    rows, answers = [], []
-    for i in rng.integers(len(contacts), size=GUESSED):
-        depth = depths[i] * np.sqrt(rng.random())
-        position = contacts[i] + (trainer.state.radius - depth) * normals[i]
-        trainer.state.forget()
-        if trainer.solve(position):
-            tip_features(models.frames[0], models.centres[:, 0], position, depth, features)
-            rows.append(features.copy())
-            answers.append(trainer.state.memory.q[0].copy())
-    return damped_fit(np.array(rows), np.array(answers))
+    """Log of the full model's relative residual (RESIDUAL_FEATURES,), by ``residual_features``.
+
+    ``modes`` (M, m) are those of the answers.
+    """
+    rows = np.empty((len(answers), RESIDUAL_FEATURES))
+    for row, share, answer in zip(rows, shares, answers, strict=True):
+        place = placed.frames[0], placed.centres[:, 0], answer.position
+        residual_features(*place, -answer.normal, share, row)
+    nodal = (models.steps[0][:, None] * modes).T @ models.basis[0].astype(np.float32)
+    displacements = np.array([answer.q for answer in answers]) @ nodal
+    positions = np.array([answer.position for answer in answers])
+    residuals = residuals_left(model, body, displacements, positions)
+    kept = (residuals > 0) & np.isfinite(residuals)
+    logs = np.log(residuals[kept])
+    fitted = damped_fit(rows[kept], (logs - logs.mean())[:, None], RESIDUAL_DAMPING)[:, 0]
+    fitted[0] += logs.mean()
+    return fitted
+
+
+def residuals_left(model: FullModel, body: Body, displacements: Array, positions: Array) -> Array:
+    """Relative residuals (k,) in the full model of answers to positions of the tip.
+
+    Parameters
+    ----------
+    model : FullModel
+    body : Body
+    displacements : ndarray, shape (k, 3 n), mm
+    positions : ndarray, shape (k, 3), mm
+        Of the tip's centre.
+    """
+    surface, nodes = body.touchable
+    faces = np.arange(len(surface.faces), dtype=np.int32)
+    touching, loads = room_for(surface, len(faces)), np.zeros_like(displacements)
+    for u, position, load in zip(displacements, positions, loads, strict=True):
+        moved = np.ascontiguousarray(u.reshape(-1, 3)[nodes])
+        count, _, _ = press_faces(body.tip, surface, faces, position, moved, touching, FORCE)
+        touched = nodes[surface.faces[touching.face[:count]]]
+        np.add.at(load.reshape(-1, 3), touched, touching.force[:count])
+    return model.relative_residuals(displacements[:, model.free], loads[:, model.free])

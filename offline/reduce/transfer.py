@@ -7,9 +7,13 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from palpate.offline.fem.model import FullModel
-from palpate.shared.model import LocalModels
+from palpate.shared.tables import LocalModels
 
 Array = NDArray[np.float64]
+
+NEXT, FOLLOWED = 1.6, 2.0
+"""Distance of centres, in extents of a patch, up to which one takes over the other's answer, and
+its history."""
 Field = NDArray[np.float32]
 
 

@@ -9,25 +9,17 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from palpate.offline.fem.model import FullModel
-from palpate.offline.reduce.transfer import neighbours, overlaps, region_basis
-from palpate.shared.model import LocalModels
-from palpate.shared.reduced.history import ViscousModels
+from palpate.offline.reduce.transfer import region_basis
+from palpate.shared.tables import LocalModels
 
 Array = NDArray[np.float64]
 
-NEIGHBOURS = 2.0
-"""Distance of centres, in extents of a patch, up to which a history follows the tool."""
 
-
-def viscous_models(
+def deviatoric_of_all(
     model: FullModel, models: LocalModels, modes: NDArray[np.float32]
-) -> ViscousModels:
-    """Deviatoric stiffness of every patch, and the overlap of neighbours' spaces.
-
-    ``modes`` (p, M, r) are those of the patches in the bases of their regions.
-    """
+) -> NDArray[np.float32]:
+    """Deviatoric stiffness (p, r, r) of every patch in its modes (p, M, r), those of its region."""
     soft = deviatoric_stiffness(model)
-    pairs = neighbours(models, NEIGHBOURS * models.extent)
     count, _, r = modes.shape
     D = np.empty((count, r, r), np.float32)
     for number in range(len(models.basis)):
@@ -35,7 +27,7 @@ def viscous_models(
         gram = basis.T @ (soft @ basis)
         for k in np.flatnonzero(models.region == number):
             D[k] = modes[k].T @ gram @ modes[k]
-    return ViscousModels(D, pairs, overlaps(model, models, modes, pairs))
+    return D
 
 
 def deviatoric_stiffness(model: FullModel) -> csr_matrix:

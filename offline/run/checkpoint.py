@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import pickle
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -46,6 +47,7 @@ class Checkpoint:
     """
 
     def __init__(self, folder: Path, key: str) -> None:
+        self.key = key
         self._parent = folder
         self._folder = folder / key
         if folder.is_dir():
@@ -75,6 +77,12 @@ class Checkpoint:
         with temporary.open("rb") as written:
             os.fsync(written.fileno())
         temporary.replace(path)
+
+    def share(self, name: str, value: object) -> Path:
+        """Write a value where workers can read it, with ``pickle``; return its path."""
+        path = self._folder / f"{name}.pickle"
+        path.write_bytes(pickle.dumps(value))
+        return path
 
     def remove(self) -> None:
         """Forget everything: the artifact is written."""

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +37,7 @@ from palpate.offline.reduce.footprint_models import (
 from palpate.offline.reduce.load_path import LoadPath, pressure_that_moves
 from palpate.offline.reduce.ritz import RITZ_VECTORS, Footprint, energy_pod, ritz_vectors
 from palpate.offline.reduce.size import TrialResult
+from palpate.offline.run.streams import Stage, stream
 from palpate.offline.validate.norms import relative
 from palpate.shared.artifact import Artifact, read_artifact
 from palpate.shared.geometry.quadrature import stress_recovery
@@ -42,8 +45,9 @@ from palpate.shared.geometry.surface import Surface
 from palpate.shared.mechanics.footprint import footprint
 from palpate.shared.mechanics.sphere import tip_of, tip_surface
 from palpate.shared.mechanics.stress import StressRecovery, nodal_von_mises, nodal_von_mises_after
-from palpate.shared.model import Body
+from palpate.shared.model import ReducedModel
 from palpate.shared.scene import Scene, parse_scene
+from palpate.shared.tables import Body, Estimators, LocalModels
 
 Array = NDArray[np.float64]
 
@@ -52,9 +56,6 @@ POINTS_IN_BASIS = 50
 
 DENTS = 24
 """Modes of a region's basis that the tip's dents add to those of footprints."""
-
-TRIAL = 7
-"""Sets the random numbers of a trial apart from those of training."""
 
 TRIAL_LOADS = 10
 
@@ -106,6 +107,7 @@ class Workshop:
         self.model = FullModel.of(scene, self.mesh)
         self.surface: Surface = accessible_surface(self.mesh)
         self._nodal = np.zeros(len(self.mesh.nodes))
+        self._asked: tuple[Path, ReducedModel] | None = None
 
     @classmethod
     def of_artifact(cls, artifact: Artifact) -> Workshop:
@@ -163,7 +165,7 @@ class Workshop:
     def von_mises_after(self, history: History) -> Array:
         """Nodal von Mises stress (n,) kPa at the end of a history."""
         shares = np.array([share for share, _ in self.model.prony])
-        past = np.einsum("a,eqai->eiq", shares, history.points[:, :, :-1, :6])
+        past = np.einsum("a,aeqi->eiq", shares, history.points[:-1])
         out = np.zeros(len(self.mesh.nodes))
         nodal_von_mises_after(self._recovery, history.displacement, np.ascontiguousarray(past), out)
         return out
@@ -173,7 +175,24 @@ class Workshop:
         nodal, _ = self.unit_load(position)
         return np.asarray(nodal @ displacement / nodal.sum())
 
+    def untested(self, models: LocalModels, limits: Array) -> ReducedModel:
+        """Reduced model of local models and a load range, without error estimates."""
+        return ReducedModel(
+            self.scene.name, self.scene, {}, self.body, self.surface, limits, models, Estimators()
+        )
+
     # --- tasks ---------------------------------------------------------------------------------
+
+    def ask(
+        self, path: Path, function: Callable[..., float], rows: Sequence[tuple[Any, ...]]
+    ) -> list[float]:
+        """Values of a function of a reduced model and of each row of further arguments.
+
+        ``path`` is a pickle of the local models and their load range; the last one is kept.
+        """
+        if self._asked is None or self._asked[0] != path:
+            self._asked = path, self.untested(*pickle.loads(path.read_bytes()))
+        return [function(self._asked[1], *row) for row in rows]
 
     def load_range(self, position: Array) -> Array:
         """Load range at a surface point: fields (8,) of ``mechanics.footprint.pressure_limit``.
@@ -263,16 +282,20 @@ class Workshop:
         """Compile what ``patch`` runs."""
         compile_query(self.scene, self.body, self.surface)
 
-    def patch(self, region: RegionResult, task: PatchTask) -> PatchResult:
-        """Train a local model."""
-        return train_patch(self.scene, self.model, self.body, self.surface, region, task)
+    def patch(self, region: RegionResult, task: PatchTask, tip: bool = True) -> PatchResult:
+        """Train a local model, under the tip only if the scene has one and ``tip`` says so."""
+        endoscope = self.scene.endoscope.model_copy(
+            update={"tip": tip and self.scene.endoscope.tip}
+        )
+        scene = self.scene.model_copy(update={"endoscope": endoscope})
+        return train_patch(scene, self.model, self.body, self.surface, region, task)
 
     def trial(self, task: PatchTask) -> TrialResult:
         """Train a local model by itself and judge it on loads it has not seen."""
         region = self.region(task.footprints, task.size.region_modes)
-        result = self.patch(region, task)
+        result = self.patch(region, task, tip=False)
         trainer = local_trainer(self.scene, self.body, self.surface, region, task, result)
-        rng = np.random.default_rng([task.seed, TRIAL])
+        rng = stream(task.seed, Stage.TRIAL_LOADS)
         displacement: list[float] = []
         von_mises: list[float] = []
         seconds: list[float] = []
@@ -282,11 +305,11 @@ class Workshop:
             if reference is None:
                 continue
             started = time.perf_counter()
-            converged = trainer.solve(load.position, load.direction, load.pressure)
+            sample = trainer.solve(load.position, load.direction, load.pressure)
             seconds.append(time.perf_counter() - started)
             errors = np.inf, np.inf
-            if converged:
-                errors = self.errors(trainer.displacement, reference.astype(float))
+            if sample is not None:
+                errors = self.errors(trainer.displacement(sample.q), reference.astype(float))
             displacement.append(errors[0])
             von_mises.append(errors[1])
         return TrialResult(np.array(displacement), np.array(von_mises), float(np.median(seconds)))

@@ -1,10 +1,18 @@
-"""The scenes that come with the software, and how to name one."""
+"""The scenes that come with the software, how to name one, and what the keys of a scene say."""
 
+import json
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Literal, get_args, get_origin
 
-from palpate.shared.scene import Scene, SceneError, load_scene
+from pydantic.fields import FieldInfo
+
+from palpate.shared.scene import Part, Scene, SceneError, absent, kinds_of, load_scene
 
 FOLDER = Path(__file__).parent
+
+MEANINGS = 34
+"""Column at which meanings stand, those of longer values on a line of their own."""
 
 
 def shipped_scenes() -> list[str]:
@@ -22,10 +30,9 @@ def find_scene(name_or_path: str | Path) -> Scene:
     """
     path = Path(name_or_path)
     if path.suffix != ".toml":
-        if str(name_or_path) not in shipped_scenes():
-            raise SceneError(
-                f"{name_or_path}: neither a .toml file nor one of {', '.join(shipped_scenes())}"
-            )
+        names = shipped_scenes()
+        if str(name_or_path) not in names:
+            raise SceneError(f"{name_or_path}: neither a .toml file nor one of {', '.join(names)}")
         path = FOLDER / f"{name_or_path}.toml"
     return load_scene(path)
 
@@ -33,3 +40,56 @@ def find_scene(name_or_path: str | Path) -> Scene:
 def default_artifact(scene: Scene) -> Path:
     """Where a scene's artifact goes and is looked for."""
     return Path("artifacts") / f"{scene.name}.h5"
+
+
+def filled(scene: Scene) -> str:
+    """A scene's TOML with every default written out; each key with its unit and meaning."""
+    return "\n".join(_lines(scene, "")) + "\n"
+
+
+def _lines(part: Part, path: str) -> Iterator[str]:
+    tables = []
+    for key, field in type(part).model_fields.items():
+        value, meaning = getattr(part, key), f"# {field.description}"
+        if isinstance(value, Part):
+            tables.append((f"{path}{key}", meaning, value))
+            continue
+        said = f"{key} = {_toml(value)}"
+        if value is None:
+            said, meaning = f"# {key} =", f"{meaning} (if absent: {absent(field)})"
+        if len(said) > MEANINGS:
+            yield meaning
+        yield said if len(said) > MEANINGS else f"{said:<{MEANINGS}} {meaning}"
+    for name, meaning, table in tables:
+        yield f"\n{f'[{name}]':<{MEANINGS}} {meaning}"
+        yield from _lines(table, f"{name}.")
+
+
+def _toml(value: object) -> str:
+    """A value as TOML writes it: as JSON does, but for the brackets of tuples."""
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    return json.dumps(value, ensure_ascii=False)
+
+
+def reference() -> str:
+    """Table of all keys of a scene, in Markdown: default, unit and meaning of each."""
+    head = ["| key | if absent | unit and meaning |", "|---|---|---|"]
+    return "\n".join([*head, *_rows(Scene, "")]) + "\n"
+
+
+def _rows(part: type[Part], path: str) -> Iterator[str]:
+    for key, field in part.model_fields.items():
+        kinds = kinds_of(field)
+        name = f"`{path}{key}`" if not kinds else f"**`[{path}{key}]`**"
+        yield f"| {name} | {'' if kinds else _default(field)} | {field.description} |"
+        for kind in kinds:
+            yield from _rows(kind, f"{path}{key}.")
+
+
+def _default(field: FieldInfo) -> str:
+    """What stands for a key that a scene does not give."""
+    if not field.is_required():
+        return absent(field) or f"`{_toml(field.default)}`"
+    kinds = get_args(field.annotation) if get_origin(field.annotation) is Literal else ()
+    return absent(field) or ": ".join(["required", *(f"`{_toml(kind)}`" for kind in kinds)])

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from palpate.offline.studies.chart_points import FULL, SHIPPED, STATISTICS, Point, pareto
+from palpate.offline.studies.chart_points import FULL, SHIPPED, STATISTICS, TWIN, Point, pareto
 from palpate.shared.scene import Scene
 
 if TYPE_CHECKING:
@@ -34,7 +34,11 @@ ACCENT, DARK_ACCENT = "#D55E00", "#A34700"
 """Of what is Palpate's; the second for letters."""
 
 GROUPS = (
-    Group("Palpate", ACCENT, {"artifact": "this artifact"}),
+    Group(
+        "Palpate",
+        ACCENT,
+        {"artifact": "this artifact", "artifact, warm": "the same without memory"},
+    ),
     Group("Finite elements", "#000000", {"full": "full model, several meshes"}),
     Group(
         "Modes of the body at rest",
@@ -85,14 +89,6 @@ MARKERS = ("o", "s", "^", "D")
 PAGE_MARKERS = ("circle", "square", "triangle-up", "diamond")
 
 
-NOTE = """\
-A point is a method of one size; a line joins its sizes. Errors are
-relative L2 norms over random loads that no method has seen: markers
-show the 95th percentile (lower left: the median), whiskers the worst.
-At 100 % an answer is no better than none. Dashed: the Pareto front;
-nothing is both faster and more accurate than what lies on it."""
-
-
 @dataclass(frozen=True)
 class Panel:
     """One pair of axes: a statistic of an error of ``chart_points.FIELDS``."""
@@ -116,16 +112,54 @@ class Panel:
         return [point for point in known if self.field == "refined" or point.key != FULL]
 
 
-PANELS = (
-    Panel("Displacement", "error against the full model, 95th percentile", "displacement"),
-    Panel("Von Mises stress", "error against the full model, 95th percentile", "von_mises"),
-    # so few loads are solved in the refined mesh that they say little of a 95th percentile
-    Panel(
-        "Displacement, error of the mesh included",
-        "error against a refined mesh, median",
-        "refined",
-        "median",
+@dataclass(frozen=True)
+class Layout:
+    """A chart: title with a place for the scene's name, what a time is of, panels, and a note."""
+
+    title: str
+    per: str
+    panels: tuple[Panel, ...]
+    note: str
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Rows and columns of the panels and of the legend, which comes last."""
+        return (2, 2) if len(self.panels) == 3 else (1, len(self.panels) + 1)
+
+
+OF_LOADS = Layout(
+    "Speed and accuracy of methods on the scene {!r}: lower left is better",
+    "query",
+    (
+        Panel("Displacement", "error against the full model, 95th percentile", "displacement"),
+        Panel("Von Mises stress", "error against the full model, 95th percentile", "von_mises"),
+        Panel(
+            "Displacement, error of the mesh included",
+            "error against a refined mesh, median",
+            "refined",
+            "median",
+        ),
     ),
+    """\
+A point is a method of one size; a line joins its sizes. Errors are
+relative L2 norms over random loads that no method has seen: markers
+show the 95th percentile (lower left: the median), whiskers the worst.
+At 100 % an answer is no better than none. Dashed: the Pareto front;
+nothing is both faster and more accurate than what lies on it.""",
+)
+IN_TIME = Layout(
+    "Speed and accuracy over histories of the scene {!r}: lower left is better",
+    "step",
+    (
+        Panel("Displacement", "error over a history, 95th percentile", "displacement"),
+        Panel("Von Mises stress", "error over a history, 95th percentile", "von_mises"),
+    ),
+    """\
+A point is a method of one size; a line joins its sizes. Errors are
+relative L2 norms over random histories that no method has seen:
+markers show the 95th percentile, whiskers the worst. Dashed: the
+Pareto front; nothing is both faster and more accurate than what
+lies on it.""",
 )
 
 NAMES = {
@@ -153,23 +187,23 @@ class Look:
     index: int
 
     @property
-    def size(self) -> float:
-        """Of the marker, points: the artifact stands out."""
-        return 17.0 if self.family == "artifact" else 5.5
+    def ours(self) -> bool:
+        """Whether it is Palpate's, which stands out."""
+        return self.group is GROUPS[0]
 
     @property
     def marker(self) -> str:
         """Matplotlib's."""
-        return "*" if self.family == "artifact" else MARKERS[self.index]
+        return "*P"[self.index] if self.ours else MARKERS[self.index]
 
     @property
     def page_marker(self) -> str:
         """Plotly's."""
-        return "star" if self.family == "artifact" else PAGE_MARKERS[self.index]
+        return ("star", "cross")[self.index] if self.ours else PAGE_MARKERS[self.index]
 
 
 def looks(points: Sequence[Point]) -> Iterator[Look]:
-    """Every method that has points, the artifact last so that it lies on top."""
+    """Every method that has points, Palpate's last so that they lie on top."""
     families = {point.family for point in points}
     for group in (*GROUPS[1:], GROUPS[0]):
         for index, (family, name) in enumerate(group.methods.items()):
@@ -193,29 +227,26 @@ def percent(error: float) -> str:
 # --- picture -------------------------------------------------------------------------------------
 
 
-def draw(path: Path, points: Sequence[Point], scene: Scene) -> None:
-    """Draw the chart; the fourth corner is its legend."""
+def draw(path: Path, points: Sequence[Point], scene: Scene, layout: Layout) -> None:
+    """Draw the chart; its legend takes the place of a last panel."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(12.5, 10.8), layout="constrained")
-    grid = figure.subplots(2, 2, sharex=True)
-    figure.suptitle(_title(scene), fontsize=15, fontweight="bold")
-    for axes, panel in zip(grid.ravel(), PANELS, strict=False):
-        _draw_panel(axes, panel, points, scene)
-    _draw_legend(grid[1, 1], points)
+    rows, columns = layout.grid
+    figure = Figure(figsize=(6.25 * columns, 5.4 * rows), layout="constrained")
+    grid = figure.subplots(rows, columns).ravel()
+    figure.suptitle(layout.title.format(scene.name), fontsize=15, fontweight="bold")
+    for axes, panel in zip(grid, layout.panels, strict=False):
+        _draw_panel(axes, panel, points, scene, layout.per)
+    _draw_legend(grid[-1], points, layout.note)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)
 
 
-def _title(scene: Scene) -> str:
-    return f"Speed and accuracy of methods on the scene {scene.name!r}: lower left is better"
-
-
-def _draw_panel(axes: Axes, panel: Panel, points: Sequence[Point], scene: Scene) -> None:
+def _draw_panel(axes: Axes, panel: Panel, points: Sequence[Point], scene: Scene, per: str) -> None:
     kept = panel.plotted(points)
     axes.set(xscale="log", yscale="log")
     axes.set_title(panel.title, fontsize=12.5, fontweight="bold", loc="left")
-    axes.set_xlabel("time per query on one core")
+    axes.set_xlabel(f"time per {per} on one core")
     axes.set_ylabel(panel.error)
     axes.xaxis.set_major_formatter(lambda x, _: duration(x))
     axes.yaxis.set_major_formatter(lambda y, _: f"{100 * y:g} %")
@@ -227,7 +258,7 @@ def _draw_panel(axes: Axes, panel: Panel, points: Sequence[Point], scene: Scene)
     axes.set_xlim(min(times) / 1.8, max(times) * 2)
     axes.set_ylim(min(errors) / 3, max(2 * max(errors), 1.5))
     _draw_front(axes, kept, panel)
-    _draw_aim(axes, panel, scene)
+    _draw_aim(axes, panel, scene, per)
     _draw_full(axes, panel, points)
     _draw_names(axes, panel, kept)
 
@@ -244,10 +275,10 @@ def _draw_method(axes: Axes, look: Look, points: Sequence[Point], panel: Panel) 
         linestyle="-",
         linewidth=0.9,
         color=look.group.colour,
-        markersize=look.size,
+        markersize={"*": 17.0, "P": 11.0}.get(look.marker, 5.5),
         markeredgecolor="white",
         markeredgewidth=0.6,
-        zorder=5 if look.family == "artifact" else 3,
+        zorder=5 if look.ours else 3,
     )
 
 
@@ -259,14 +290,17 @@ def _draw_front(axes: Axes, kept: Sequence[Point], panel: Panel) -> None:
     axes.step(times, [*errors, errors[-1]], where="post", color="0.25", lw=1.3, ls=dashes, zorder=2)
 
 
-def _draw_aim(axes: Axes, panel: Panel, scene: Scene) -> None:
-    """Box of the tolerance, which is one of reduction, and the budget."""
+def _draw_aim(axes: Axes, panel: Panel, scene: Scene, per: str) -> None:
+    """Box of the scene's tolerance, which is one of reduction, and of its budget for a query."""
     if panel.field == "refined":
         return
-    tolerance, budget = getattr(scene.tolerance, panel.field), 1e6 * scene.budget.query
-    (left, _), (bottom, _) = axes.get_xlim(), axes.get_ylim()
-    axes.fill_between([left, budget], bottom, tolerance, color=ACCENT, alpha=0.12, lw=0)
-    text = f"aim: {percent(tolerance)} in {duration(budget)}"
+    tolerance = getattr(scene.tolerance, panel.field)
+    (left, right), (bottom, _) = axes.get_xlim(), axes.get_ylim()
+    text = f"aim: {percent(tolerance)}"
+    if per == "query":
+        right = 1e6 * scene.budget.query
+        text += f" in {duration(right)}"
+    axes.fill_between([left, right], bottom, tolerance, color=ACCENT, alpha=0.12, lw=0)
     _write(axes, text, (left, bottom), (8, 8), color=DARK_ACCENT)
 
 
@@ -286,6 +320,7 @@ def _draw_full(axes: Axes, panel: Panel, points: Sequence[Point]) -> None:
 
 def _draw_names(axes: Axes, panel: Panel, kept: Sequence[Point]) -> None:
     colours = {look.family: look.group.colour for look in looks(kept)}
+    without_memory = [point.time_us for point in kept if point.key == TWIN]
     for point in kept:
         if point.key in NAMES:
             text, offset, side = NAMES[point.key]
@@ -293,6 +328,8 @@ def _draw_names(axes: Axes, panel: Panel, kept: Sequence[Point]) -> None:
             _write(axes, text, where, offset, ha=side, color=colours[point.family])
         elif point.key == SHIPPED:
             text = f"Palpate: {percent(panel.of(point))}\nin {duration(point.time_us)}"
+            for time in without_memory:
+                text += f",\n{point.time_us / time:.1f} x that without memory"
             _write(
                 axes, text, (point.time_us, panel.of(point)), (12, -32),
                 color=DARK_ACCENT, fontweight="bold", fontsize=11,
@@ -315,7 +352,7 @@ def _write(
     axes.annotate(text, where, offset, textcoords="offset points", **style)
 
 
-def _draw_legend(axes: Axes, points: Sequence[Point]) -> None:
+def _draw_legend(axes: Axes, points: Sequence[Point], note: str) -> None:
     from matplotlib.legend import Legend
 
     axes.axis("off")
@@ -336,8 +373,8 @@ def _draw_legend(axes: Axes, points: Sequence[Point]) -> None:
         for text in legend.get_texts():
             if any(text.get_text() == group.title for group in GROUPS):
                 text.set_fontweight("bold")
-    note = axes.text(0, 0, NOTE, transform=axes.transAxes, fontsize=9.5, linespacing=1.4)
-    note.set_in_layout(False)
+    words = axes.text(0, 0, note, transform=axes.transAxes, fontsize=9.5, linespacing=1.4)
+    words.set_in_layout(False)
 
 
 def _handles(group: Group, known: Sequence[Look]) -> list[Line2D]:
@@ -347,44 +384,38 @@ def _handles(group: Group, known: Sequence[Look]) -> list[Line2D]:
     own = [look for look in known if look.group is group]
     methods = [
         Line2D(
-            [],
-            [],
-            color=group.colour,
-            marker=look.marker,
-            markersize=min(look.size, 12.0),
-            linewidth=0.9,
-            label=look.name,
+            [], [], color=group.colour, marker=look.marker, markersize=12.0 if look.ours else 5.5,
+            linewidth=0.9, label=look.name,
         )
         for look in own
-    ]
+    ]  # fmt: skip
     return [Line2D([], [], linestyle="", label=group.title), *methods] if own else []
 
 
 # --- page ----------------------------------------------------------------------------------------
 
 
-def write_page(path: Path, points: Sequence[Point], scene: Scene) -> None:
+def write_page(path: Path, points: Sequence[Point], scene: Scene, layout: Layout) -> None:
     """Write the chart as a page that needs no network: every point tells its figures."""
     from plotly.subplots import make_subplots
 
-    figure = make_subplots(2, 2, subplot_titles=[f"<b>{panel.title}</b>" for panel in PANELS])
-    for number, panel in enumerate(PANELS):
-        where = {"row": 1 + number // 2, "col": 1 + number % 2}
-        kept = panel.plotted(points)
+    rows, columns = layout.grid
+    titles = [f"<b>{panel.title}</b>" for panel in layout.panels]
+    figure = make_subplots(rows, columns, subplot_titles=titles)
+    for number, panel in enumerate(layout.panels):
+        where = {"row": 1 + number // columns, "col": 1 + number % columns}
+        kept, last = panel.plotted(points), panel is layout.panels[-1]
         for look in looks(points):
             own = [point for point in kept if point.family == look.family]
-            figure.add_trace(_trace(look, own, panel), **where)
-        figure.add_trace(_front(kept, panel), **where)
-        figure.update_xaxes(
-            type="log", title="time per query on one core", tickformat="~s", ticksuffix="s", **where
-        )
+            figure.add_trace(_trace(look, own, panel) | {"showlegend": last}, **where)
+        figure.add_trace(_front(kept, panel) | {"showlegend": last}, **where)
+        title = f"time per {layout.per} on one core"
+        figure.update_xaxes(type="log", title=title, tickformat="~s", ticksuffix="s", **where)
         figure.update_yaxes(type="log", title=panel.error, tickformat="~%", **where)
         if panel.field != "refined":
             _aim(figure, panel, kept, scene, where)
     figure.update_layout(
-        title=_title(scene),
-        template="plotly_white",
-        height=1000,
+        title=layout.title.format(scene.name), template="plotly_white", height=500 * rows
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.write_html(path, include_plotlyjs=True)
@@ -392,32 +423,21 @@ def write_page(path: Path, points: Sequence[Point], scene: Scene) -> None:
 
 def _trace(look: Look, points: Sequence[Point], panel: Panel) -> dict[str, Any]:
     errors = np.array([panel.of(point) for point in points])
-    largest = np.array([point.error(panel.field, "max") for point in points])
+    above = np.array([point.error(panel.field, "max") for point in points]) - errors
+    colour, size = look.group.colour, 18 if look.ours else 9
     return {
         "type": "scatter",
         "mode": "lines+markers",
         "x": [1e-6 * point.time_us for point in points],
         "y": errors,
-        "error_y": {
-            "array": largest - errors,
-            "arrayminus": 0 * errors,
-            "thickness": 0.6,
-            "width": 0,
-        },
+        "error_y": {"array": above, "arrayminus": 0 * errors, "thickness": 0.6, "width": 0},
         "name": look.name,
         "text": [_hover(point, panel.field) for point in points],
         "hovertemplate": f"<b>{look.name}</b><br>%{{text}}<extra></extra>",
-        "marker": {
-            "color": look.group.colour,
-            "symbol": look.page_marker,
-            "size": 18 if look.family == "artifact" else 9,
-            "line": {"color": "white", "width": 1},
-        },
-        "line": {"color": look.group.colour, "width": 1},
+        "marker": {"color": colour, "symbol": look.page_marker, "size": size},
+        "line": {"color": colour, "width": 1},
         "legendgroup": look.group.title,
         "legendgrouptitle": {"text": look.group.title},
-        # the last panel has all methods
-        "showlegend": panel is PANELS[-1],
     }
 
 
@@ -425,9 +445,9 @@ def _hover(point: Point, field: str) -> str:
     errors = [f"{percent(point.error(field, name))} ({name})" for name in STATISTICS]
     lines = (
         f"{point.label}; {point.unknowns} unknowns",
-        f"{duration(point.time_us)} per query",
+        duration(point.time_us),
         "error " + ", ".join(errors),
-        f"{point.unconverged} loads without an answer",
+        f"{point.unconverged} queries without an answer",
     )
     return "<br>".join(lines)
 
@@ -442,7 +462,6 @@ def _front(kept: Sequence[Point], panel: Panel) -> dict[str, Any]:
         "line": {"color": "#404040", "dash": "dash", "shape": "hv"},
         "name": "Pareto front",
         "hoverinfo": "skip",
-        "showlegend": panel is PANELS[-1],
     }
 
 

@@ -1,15 +1,13 @@
-"""Points of the speed-accuracy chart, what stands out among them, and their table."""
+"""Points of the speed-accuracy charts, and those that no other beats."""
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 
-SHIPPED, FULL = "artifact 1", "full 1"
-"""Keys of the artifact, and of the full model on the scene's own mesh."""
+SHIPPED, TWIN, FULL = "artifact 1", "artifact, warm 1", "full 1"
+"""Keys of the artifact, of the artifact without memory, and of the full model on its own mesh."""
 
 FIELDS = ("displacement", "von_mises", "refined")
 """Errors: of two fields on the scene's mesh, and of displacement against a refined one."""
@@ -19,7 +17,7 @@ STATISTICS = ("median", "p95", "max")
 
 @dataclass(frozen=True)
 class Point:
-    """A method of one size; errors are fractions, over all loads.
+    """A method of one size; errors are fractions, over all queries.
 
     They are nan where there is nothing to compare: another mesh has no error of reduction.
     """
@@ -48,22 +46,15 @@ class Point:
 def pareto(
     points: Sequence[Point], field: str = "displacement", statistic: str = "p95"
 ) -> list[Point]:
-    """The points, fastest first, that no other beats in both time and an error."""
+    """The points, fastest first, that no other beats in both time and an error.
+
+    The artifact without memory is no competitor: it answers another question.
+    """
     front: list[Point] = []
     least = math.inf
+    points = [point for point in points if point.key != TWIN]
     for point in sorted(points, key=lambda point: (point.time_us, point.error(field, statistic))):
         if point.error(field, statistic) < least:
             front.append(point)
             least = point.error(field, statistic)
     return front
-
-
-def write_csv(path: Path, points: Sequence[Point]) -> None:
-    """Write a row per point; errors as fractions."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    rows = [asdict(point) for point in points]
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items()})

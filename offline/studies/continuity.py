@@ -1,67 +1,30 @@
-"""Whether the answer glides as the contact does, step by step beside the full model."""
+"""Whether the answer changes smoothly as the contact glides, step by step beside the full model."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from palpate.offline.bench import STEP, tip_at, walk
-from palpate.offline.run.workshop import Workshop
+from palpate.offline.run.workshop import Load, Workshop
 from palpate.offline.validate.loads import unseen_loads
 from palpate.offline.validate.norms import relative
 from palpate.offline.validate.tip import OTHER_EQUILIBRIUM
 from palpate.shared.artifact import read_artifact
 from palpate.shared.model import ReducedModel
 
-
-def continuity(artifact: Path, paths: int, steps: int, seed: int) -> dict[str, Any]:
-    """Compare the change of the whole displacement field from step to step.
-
-    Parameters
-    ----------
-    artifact : Path
-    paths, steps : int
-        Paths over the surface, and steps of 0.05 mm along each.
-    seed : int
-
-    Returns
-    -------
-    dict
-        ``excess_mm``: the change of the reduced field that the full model does not show, largest of
-        all nodes (median, p95 and max over steps); ``change_mm``: the full model's own;
-        ``switches``: steps at which the active patches change.
-    """
-    atlas = ReducedModel.load(artifact)
-    workshop = Workshop.of_artifact(read_artifact(artifact))
-    rng = np.random.default_rng([seed, 7])
-    excess, change, switches = [], [], 0
-    for start in tqdm(unseen_loads(atlas, paths, seed), desc="paths"):
-        before = None
-        for load in walk(atlas, start, steps + 1, rng):
-            full = workshop.solve(load, None if before is None else before[0]).displacement
-            solution = atlas.solve(load.position, load.pressure, load.direction)
-            reduced = atlas.displacement(solution).astype(float)
-            active = {number for number, _, _ in solution.patches}
-            if before is not None:
-                moved = full - before[0]
-                change.append(np.linalg.norm(moved, axis=1).max())
-                excess.append(np.linalg.norm(reduced - before[1] - moved, axis=1).max())
-                switches += active != before[2]
-            before = full, reduced, active
-    return {
-        "step_mm": STEP,
-        "steps": len(excess),
-        "switches": switches,
-        "excess_mm": _quantiles(excess),
-        "change_mm": _quantiles(change),
-    }
+Array = NDArray[np.float64]
 
 
-def tip_continuity(artifact: Path, paths: int, steps: int, seed: int) -> dict[str, Any]:
-    """Compare the change of the force on a rigid tip from step to step.
+def continuity(
+    artifact: Path, paths: int, steps: int, seed: int, tip: bool = False
+) -> dict[str, Any]:
+    """Compare the changes of both models' answers from step to step.
 
     Parameters
     ----------
@@ -69,46 +32,61 @@ def tip_continuity(artifact: Path, paths: int, steps: int, seed: int) -> dict[st
     paths, steps : int
         Paths over the surface, and steps of 0.05 mm along each.
     seed : int
+    tip : bool
+        Glide with a rigid tip instead of a footprint.
 
     Returns
     -------
     dict
-        ``excess``: the change of the reduced model's force that the full model does not show, over
-        the largest force on the path (median, p95 and max over steps); ``change``: the full model's
-        own. ``left_out``: steps at which the models rest in different equilibria, or the full model
-        in none.
+        ``excess``: the change of the reduced answer that the full model does not show (median, p95
+        and max over steps); ``change``: the full model's own.  Of a footprint they are of the
+        displacement, largest of all nodes, in mm; of the tip, of its force over the largest force
+        on the path.  ``left_out``: steps at which the models rest in different equilibria, or the
+        full model in none.
     """
     atlas = ReducedModel.load(artifact)
     workshop = Workshop.of_artifact(read_artifact(artifact))
-    rng = np.random.default_rng([seed, 8])
-    excess: list[float] = []
-    change: list[float] = []
+    rng = np.random.default_rng([seed, 8 if tip else 7])
+    excess, change = [], []
     for start in tqdm(unseen_loads(atlas, paths, seed), desc="paths"):
-        state, before = atlas.new_state(), None
-        forces = []
-        for load in walk(atlas, start, steps + 1, rng):
-            answer = atlas.touch(tip_at(atlas, load), state)
-            reduced = atlas.displacement(answer).astype(float)
-            full = workshop.touch(answer.position, reduced if before is None else before)
-            before = full.displacement.astype(float) if full.displacement.size else None
-            if before is None or relative(reduced, before) > OTHER_EQUILIBRIUM:
-                forces.append(np.full((2, 3), np.nan))
-            else:
-                forces.append(np.array([full.force, answer.force]))
-        moved = np.diff(forces, axis=0)  # (steps, 2, 3)
-        largest = np.nan_to_num(np.linalg.norm(forces, axis=2)).max()
-        change += (np.linalg.norm(moved[:, 0], axis=1) / largest).tolist()
-        excess += (np.linalg.norm(moved[:, 1] - moved[:, 0], axis=1) / largest).tolist()
-    kept = [e for e in excess if not np.isnan(e)]
-    return {
-        "step_mm": STEP,
-        "steps": len(kept),
-        "left_out": len(excess) - len(kept),
-        "excess": _quantiles(kept),
-        "change": _quantiles([c for c in change if not np.isnan(c)]),
-    }
-
-
-def _quantiles(values: list[float]) -> dict[str, float]:
+        loads = walk(atlas, start, steps + 1, rng)
+        answers = (_forces if tip else _displacements)(atlas, workshop, loads)
+        full, reduced = np.diff(answers, axis=1)
+        change.append(np.linalg.norm(full, axis=2).max(axis=1))
+        excess.append(np.linalg.norm(reduced - full, axis=2).max(axis=1))
+    kept = ~np.isnan(np.concatenate(excess))
     named = {"median": 50, "p95": 95, "max": 100}
-    return {name: float(np.percentile(values, q)) for name, q in named.items()}
+    return {
+        "step_mm": STEP,
+        "steps": int(kept.sum()),
+        "left_out": int((~kept).sum()),
+        **{
+            name: {
+                key: float(np.percentile(np.concatenate(x)[kept], q)) for key, q in named.items()
+            }
+            for name, x in (("excess", excess), ("change", change))
+        },
+    }
+
+
+def _displacements(atlas: ReducedModel, workshop: Workshop, loads: Sequence[Load]) -> Array:
+    """Displacements (2, t, n, 3) mm of the full and the reduced model."""
+    full: list[Array] = []
+    for load in loads:
+        full.append(workshop.solve(load, full[-1] if full else None).displacement)
+    answers = [atlas.press(load.position, load.pressure, load.direction) for load in loads]
+    return np.array([full, [atlas.displacement(answer) for answer in answers]], dtype=float)
+
+
+def _forces(atlas: ReducedModel, workshop: Workshop, loads: Sequence[Load]) -> Array:
+    """Forces (2, t, 1, 3) of both models over the largest, nan where they are not comparable."""
+    warm, before = atlas.new_warm(), None
+    forces = np.full((2, len(loads), 1, 3), np.nan)
+    for i, load in enumerate(loads):
+        answer = atlas.touch(tip_at(atlas, load), warm=warm)
+        reduced = atlas.displacement(answer).astype(float)
+        full = workshop.touch(answer.position, reduced if before is None else before)
+        before = full.displacement.astype(float) if full.displacement.size else None
+        if before is not None and relative(reduced, before) <= OTHER_EQUILIBRIUM:
+            forces[:, i, 0] = full.force, answer.force
+    return forces / np.nan_to_num(np.linalg.norm(forces, axis=3)).max()

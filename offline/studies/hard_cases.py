@@ -1,10 +1,10 @@
-"""Cases that strain a method of deforming tissue, and what the full model makes of them.
+"""Loads that strain a method of deforming tissue, and the full model's answers to them.
 
-The answer that counts is the one tissue comes to when the load is raised from nothing.  Within a
-few times the trained range a single jump finds the same; beyond it the load path is followed in
-small steps, and where the jump ends elsewhere the load has more than one equilibrium.  So it has
-where a load that was raised beyond the range and lowered again leaves the tissue elsewhere than
-one raised from nothing does: there what counts is where the way has led.
+The right answer is the equilibrium that tissue reaches when the load is raised from nothing.
+Within a few times the trained range a single jump finds the same; beyond it the load path is
+followed in small steps, and where the jump ends elsewhere the load has more than one equilibrium.
+The same holds where a load that was raised beyond the range and lowered again leaves the tissue
+elsewhere than one raised from nothing: there the right answer is the one that the path led to.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from palpate.offline.fem.surface import accessible_surface
 from palpate.offline.methods.method import Case
 from palpate.offline.reduce.sampling import cone, random_points, tangents
 from palpate.offline.run.checkpoint import Checkpoint
+from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.workers import resume
 from palpate.offline.run.workshop import Load, Workshop
 from palpate.offline.validate.loads import random_loads
@@ -32,22 +33,20 @@ from palpate.shared.model import ReducedModel
 
 Array = NDArray[np.float64]
 
-STRESS = 102
-"""Sets these random numbers apart, as ``validate.loads.UNSEEN`` does those of the queries."""
-
 CONTROL, SEVERAL = "inside the range", "several equilibria"
 
 LOWERED, HYSTERESIS = "raised, then lowered", "lowered, several equilibria"
 
 FACTORS = (1.5, 2.0, 4.0, 8.0)
-"""Load jumps: pressures over the trained maximum."""
+"""Pressures over the trained maximum, reached in one jump."""
 
 RAISED, SNAPPED = (2.0, 2.0), (1.5, 4.0)
-"""The highest pressure over the trained maximum of a load that is lowered into the range again, at
-random between two: of any, and of those that are searched for several equilibria."""
+"""Least and largest peak, over the trained maximum, of loads that are lowered into the range again:
+of all of them, and of those that are searched for several equilibria."""
 
 SEARCHED = 3
-"""Of the latter, for each one wanted: about one in twenty on the turbinate stays elsewhere."""
+"""How many of the latter are tried for each one wanted: on the turbinate about one in twenty stays
+in another equilibrium."""
 
 TILTS = (45.0, 60.0)
 """Degrees."""
@@ -61,53 +60,66 @@ STEPS = (0.05, 0.5, 2.0, 10.0)
 TELEPORT = "tool teleports"
 
 WARM_UP = 4
-"""Queries on the way of a moving tool before the one that is judged."""
+"""Queries along the path of a moving tool before the one that counts."""
 
 TURNS = 20
-"""Headings tried where the surface ends; on one smaller than a step the last is taken."""
+"""Headings tried where the surface ends; if none leads on, the last is taken."""
 
 OFF = 0.5
-"""Points as far from the accessible surface (mm) count as off it."""
+"""Distance (mm) from the accessible surface at which a point counts as off it."""
 
 PATH_STEPS = 8
-"""Of a load path; of one that is lowered again half of them lead up."""
+"""Steps of a load path; of a load that is lowered again, half of them lead up."""
 
 APART = 0.01
-"""Two equilibria that differ by more are not the same."""
+"""Relative difference of displacements beyond which two equilibria are not the same."""
 
 FINEST = 0.25
-"""Part of a load in range below which a full solution gives up; others are not divided further."""
+"""Smallest load step, as a fraction, of the full model in range; out of range it takes no steps."""
 
 
 @dataclass(frozen=True)
-class Trial:
-    """A case, and what else it depends on.
+class HardCase:
+    """Steps that strain a method, and how the full model answers them.
 
     Attributes
     ----------
-    case : Case
+    steps : tuple of (Case, float)
+        Cases and the times (s) in which they are reached.
     poisson : float
         Of the tissue.
-    before : tuple of Case
-        Where the tool has been.
     follow : bool
-        Whether the full model follows the load path: from nothing, or through the loads before.
+        Whether the full model follows the load path, from nothing or through the steps before the
+        last; loads only.
+    brief : tuple of (Case, float)
+        Fewer steps to the same end, which the full model follows instead, if any; in time only.
+    end_only : bool
+        Whether only the answer to the last step counts.
+    nonsense : bool
+        Whether the right answer is to refuse.
     """
 
-    case: Case
+    steps: tuple[tuple[Case, float], ...]
     poisson: float
-    before: tuple[Case, ...] = ()
     follow: bool = False
+    brief: tuple[tuple[Case, float], ...] = ()
+    end_only: bool = False
+    nonsense: bool = False
+
+    @property
+    def last(self) -> Case:
+        """The case at the end."""
+        return self.steps[-1][0]
 
 
 @dataclass(frozen=True)
-class Truth:
-    """Full model's displacements (3 n,) mm, None where no equilibrium is found.
+class Equilibria:
+    """The full model's displacements (3 n,) mm under a load, None where it finds no equilibrium.
 
     Attributes
     ----------
     path, jump : ndarray or None
-        At the end of the load path, which is the answer that counts, and in one jump from rest.
+        At the end of the load path, which is the right answer, and in one jump from rest.
     """
 
     path: Array | None
@@ -126,8 +138,11 @@ class Truth:
         return None
 
 
-class Stressors:
-    """Makes the trials of every stressor.
+Followed = tuple[HardCase, Equilibria]
+
+
+class HardLoads:
+    """Makes the hard cases of every kind, for elastic tissue.
 
     Parameters
     ----------
@@ -135,7 +150,7 @@ class Stressors:
     workshop : Workshop
         Of the artifact's mesh.
     count : int
-        Trials of each.
+        Cases of each kind.
     seed : int
     """
 
@@ -145,8 +160,8 @@ class Stressors:
         self._poisson = self._scene.tissue.poisson
 
     @property
-    def makers(self) -> dict[str, Callable[[np.random.Generator], list[Trial]]]:
-        """What makes the trials of each stressor, by its name."""
+    def makers(self) -> dict[str, Callable[[np.random.Generator], list[HardCase]]]:
+        """What makes the cases of each kind, by its name."""
         radius = self._scene.endoscope.radius
         return {
             CONTROL: partial(self._in_tissue, self._poisson),
@@ -165,10 +180,10 @@ class Stressors:
             HYSTERESIS: partial(self._lowered, SNAPPED, SEARCHED * self._count),
         }
 
-    def trials(self) -> dict[str, list[Trial]]:
-        """Trials of every stressor by its name; of several equilibria those that may be."""
+    def cases(self) -> dict[str, list[HardCase]]:
+        """Cases of every kind by its name; of several equilibria, candidates."""
         return {
-            name: make(np.random.default_rng([self._scene.seed, STRESS, self._seed, i]))
+            name: make(stream(self._scene.seed, Stage.HARD_CASES, self._seed, i))
             for i, (name, make) in enumerate(self.makers.items())
         }
 
@@ -183,52 +198,55 @@ class Stressors:
     def _case(self, *loads: Load) -> Case:
         return Case.of(self._workshop, *loads)
 
-    def _single(self, loads: list[Load]) -> list[Trial]:
-        return [Trial(self._case(load), self._poisson) for load in loads]
+    def _through(self, *cases: Case) -> HardCase:
+        """A case that is reached through others, all at once."""
+        return HardCase(tuple((case, 0.0) for case in cases), self._poisson, end_only=True)
 
-    def _in_tissue(self, poisson: float, rng: np.random.Generator) -> list[Trial]:
-        return [Trial(self._case(load), poisson) for load in self._loads(rng)]
+    def _in_tissue(self, poisson: float, rng: np.random.Generator) -> list[HardCase]:
+        loads = self._loads(rng)
+        return [replace(self._through(self._case(load)), poisson=poisson) for load in loads]
 
-    def _raised(self, load: Load, factor: float) -> Trial:
+    def _raised(self, load: Load, factor: float) -> HardCase:
         pressure = factor * self._limit(load.position, load.direction)
-        return Trial(self._case(replace(load, pressure=pressure)), self._poisson, follow=True)
+        return replace(self._through(self._case(replace(load, pressure=pressure))), follow=True)
 
-    def _jumps(self, factor: float, rng: np.random.Generator) -> list[Trial]:
+    def _jumps(self, factor: float, rng: np.random.Generator) -> list[HardCase]:
         return [self._raised(load, factor) for load in self._loads(rng)]
 
-    def _extreme(self, rng: np.random.Generator) -> list[Trial]:
+    def _extreme(self, rng: np.random.Generator) -> list[HardCase]:
         loads = self._loads(rng)
         return [self._raised(load, rng.uniform(FACTORS[0], FACTORS[-1])) for load in loads]
 
     def _lowered(
         self, peaks: tuple[float, float], count: int, rng: np.random.Generator
-    ) -> list[Trial]:
+    ) -> list[HardCase]:
         loads = self._loads(rng, count)
         return [self._up_and_down(load, rng.uniform(*peaks)) for load in loads]
 
-    def _up_and_down(self, load: Load, factor: float) -> Trial:
+    def _up_and_down(self, load: Load, factor: float) -> HardCase:
         """A load in range that comes down from a multiple of the limit."""
         peak, half = factor * self._limit(load.position, load.direction), PATH_STEPS // 2
         turns = np.interp(
             np.arange(1, PATH_STEPS + 1), (0, half, PATH_STEPS), (0, peak, load.pressure)
         )
-        way = [replace(load, pressure=float(pressure)) for pressure in turns]
-        return replace(self._way(way), follow=True)
+        path = [self._case(replace(load, pressure=float(pressure))) for pressure in turns]
+        return replace(self._through(*path), follow=True)
 
-    def _tilted(self, tilt: float, rng: np.random.Generator) -> list[Trial]:
-        loads = []
+    def _tilted(self, tilt: float, rng: np.random.Generator) -> list[HardCase]:
+        cases = []
         for load in self._loads(rng):
             normal = self._atlas.surface.project(load.position)[1]
             direction = cone(normal, tilt, 1, rng, border=True)[0]
             pressure = self._limit(load.position, direction) * np.sqrt(rng.random())
-            loads.append(Load(load.position, direction, float(pressure)))
-        return self._single(loads)
+            tilted = Load(load.position, direction, float(pressure))
+            cases.append(self._through(self._case(tilted)))
+        return cases
 
-    def _elsewhere(self, within: bool, rng: np.random.Generator) -> list[Trial]:
+    def _elsewhere(self, within: bool, rng: np.random.Generator) -> list[HardCase]:
         """Presses other parts of the boundary, straight in."""
         surface, reach = self._boundary(), self._scene.endoscope.reach
-        trials: list[Trial] = []
-        while len(trials) < self._count:
+        cases: list[HardCase] = []
+        while len(cases) < self._count:
             point = random_points(surface, 1, rng)[0]
             _, _, distance = self._atlas.surface.project(point)
             if not (OFF < distance <= reach if within else distance > reach):
@@ -236,8 +254,8 @@ class Stressors:
             x, normal, _ = surface.project(point)
             pressure = self._limit(point, -normal) * np.sqrt(rng.random())
             load = Load(x, -normal, float(pressure))
-            trials.append(self._pressed(load, normal, self._scene.endoscope.radius))
-        return trials
+            cases.append(self._pressed(load, normal, self._scene.endoscope.radius))
+        return cases
 
     def _boundary(self) -> Surface:
         """All of the boundary that is free."""
@@ -245,31 +263,31 @@ class Stressors:
         free = np.asarray(~mesh.clamped[mesh.faces].all(axis=1))
         return accessible_surface(replace(mesh, accessible=free))
 
-    def _footprints(self, radius: float, rng: np.random.Generator) -> list[Trial]:
+    def _footprints(self, radius: float, rng: np.random.Generator) -> list[HardCase]:
         normals = self._atlas.surface.project
         return [self._pressed(x, normals(x.position)[1], radius) for x in self._loads(rng)]
 
-    def _pressed(self, load: Load, normal: Array, radius: float) -> Trial:
+    def _pressed(self, load: Load, normal: Array, radius: float) -> HardCase:
         nodal = np.zeros(len(self._workshop.mesh.nodes))
         footprint(self._workshop.body.boundary, load.position, normal, radius, nodal)
         own = None if radius == self._scene.endoscope.radius else radius
-        return Trial(Case.pressed((load,), [nodal], own), self._poisson)
+        return self._through(Case.pressed((load,), [nodal], own))
 
-    def _pairs(self, rng: np.random.Generator) -> list[Trial]:
+    def _pairs(self, rng: np.random.Generator) -> list[HardCase]:
         pairs = zip(self._loads(rng), self._loads(rng), strict=True)
-        return [Trial(self._case(*pair), self._poisson) for pair in pairs]
+        return [self._through(self._case(*pair)) for pair in pairs]
 
-    def _moves(self, step: float, rng: np.random.Generator) -> list[Trial]:
-        return [self._way(self._glide(load, step, rng)) for load in self._loads(rng)]
+    def _moves(self, step: float, rng: np.random.Generator) -> list[HardCase]:
+        return [self._moved(self._glide(load, step, rng)) for load in self._loads(rng)]
 
     def _glide(self, start: Load, step: float, rng: np.random.Generator) -> list[Load]:
         """Contacts a step apart along the surface, turning where it ends."""
-        surface, way = self._atlas.surface, [start]
+        surface, path = self._atlas.surface, [start]
         share = start.pressure / self._limit(start.position, start.direction)
         cosine = min(1.0, float(-start.direction @ surface.project(start.position)[1]))
         heading = rng.standard_normal(3)
-        while len(way) <= WARM_UP:
-            x = way[-1].position
+        while len(path) <= WARM_UP:
+            x = path[-1].position
             for wanted in (heading, *rng.standard_normal((TURNS, 3))):
                 reached, normal, _ = surface.project(
                     x + step * _along(surface.project(x)[1], wanted)
@@ -278,15 +296,14 @@ class Stressors:
                     break
             heading = _along(normal, reached - x)
             direction = np.sqrt(1 - cosine**2) * heading - cosine * normal
-            way.append(Load(reached, direction, share * self._limit(reached, direction)))
-        return way
+            path.append(Load(reached, direction, share * self._limit(reached, direction)))
+        return path
 
-    def _teleports(self, rng: np.random.Generator) -> list[Trial]:
-        return [self._way(self._loads(rng, WARM_UP + 1)) for _ in range(self._count)]
+    def _teleports(self, rng: np.random.Generator) -> list[HardCase]:
+        return [self._moved(self._loads(rng, WARM_UP + 1)) for _ in range(self._count)]
 
-    def _way(self, loads: list[Load]) -> Trial:
-        *before, last = (self._case(load) for load in loads)
-        return Trial(last, self._poisson, tuple(before))
+    def _moved(self, loads: list[Load]) -> HardCase:
+        return self._through(*(self._case(load) for load in loads))
 
 
 def _along(normal: Array, heading: Array) -> Array:
@@ -306,24 +323,29 @@ def tissue(workshop: Workshop, poisson: float) -> Workshop:
     return Workshop(scene.model_copy(update={"tissue": other}), workshop.mesh)
 
 
-def press(workshop: Workshop, trial: Trial) -> Truth:
-    """What the full model makes of a trial, on the path to it and in one jump."""
-    own = tissue(workshop, trial.poisson)
-    load = _forces(own, trial.case)
-    if not trial.follow:
+def several(pairs: Mapping[str, Sequence[Followed]], most: int) -> dict[str, list[Followed]]:
+    """Of all loads that were followed, those of several equilibria: raised, and lowered again."""
+    followed: dict[str, list[Followed]] = {}
+    for own in pairs.values():
+        for case, truth in own:
+            if case.follow:
+                kind = followed.setdefault(HYSTERESIS if len(case.steps) > 1 else SEVERAL, [])
+                kind += [(case, truth)] if truth.several else []
+    return {name: own[:most] for name, own in followed.items()}
+
+
+def equilibria(workshop: Workshop, case: HardCase) -> Equilibria:
+    """Full solutions of a hard case; a task for ``run.workers``."""
+    own = tissue(workshop, case.poisson)
+    nodes = len(own.mesh.nodes)
+    load = case.last.load(nodes)
+    if not case.follow:
         jump = _lead(own, [load], FINEST)
-        return Truth(jump, jump)
-    path = [_forces(own, case) for case in (*trial.before, trial.case)]
-    if not trial.before:
+        return Equilibria(jump, jump)
+    path = [step.load(nodes) for step, _ in case.steps]
+    if len(path) == 1:
         path = [(i + 1) / PATH_STEPS * load for i in range(PATH_STEPS)]
-    return Truth(_lead(own, path, 1.0), _lead(own, [load], 1.0))
-
-
-def _forces(workshop: Workshop, case: Case) -> Array:
-    """Nodal forces (n, 3) mN."""
-    load = np.zeros((len(workshop.mesh.nodes), 3))
-    load[case.nodes] = case.forces
-    return load
+    return Equilibria(_lead(own, path, 1.0), _lead(own, [load], 1.0))
 
 
 def _lead(workshop: Workshop, loads: Sequence[Array], finest: float) -> Array | None:
@@ -338,21 +360,22 @@ def _lead(workshop: Workshop, loads: Sequence[Array], finest: float) -> Array | 
     return None if u is None else u.ravel()
 
 
-def truths(
-    trials: Mapping[str, Sequence[Trial]], pool: Executor, checkpoint: Checkpoint
-) -> dict[str, list[Truth]]:
-    """What the full model makes of the trials of each stressor."""
-    names = {(name, i): f"{name}-{i}" for name, own in trials.items() for i in range(len(own))}
-    tasks = {text: (press, trials[name][i]) for (name, i), text in names.items()}
-    found = resume("full solutions", pool, checkpoint, tasks, _pack)
-    answers: dict[str, list[Truth]] = {name: [] for name in trials}
-    for (name, _), text in names.items():
-        answers[name].append(Truth(*(found[text].get(key) for key in KEYS)))
-    return answers
+def all_equilibria(
+    cases: Mapping[str, Sequence[HardCase]], pool: Executor, checkpoint: Checkpoint
+) -> dict[str, list[Equilibria]]:
+    """Full solutions of the cases of each kind."""
+    tasks = {
+        f"{name}-{i}": (equilibria, x) for name, own in cases.items() for i, x in enumerate(own)
+    }
 
+    def pack(found: Equilibria) -> dict[str, Array]:
+        return {key: u for key, u in vars(found).items() if u is not None}
 
-KEYS = ("path", "jump")
-
-
-def _pack(truth: Truth) -> dict[str, Array]:
-    return {key: u for key in KEYS if (u := getattr(truth, key)) is not None}
+    found = resume("full solutions", pool, checkpoint, tasks, pack)
+    return {
+        name: [
+            Equilibria(*(found[f"{name}-{i}"].get(key) for key in ("path", "jump")))
+            for i in range(len(own))
+        ]
+        for name, own in cases.items()
+    }

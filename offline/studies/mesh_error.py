@@ -13,22 +13,18 @@ fine meshes remain.
 
 from __future__ import annotations
 
-import csv
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from palpate.offline.fem.mesh import build_mesh, local_thickness
-from palpate.offline.fem.model import Equilibrium, FullModel
-from palpate.offline.fem.surface import accessible_surface
+from palpate.offline.fem.mesh import local_thickness
 from palpate.offline.reduce.sampling import spread_points
+from palpate.offline.run.workshop import Workshop
 from palpate.offline.scenes import find_scene
-from palpate.shared.geometry.quadrature import surface_quadrature
-from palpate.shared.mechanics.footprint import footprint
+from palpate.offline.studies.tables import write_csv
 from palpate.shared.scene import ElementName
 
 Array = NDArray[np.float64]
@@ -46,8 +42,7 @@ VALUES = {"hex8": 9, "hex8-mean-dilatation": 72, "hex8-fbar": 18, "hex20": 9}
 with F-bar the element's mean beside it, with mean dilatation all eight of the element."""
 
 
-@dataclass(frozen=True)
-class Discretisation:
+class Discretisation(NamedTuple):
     """How the turbinate is meshed: element, divisions and grading of a scene."""
 
     element: ElementName
@@ -57,6 +52,12 @@ class Discretisation:
     def __str__(self) -> str:
         along, through, length = self.divisions
         return f"{self.element} {along}x{through}x{length} graded {self.grading:g}"
+
+    def body(self) -> Workshop:
+        """The turbinate in this mesh."""
+        scene = find_scene("turbinate")
+        geometry = scene.geometry.model_copy(update=self._asdict())
+        return Workshop(scene.model_copy(update={"geometry": geometry}))
 
 
 REFERENCE = Discretisation("hex20", (26, 5, 26), 1.7)
@@ -77,8 +78,7 @@ CANDIDATES = (
 )
 
 
-@dataclass(frozen=True)
-class Contact:
+class Contact(NamedTuple):
     """A contact point with its outward normal, local thickness (mm) and pressure (kPa)."""
 
     position: Array
@@ -87,37 +87,19 @@ class Contact:
     pressure: float
 
 
-class Body:
-    """The turbinate in one discretisation, ready to be pressed."""
-
-    def __init__(self, how: Discretisation) -> None:
-        scene = find_scene("turbinate")
-        geometry = scene.geometry.model_copy(
-            update={"element": how.element, "divisions": how.divisions, "grading": how.grading}
-        )
-        scene = scene.model_copy(update={"geometry": geometry})
-        self.seed, self.radius = scene.seed, scene.endoscope.radius
-        self.mesh = build_mesh(scene)
-        self.model = FullModel.of(scene, self.mesh)
-        self._quadrature = surface_quadrature(self.mesh.nodes, self.mesh.faces)
-        self._nodal = np.empty(len(self.mesh.nodes))
-
-    def press(
-        self, position: Array, normal: Array, pressure: float, start: Array | None = None
-    ) -> tuple[float, float, Equilibrium]:
-        """Press straight in: largest displacement, mean one under the footprint (mm), state."""
-        area = footprint(self._quadrature, position, normal, self.radius, self._nodal)
-        state = self.model.solve(-pressure * np.outer(self._nodal, normal), start)
-        largest = float(np.linalg.norm(state.displacement, axis=1).max())
-        under = float(np.linalg.norm(self._nodal @ state.displacement)) / area
-        return largest, under, state
+def press(
+    body: Workshop, position: Array, normal: Array, pressure: float, start: Array | None = None
+) -> tuple[float, float, Array]:
+    """Press straight in: largest displacement, mean under the footprint (mm), and all (n, 3)."""
+    nodal = body.unit_load_at(position, normal)
+    u = body.model.solve(-pressure * np.outer(nodal, normal), start).displacement
+    return np.linalg.norm(u, axis=1).max(), np.linalg.norm(nodal @ u) / nodal.sum(), u
 
 
-def contacts(reference: Body, probe: Body) -> list[Contact]:
+def contacts(reference: Workshop, probe: Workshop) -> list[Contact]:
     """Contact points all over the reference's surface, with the pressures that ``probe`` needs."""
-    surface = accessible_surface(reference.mesh)
-    found = []
-    for point in spread_points(surface, POINTS, np.random.default_rng(reference.seed)):
+    surface, found = reference.surface, []
+    for point in spread_points(surface, POINTS, np.random.default_rng(reference.scene.seed)):
         position, normal, _ = surface.project(point)
         (thickness,) = local_thickness(reference.mesh, position[None], normal[None])
         pressure = _pressure(probe, position, normal, INDENTATION * thickness)
@@ -126,7 +108,7 @@ def contacts(reference: Body, probe: Body) -> list[Contact]:
 
 
 def _pressure(
-    body: Body, position: Array, normal: Array, target: float, step: float = 0.5
+    body: Workshop, position: Array, normal: Array, target: float, step: float = 0.5
 ) -> float:
     """Pressure (kPa) that first moves the footprint by ``target`` (mm), along the load path."""
     before, pressure, under, start = 0.0, 0.0, 0.0, None
@@ -134,14 +116,8 @@ def _pressure(
         if pressure == MAX_PRESSURE:
             return pressure
         before, pressure = under, pressure + step
-        _, under, state = body.press(position, normal, pressure, start)
-        start = state.displacement
+        _, under, start = press(body, position, normal, pressure, start)
     return pressure - step * (under - target) / (under - before)
-
-
-def displacements(body: Body, loads: list[Contact]) -> Array:
-    """Largest displacement and mean one under the footprint, shape (loads, 2) mm."""
-    return np.array([body.press(x.position, x.normal, x.pressure)[:2] for x in loads])
 
 
 def mesh_error(report: Path) -> dict[str, Any]:
@@ -159,53 +135,36 @@ def mesh_error(report: Path) -> dict[str, Any]:
         Per mesh: ``dofs``, ``points`` of quadrature, ``values`` that a cubature samples at once,
         and of the errors (fractions) of either displacement the least, mean and greatest.
     """
-    reference = Body(REFERENCE)
-    loads = contacts(reference, Body(PROBE))
-    exact = displacements(reference, loads)
+    reference = REFERENCE.body()
+    loads = contacts(reference, PROBE.body())
+    exact = np.empty(0)
     rows: dict[str, dict[str, Any]] = {}
     errors: dict[str, Array] = {}
     for how in tqdm((REFERENCE, *SECOND_OPINIONS, *CANDIDATES), desc="meshes"):
-        body = reference if how == REFERENCE else Body(how)
-        moved = exact if body is reference else displacements(body, loads)
+        body = how.body()
+        moved = np.array([press(body, x.position, x.normal, x.pressure)[:2] for x in loads])
+        exact = moved if how is REFERENCE else exact
         error = errors[str(how)] = moved / exact - 1
-        row = rows[str(how)] = {
+        rows[str(how)] = {
             "dofs": body.mesh.nodes.size,
             "points": 8 * len(body.mesh.elements),
             "values": VALUES[how.element],
+        } | {
+            f"{name}_{key}": float(of(column))
+            for name, column in zip(("largest", "under_footprint"), error.T, strict=True)
+            for key, of in (("least", np.min), ("mean", np.mean), ("greatest", np.max))
         }
-        for name, column in zip(("largest", "under_footprint"), error.T, strict=True):
-            row[f"{name}_least"] = float(column.min())
-            row[f"{name}_mean"] = float(column.mean())
-            row[f"{name}_greatest"] = float(column.max())
-    report.mkdir(parents=True, exist_ok=True)
-    _write(report / "mesh_error.csv", [{"mesh": name} | row for name, row in rows.items()])
-    _write(report / "mesh_error_points.csv", _point_rows(loads, exact, errors))
-    _draw(report / "mesh_error.png", errors)
-    return dict(rows)
-
-
-def _point_rows(
-    loads: list[Contact], exact: Array, errors: dict[str, Array]
-) -> list[dict[str, Any]]:
-    return [
-        {
-            **dict(zip(("x_mm", "y_mm", "z_mm"), load.position.tolist(), strict=True)),
-            "thickness_mm": load.thickness,
-            "pressure_kPa": load.pressure,
-            "largest_mm": exact[i, 0],
-            "under_footprint_mm": exact[i, 1],
-        }
+    write_csv(report / "mesh_error.csv", [{"mesh": name} | row for name, row in rows.items()])
+    points = [
+        dict(zip(("x_mm", "y_mm", "z_mm"), load.position.tolist(), strict=True))
+        | {"thickness_mm": load.thickness, "pressure_kPa": load.pressure}
+        | {"largest_mm": exact[i, 0], "under_footprint_mm": exact[i, 1]}
         | {name: error[i, 0] for name, error in errors.items()}
         for i, load in enumerate(loads)
     ]
-
-
-def _write(path: Path, rows: list[dict[str, Any]]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items()})
+    write_csv(report / "mesh_error_points.csv", points)
+    _draw(report / "mesh_error.png", errors)
+    return dict(rows)
 
 
 def _draw(path: Path, errors: dict[str, Array]) -> None:

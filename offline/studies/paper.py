@@ -10,20 +10,27 @@ The three methods, on the full quadrature of the mesh as in the paper:
 - RITZ: load-dependent Ritz vectors of the one load (Wilson's sequence);
 - POD: main directions of snapshots along the load's path, in the energy of the rest state.
 
-Errors are taken at loads half-way between the snapshots' own.  Times are those of solves from rest,
-full and reduced in turns, so that they share the weather.  What differs from the paper:
+Errors are taken at loads half-way between those of the snapshots.  Times are those of solves from
+rest, full and reduced alternating, so that both meet the same speed of the machine.  What differs
+from the paper:
 
 - The cube: the paper does not give its size, mesh or load.  Here a dead pressure covers its whole
   top, which is free to move sideways, so that it would sway beyond ``pi^2 E / 48`` = 3.1 kPa (a
   clamped column); the load ends well before, at 13 % of its height.  P is the top's centre.
 - The turbinate: our own section and mesh; the pressure is a round footprint's.  P lies under it.
-- Tissue is elastic without time: the path is a curve in one parameter, and a handful of POD bases
-  hold it to within the reduced solver's tolerance.  For tissue with time see ``paper_in_time``.
+- Elastic tissue follows a curve in one parameter, and a handful of POD bases hold it to within the
+  reduced solver's tolerance.
+
+Tissue that knows time is pressed, held, let go, and rests.  Full and reduced models take the same
+time steps, each from its own past, and times are those of steps.  POD learns from one history and
+is asked another: less pressure, and slower.  Errors are relative L2 norms over all moments, since
+at the end there is nothing left to be relative to; the largest is that of a moment, over the
+largest value in the history.  On the cube the relaxed tissue is softer and would sway under less:
+the pressure is smaller by the share of the shear modulus that is lost.
 """
 
 from __future__ import annotations
 
-import csv
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,16 +39,23 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import spearmanr
 from tqdm import tqdm
 
 from palpate.offline.methods.full import Full
-from palpate.offline.methods.galerkin import Cubature, Galerkin
-from palpate.offline.methods.method import Answer, Case
+from palpate.offline.methods.galerkin import Galerkin, GalerkinInTime
+from palpate.offline.methods.method import Case, Method
 from palpate.offline.methods.spaces import krylov, mass, modal, pod
 from palpate.offline.run.workshop import Workshop
 from palpate.offline.scenes import find_scene
 from palpate.offline.studies import paper_pictures
+from palpate.offline.studies.paper_claims import (
+    FieldErrors,
+    claims_of_figure_1,
+    claims_of_figure_2,
+)
+from palpate.offline.studies.references import Fields
+from palpate.offline.studies.relaxation import Phases, load_steps
+from palpate.offline.studies.tables import write_csv
 from palpate.offline.validate.norms import relative
 from palpate.shared.geometry.quadrature import surface_quadrature
 
@@ -49,7 +63,7 @@ Array = NDArray[np.float64]
 
 SNAPSHOTS = 20
 ROUNDS = 3
-"""How often every load is solved for the clock."""
+"""How often every step is timed."""
 
 SIZES = (1, 2, 3, 4, 5, 7, 10, 15, 20, 30)
 """Numbers of bases; POD ends where its snapshots have no more to give."""
@@ -57,18 +71,22 @@ SIZES = (1, 2, 3, 4, 5, 7, 10, 15, 20, 30)
 CONTOUR_BASES = 5
 """Of the paper's figures 2c and 2d."""
 
-ACCURACIES = (0.01, 0.001)
-"""Errors at P at which the methods' times are compared."""
-
-MARGIN = 1.25
-"""Factor by which ratios of CPU times must differ to be told apart on a busy machine."""
-
 POLISH = 4
-"""Newton steps from the answer of the reduced solver: enough for round-off."""
+"""Newton steps after the reduced solver's answer: enough to reach round-off."""
 
 CUBE_PRESSURE = 2.5  # kPa
 MEDIAL = (10.0, 20.0, 11.0)
 """In the middle of the turbinate's medial side, mm."""
+
+TRAINING: Phases = ((0.2, 10, 1.0), (2.0, 14, 1.0), (0.1, 5, 0.0), (2.0, 14, 0.0))
+QUERY: Phases = ((0.3, 10, 0.9), (1.5, 14, 0.9), (0.15, 5, 0.0), (1.5, 14, 0.0))
+"""Press, hold, release, rest: what POD is trained on, and what all methods answer, in time."""
+
+HELD = 23
+"""Step of both at whose end the load has been held."""
+
+EXACT = 1e-6
+"""Tolerance of the reduced solver in time where fields are looked at."""
 
 
 @dataclass(frozen=True)
@@ -106,27 +124,39 @@ class Example:
         load = -pressure * areas[:, None] * normal
         return cls(workshop.scene.name, workshop, load, pressure, at, point)
 
-    def case(self, factor: float) -> Case:
+    def case(self, share: float) -> Case:
         """A share of the load, for a method to answer."""
         nodes = np.flatnonzero(self.load.any(axis=1))
-        return Case((), nodes, factor * self.load[nodes])
+        return Case((), nodes, share * self.load[nodes])
+
+    @property
+    def in_time(self) -> bool:
+        """Whether the tissue knows time."""
+        return bool(self.workshop.model.prony)
+
+    def training(self) -> list[tuple[Case, float]]:
+        """The history that POD learns from, cases with times (s)."""
+        if self.in_time:
+            return [(self.case(share), dt) for dt, share in load_steps(TRAINING)]
+        return [(self.case(i / SNAPSHOTS), 0.0) for i in range(1, SNAPSHOTS + 1)]
+
+    def queries(self) -> list[list[tuple[Case, float]]]:
+        """The histories that methods are asked; of elastic tissue single loads."""
+        if self.in_time:
+            return [[(self.case(share), dt) for dt, share in load_steps(QUERY)]]
+        return [[(self.case(share), 0.0)] for share in self.shares()]
+
+    @staticmethod
+    def shares() -> list[float]:
+        """Shares of the load at which elastic tissue is asked, half-way between snapshots."""
+        return [(i - 0.5) / SNAPSHOTS for i in range(1, SNAPSHOTS + 1)]
 
 
-@dataclass(frozen=True)
-class Trial:
-    """What a method of one size makes of k loads."""
-
-    method: str
-    bases: int
-    displacements: Array  # (k, n, 3) mm
-    seconds: float  # median
-    unconverged: int
-
-
-def cube(report: Path) -> dict[str, Any]:
-    """Figure 1: the cube under compression; see ``compare``."""
-    workshop = Workshop(find_scene("cube"))
-    return compare(covered(workshop, CUBE_PRESSURE), report)
+def cube(scene: str, report: Path) -> dict[str, Any]:
+    """Figure 1: the cube of a scene under compression; see ``compare``."""
+    workshop = Workshop(find_scene(scene))
+    left = 1.0 - sum(share for share, _ in workshop.model.prony)
+    return compare(covered(workshop, left * CUBE_PRESSURE), report)
 
 
 def covered(workshop: Workshop, pressure: float) -> Example:
@@ -138,11 +168,13 @@ def covered(workshop: Workshop, pressure: float) -> Example:
     return Example.pressed(workshop, areas, top.normals[0], pressure, top.points.mean(axis=0))
 
 
-def turbinate(report: Path) -> dict[str, Any]:
-    """Figure 1 for the turbinate under a footprint, and figures 2c and 2d; see ``compare``."""
-    paper_pictures.require_pyvista()
-    example = footprint(Workshop(find_scene("turbinate")), MEDIAL)
-    return compare(example, report, contours=True)
+def turbinate(scene: str, report: Path) -> dict[str, Any]:
+    """Figure 1 for the turbinate of a scene under a footprint, and of elastic tissue 2c and 2d."""
+    found = find_scene(scene)
+    contours = not found.tissue.prony
+    if contours:
+        paper_pictures.require_pyvista()
+    return compare(footprint(Workshop(found), MEDIAL), report, contours=contours)
 
 
 def footprint(workshop: Workshop, position: Sequence[float]) -> Example:
@@ -156,9 +188,9 @@ def footprint(workshop: Workshop, position: Sequence[float]) -> Example:
 
 
 def compare(
-    example: Example, report: Path, sizes: Sequence[int] = SIZES, contours: bool = False
+    example: Example, report: Path, sizes: Sequence[int] | None = None, contours: bool = False
 ) -> dict[str, Any]:
-    """Errors and times of the three methods, and what becomes of the paper's claims.
+    """Errors and times of the three methods, and whether the paper's claims hold.
 
     Parameters
     ----------
@@ -166,8 +198,8 @@ def compare(
     report : Path
         Folder to write ``paper_NAME.csv`` (a row per method and number of bases) and
         ``paper_NAME.png`` (figures 1a and 1b) to.
-    sizes : sequence of int
-        Numbers of bases.
+    sizes : sequence of int, optional
+        Numbers of bases; ``SIZES`` if absent.
     contours : bool
         Whether to draw ``paper_NAME_contours.png`` (figures 2c and 2d) too.
 
@@ -175,35 +207,24 @@ def compare(
     -------
     dict
         ``load``; ``figure_1``: per method and number of bases what the table holds; ``claims``, see
-        ``claims_of_figure_1`` and ``claims_of_figure_2``; ``claims_with_fewer_bases``: the latter
-        by number of bases.
+        ``claims_of_figure_1`` and ``claims_of_figure_2``, in time of the moment when the load has
+        been held; ``claims_with_fewer_bases``: the latter by number of bases, of elastic tissue.
     """
-    known = snapshots(example)
-    rows = measure(example, known, sizes)
-    fields = {size: field_errors(example, known, size) for size in range(1, CONTOUR_BASES + 1)}
-    moved = float(np.linalg.norm(known[-1, example.point]))
-    title = f"{example.name}, pressed with up to {example.pressure:.1f} kPa: P moves {moved:.1f} mm"
-    figure = publish_figure_1(example, rows, moved, title, report)
+    training = snapshots(example)
+    rows = measure(example, training, sizes or SIZES)
+    fewest = CONTOUR_BASES if example.in_time else 1
+    fields = {m: field_errors(example, training, m) for m in range(fewest, CONTOUR_BASES + 1)}
+    moved = float(np.linalg.norm(training[:, example.point], axis=1).max())
+    title = f"{example.name}, pressed with up to {example.pressure:.3g} kPa"
+    title += f"{', held and let go' if example.in_time else ''}: P moves {moved:.1f} mm"
+    write_csv(report / f"paper_{example.name}.csv", rows)
+    paper_pictures.chart(report / f"paper_{example.name}.png", rows, title)
     if contours:
         path = report / f"paper_{example.name}_contours.png"
         errors = fields[CONTOUR_BASES].contours
         radius = example.workshop.scene.endoscope.radius
         paper_pictures.contours(path, example.workshop.mesh, errors, example.at, radius)
-    return figure | {
-        "claims": claims_of_figure_1(rows) | claims_of_figure_2(fields[CONTOUR_BASES]),
-        "claims_with_fewer_bases": {
-            str(size): claims_of_figure_2(fields[size]) for size in range(1, CONTOUR_BASES)
-        },
-    }
-
-
-def publish_figure_1(
-    example: Example, rows: list[dict[str, Any]], moved: float, title: str, report: Path
-) -> dict[str, Any]:
-    """Write table and chart, and say what was pressed how far (mm) and found."""
-    report.mkdir(parents=True, exist_ok=True)
-    _write(report / f"paper_{example.name}.csv", rows)
-    paper_pictures.chart(report / f"paper_{example.name}.png", rows, title)
+    claims = {size: claims_of_figure_2(own) for size, own in fields.items()}
     return {
         "load": {
             "pressure_kPa": example.pressure,
@@ -211,229 +232,131 @@ def publish_figure_1(
             "P_moves_mm": moved,
         },
         "figure_1": {f"{row['method']} {row['bases']}": row for row in rows},
+        "claims": claims_of_figure_1(rows) | claims.pop(CONTOUR_BASES),
+        "claims_with_fewer_bases": {str(size): own for size, own in claims.items()},
     }
 
 
-def factors() -> tuple[Array, Array]:
-    """Shares of the load: those of the snapshots, and those half-way between, to be judged at."""
-    steps = np.arange(1, SNAPSHOTS + 1)
-    return steps / SNAPSHOTS, (steps - 0.5) / SNAPSHOTS
-
-
 def snapshots(example: Example) -> Array:
-    """Full solutions along the load's path, (SNAPSHOTS, n, 3) mm, each from the last."""
-    found: list[Array] = []
-    for factor in tqdm(factors()[0], desc="snapshots"):
-        start = found[-1] if found else None
-        state = example.workshop.model.solve(factor * example.load, start)
-        found.append(state.displacement)
-    return np.array(found)
+    """Full solutions (t, n, 3) mm of the history that POD learns from."""
+    full = Full(example.workshop)
+    states = full.follow(tqdm(example.training(), desc="snapshots"))
+    return np.array([full.displacement(state) for state in states])
 
 
-def spaces(example: Example, known: Array, size: int) -> dict[str, Array]:
+def spaces(example: Example, training: Array, size: int) -> dict[str, Array]:
     """Bases of the three methods, (free dofs, <= size), nested."""
     model = example.workshop.model
     load = example.load.reshape(-1, 1)[model.free]
     return {
         "MOD": modal(model, size),
         "RITZ": krylov(model, mass(model), load, size),
-        "POD": pod(model, known.reshape(len(known), -1), size),
+        "POD": pod(model, training.reshape(len(training), -1), size),
     }
 
 
-def measure(example: Example, known: Array, sizes: Sequence[int]) -> list[dict[str, Any]]:
+def measure(example: Example, training: Array, sizes: Sequence[int]) -> list[dict[str, Any]]:
     """Rows of the table: a method and number of bases each."""
-    model = example.workshop.model
-    everything = Cubature.full(model)
-    methods: dict[tuple[str, int], Full | Galerkin] = {("full", len(model.free)): Full(model)}
-    for name, basis in spaces(example, known, max(sizes)).items():
+    kind = GalerkinInTime if example.in_time else Galerkin
+    methods: dict[tuple[str, int], Method] = {("full", 0): Full(example.workshop)}
+    for name, basis in spaces(example, training, max(sizes)).items():
         for size in sizes:
             if size <= basis.shape[1]:
-                modes = np.ascontiguousarray(basis[:, :size])
-                methods[name, size] = Galerkin(name, str(size), model, modes, everything)
-    full, *trials = _in_turns(example, methods)
-    return [_row(example, trial, full) for trial in trials]
-
-
-def _in_turns(example: Example, methods: dict[tuple[str, int], Full | Galerkin]) -> list[Trial]:
-    """Every method's answers to the loads that are judged at, one load after the other."""
-    first = example.case(factors()[1][0])
-    answers: dict[tuple[str, int], dict[float, Answer]] = {key: {} for key in methods}
-    seconds: dict[tuple[str, int], list[float]] = {key: [] for key in methods}
-    for method in methods.values():
-        method.solve(first)  # compiled code comes in from disk
-    for factor in tqdm(np.tile(factors()[1], ROUNDS), desc="full and reduced solves"):
-        case = example.case(factor)
-        for key, method in methods.items():
-            started = time.perf_counter()
-            answers[key][factor] = method.solve(case)
-            seconds[key].append(time.perf_counter() - started)
+                methods[name, size] = kind(example.workshop, basis[:, :size].copy())
+    full, *others = _in_turns(example, list(methods.values()))
     return [
-        Trial(
-            *key,
-            np.array([method.displacement(answer) for answer in answers[key].values()]),
-            float(np.median(seconds[key])),
-            sum(not answer.converged for answer in answers[key].values()),
-        )
-        for key, method in methods.items()
+        {"method": name, "bases": size} | _errors(example, found, full)
+        for (name, size), found in zip(list(methods)[1:], others, strict=True)
     ]
-
-
-def _row(example: Example, trial: Trial, full: Trial) -> dict[str, Any]:
-    workshop, P = example.workshop, example.point
-    pairs = list(zip(trial.displacements, full.displacements, strict=True))
-    at_point = [relative(u[P], exact[P]) for u, exact in pairs]
-    whole = np.array([workshop.errors(u, exact) for u, exact in pairs])
-    return {
-        "method": trial.method,
-        "bases": trial.bases,
-        "error_at_P_mean": float(np.mean(at_point)),
-        "error_at_P_max": float(np.max(at_point)),
-        "displacement_error_mean": float(whole[:, 0].mean()),
-        "von_mises_error_mean": float(whole[:, 1].mean()),
-        "full_ms": 1e3 * full.seconds,
-        "reduced_ms": 1e3 * trial.seconds,
-        "cpu_ratio": full.seconds / trial.seconds,
-        "unconverged": trial.unconverged,
-    }
-
-
-def _write(path: Path, rows: list[dict[str, Any]]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items()})
-
-
-def claims_of_figure_1(rows: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Whether POD is the most accurate and the fastest, in numbers.
-
-    Returns
-    -------
-    dict
-        ``pod_least_error``: numbers of bases ``compared``, and at how many of them POD has the
-        least error at P and over the whole field of stress; it holds if at all of them.
-        ``pod_best_cpu_ratio``: at how many of them its ratio is best, and the median of its ratio
-        over the best other; ``at_accuracy``: each method's ratio with the fewest bases whose error
-        at P is within each of ``ACCURACIES``, None where none is.  It holds if POD's is best by
-        ``MARGIN`` at each of those.
-    """
-    by_size: dict[int, dict[str, dict[str, Any]]] = {}
-    for row in rows:
-        by_size.setdefault(row["bases"], {})[row["method"]] = row
-    common = [methods for methods in by_size.values() if "POD" in methods]
-    advantage = [_ratio_over_others(methods) for methods in common]
-    least = {
-        key: sum(min(methods, key=lambda name: methods[name][key]) == "POD" for methods in common)
-        for key in ("error_at_P_mean", "von_mises_error_mean")
-    }
-    ratios = {
-        f"{accuracy:g}": {
-            name: _ratio_at_accuracy(rows, name, accuracy) for name in ("MOD", "RITZ", "POD")
-        }
-        for accuracy in ACCURACIES
-    }
-    return {
-        "pod_least_error": {
-            "holds": set(least.values()) == {len(common)},
-            "compared": len(common),
-            "least_at_P": least["error_at_P_mean"],
-            "least_in_stress": least["von_mises_error_mean"],
-        },
-        "pod_best_cpu_ratio": {
-            "holds": all(
-                (best["POD"] or 0.0) > MARGIN * max(best["MOD"] or 0.0, best["RITZ"] or 0.0)
-                for best in ratios.values()
-            ),
-            "compared": len(common),
-            "best_at_equal_bases": sum(over > 1 for over in advantage),
-            "over_best_other_at_equal_bases": float(np.median(advantage)),
-            "at_accuracy": ratios,
-        },
-    }
-
-
-def _ratio_over_others(methods: dict[str, dict[str, Any]]) -> float:
-    """CPU ratio of POD over the best of the others that answer at all, as RITZ does."""
-    others = [
-        row["cpu_ratio"]
-        for name, row in methods.items()
-        if name != "POD" and row["error_at_P_mean"] < paper_pictures.NO_ANSWER
-    ]
-    return float(methods["POD"]["cpu_ratio"] / max(others))
-
-
-def _ratio_at_accuracy(rows: list[dict[str, Any]], method: str, accuracy: float) -> float | None:
-    """CPU ratio with the fewest bases that are accurate enough."""
-    accurate = [
-        row for row in rows if row["method"] == method and row["error_at_P_mean"] <= accuracy
-    ]
-    return float(accurate[0]["cpu_ratio"]) if accurate else None
-
-
-# --- figures 2c and 2d ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class FieldErrors:
-    """Values (n,) of the full model and relative errors (n,) of a reduced one, node by node.
+class Timed:
+    """A method's fields in every history, median time (s) of a step, and steps without answer."""
 
-    Attributes
-    ----------
-    displacement, von_mises : tuple of ndarray
-        Value (mm, kPa) and relative error; nan where the value is zero.
-    near_support : ndarray, bool
-        Nodes of an element that touches it.
-    """
+    fields: list[Fields]
+    seconds: float
+    unconverged: int
 
-    displacement: tuple[Array, Array]
-    von_mises: tuple[Array, Array]
-    near_support: NDArray[np.bool_]
 
-    @classmethod
-    def of(
-        cls, workshop: Workshop, reduced: tuple[Array, Array], full: tuple[Array, Array]
-    ) -> FieldErrors:
-        """Of displacements (n, 3) and von Mises stresses (n,)."""
-        (u, found), (exact, stress) = reduced, full
-        moved = np.linalg.norm(exact, axis=1)
-        return cls(
-            (moved, _over(np.linalg.norm(u - exact, axis=1), moved)),
-            (stress, _over(np.abs(found - stress), stress)),
-            ~workshop.beyond_clamped_layer,
+def _in_turns(example: Example, methods: Sequence[Method]) -> list[Timed]:
+    """Answers of the methods to all histories, one step after the other."""
+    histories = example.queries()
+    seconds: list[list[float]] = [[] for _ in methods]
+    missed = [0] * len(methods)
+    for method in methods:  # compiled code comes in from disk
+        method.solve(histories[0][0][0])
+    for _ in tqdm(range(ROUNDS), desc="full and reduced solves"):
+        states: list[list[list[Any]]] = [[] for _ in methods]
+        for history in histories:
+            for method, own in zip(methods, states, strict=True):
+                own.append([method.at_rest()])
+            for case, dt in history:
+                for i, method in enumerate(methods):
+                    started = time.perf_counter()
+                    answer = method.step(states[i][-1][-1], case, dt)
+                    seconds[i].append(time.perf_counter() - started)
+                    missed[i] += not answer.converged
+                    states[i][-1].append(answer.state)
+    return [
+        Timed(
+            [Fields.of(method, history[1:]) for history in own],
+            float(np.median(times)),
+            count // ROUNDS,
         )
-
-    @property
-    def contours(self) -> dict[str, Array]:
-        """Errors by what the pictures call them."""
-        return {"displacement": self.displacement[1], "von Mises stress": self.von_mises[1]}
+        for method, own, times, count in zip(methods, states, seconds, missed, strict=True)
+    ]
 
 
-def field_errors(example: Example, known: Array, bases: int) -> FieldErrors:
-    """Errors in POD bases at the greatest load that is not a snapshot.
+def _errors(example: Example, found: Timed, full: Timed) -> dict[str, Any]:
+    """Columns of the table; means and maxima are over histories."""
+    workshop, P = example.workshop, example.point
+    pairs = list(zip(found.fields, full.fields, strict=True))
+    points = [(own.displacements[:, P], exact.displacements[:, P]) for own, exact in pairs]
+    worst = [
+        np.linalg.norm(u - exact, axis=1).max() / np.linalg.norm(exact, axis=1).max()
+        for u, exact in points
+    ]
+    whole = np.array([own.errors(workshop, exact) for own, exact in pairs])
+    return {
+        "error_at_P_mean": float(np.mean([relative(*pair) for pair in points])),
+        "error_at_P_max": float(np.max(worst)),
+        "displacement_error_mean": float(whole[:, 0].mean()),
+        "von_mises_error_mean": float(whole[:, 1].mean()),
+        "full_ms": 1e3 * full.seconds,
+        "reduced_ms": 1e3 * found.seconds,
+        "cpu_ratio": full.seconds / found.seconds,
+        "unconverged": found.unconverged,
+    }
 
-    The reduced equilibrium is polished, so that the error is that of the bases and no solver's.
+
+def field_errors(example: Example, training: Array, bases: int) -> FieldErrors:
+    """Errors in POD bases: when the load has been held, or at the greatest load that is asked.
+
+    They are those of the bases and not of the reduced solver, whose answer is polished.
     """
-    workshop, model = example.workshop, example.workshop.model
-    basis = pod(model, known.reshape(len(known), -1), bases)
-    factor = factors()[1][-1]
-    answer = Galerkin("POD", "", model, basis, Cubature.full(model)).solve(example.case(factor))
-    u = polished(example, basis, answer.state[: basis.shape[1]], factor)
-    exact = model.solve(factor * example.load, known[-1]).displacement
-    fields = [(x, workshop.von_mises(x)) for x in (u, exact)]
+    workshop = example.workshop
+    basis = pod(workshop.model, training.reshape(len(training), -1), bases)
+    full = Full(workshop)
+    if example.in_time:
+        steps = example.queries()[0][: HELD + 1]
+        fields = [
+            Fields.of(method, method.follow(steps)[-1:])
+            for method in (GalerkinInTime(workshop, basis, EXACT), full)
+        ]
+    else:
+        share = example.shares()[-1]
+        found, exact = (x.solve(example.case(share)) for x in (Galerkin(workshop, basis), full))
+        u = polished(example, basis, found.state[: basis.shape[1]], share)
+        stress = workshop.von_mises(u)
+        fields = [Fields(u[None], stress[None]), Fields.of(full, [exact.state])]
     return FieldErrors.of(workshop, *fields)
 
 
-def _over(error: Array, value: Array) -> Array:
-    """Relative error, nan where there is nothing to approximate."""
-    return np.divide(error, value, out=np.full_like(value, np.nan), where=value > 0)
-
-
-def polished(example: Example, basis: Array, q: Array, factor: float) -> Array:
+def polished(example: Example, basis: Array, q: Array, share: float) -> Array:
     """Displacement (n, 3) mm, ``POLISH`` Newton steps (the paper's equation 2) after ``q``."""
     model = example.workshop.model
-    load = factor * example.load.ravel()[model.free]
+    load = share * example.load.ravel()[model.free]
     u, force = np.zeros(example.load.size), np.zeros(example.load.size)
     for _ in range(POLISH):
         u[model.free] = basis @ q
@@ -443,49 +366,3 @@ def polished(example: Example, basis: Array, q: Array, factor: float) -> Array:
         q = q - np.linalg.solve(tangent, residual)
     u[model.free] = basis @ q
     return u.reshape(-1, 3)
-
-
-def claims_of_figure_2(errors: FieldErrors) -> dict[str, dict[str, Any]]:
-    """Where the errors are largest, in numbers.
-
-    Returns
-    -------
-    dict
-        ``error_largest_where_value_smallest``, for displacement and stress: median relative errors
-        of the tenth of nodes with the least and with the greatest values, and the rank correlation
-        of value and error; it holds if no other tenth has a larger median than the first.
-        ``stress_best_near_support``: medians near the support and elsewhere, and whether the
-        largest stress is near it, as the paper says too.
-    """
-    smallest = {
-        name: _tenths(*pair)
-        for name, pair in (("displacement", errors.displacement), ("von_mises", errors.von_mises))
-    }
-    stress, error = errors.von_mises
-    near, elsewhere = (
-        float(np.nanmedian(error[where])) for where in (errors.near_support, ~errors.near_support)
-    )
-    return {
-        "error_largest_where_value_smallest": {
-            "holds": all(found["holds"] for found in smallest.values())
-        }
-        | smallest,
-        "stress_best_near_support": {
-            "holds": near < elsewhere,
-            "near": near,
-            "elsewhere": elsewhere,
-            "largest_stress_is_near": bool(errors.near_support[np.argmax(stress)]),
-        },
-    }
-
-
-def _tenths(value: Array, error: Array) -> dict[str, Any]:
-    known = np.isfinite(error)
-    value, error = value[known], error[known]
-    medians = [float(np.median(error[part])) for part in np.array_split(np.argsort(value), 10)]
-    return {
-        "holds": medians[0] == max(medians),
-        "least_values": medians[0],
-        "greatest_values": medians[-1],
-        "rank_correlation": float(spearmanr(value, error).statistic),
-    }

@@ -1,8 +1,7 @@
-"""Press, hold, release: what an examiner's hand would feel and see, of both models."""
+"""Press, hold, release: the depth of the dent and the force over time, of both models."""
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from palpate.offline.methods.full import Full
+from palpate.offline.methods.method import Case
+from palpate.offline.methods.shipped import ShippedInTime
 from palpate.offline.run.workshop import Load, Workshop
-from palpate.offline.validate.histories import Press, play
+from palpate.offline.studies.tables import write_csv
 from palpate.shared.artifact import read_artifact
 from palpate.shared.errors import QueryError
 from palpate.shared.model import ReducedModel
@@ -23,7 +25,7 @@ PRESSED = 0.8
 """Pressure over its limit."""
 
 Phases = Sequence[tuple[float, int, float]]
-"""Of a course: seconds, steps, and the share of the load at the end."""
+"""Seconds, steps, and the share of the load at the end of each phase of a history."""
 
 PHASES = ((0.2, 10, 1.0), (4.0, 40, 1.0), (0.1, 5, 0.0), (4.0, 40, 0.0))
 """Press, hold, release, rest."""
@@ -38,13 +40,13 @@ def relaxation(artifact: Path, position: Array | None = None) -> dict[str, Any]:
     ----------
     artifact : Path
     position : ndarray, shape (3,), mm, optional
-        Amid the surface if absent.
+        The middle of the surface if absent.
 
     Returns
     -------
     dict
-        Depths (mm) at once and after the hold, what is left of the dent after the rest, largest
-        difference of the two models' depths, and median times of a step (µs).
+        Depths (mm) at once and after the hold, the depth left after the rest, the largest
+        difference of the two models' depths, and the median time of a step (µs).
     """
     atlas = ReducedModel.load(artifact)
     if atlas.models.viscous is None:
@@ -54,55 +56,46 @@ def relaxation(artifact: Path, position: Array | None = None) -> dict[str, Any]:
     if position is None:
         position = vertices[((vertices - vertices.mean(axis=0)) ** 2).sum(axis=1).argmin()]
     x, normal, _, fields = atlas.surface.locate(position, atlas.limits)
-    presses = [
-        Press(dt, x, -normal, share * PRESSED * float(fields[0])) for dt, share in course(PHASES)
+    pressure = PRESSED * float(fields[0])
+    steps = [
+        (Case.of(workshop, Load(x, -normal, share * pressure)), dt)
+        for dt, share in load_steps(PHASES)
     ]
-    play(atlas, presses[:2])  # compiles
-    moments = play(atlas, presses)
-    force = np.array([np.linalg.norm(moment.force) for moment in moments])
-    reduced = np.array([-moment.contact_displacement @ normal for moment in moments])
-    full = _full_depth(workshop, presses, normal)
-    times = np.cumsum([press.dt for press in presses])
-    report = artifact.parent / artifact.stem / "report"
-    report.mkdir(parents=True, exist_ok=True)
-    _write(report / "relaxation.csv", times, force, full, reduced)
-    _draw(report / "relaxation.png", times, force, full, reduced)
-    pressed, held, released = (np.cumsum([steps for _, steps, _ in PHASES]) - 1)[[0, 1, 3]]
+    reduced, full = ShippedInTime(atlas), Full(workshop)
+    reduced.solve(steps[0][0])  # compiles
+    answers = list(reduced.follow(steps))
+    histories = full.follow(tqdm(steps, "full model"))
+    moved = [
+        (workshop.under(x, history.displacement), answer.contact_displacement)
+        for history, answer in zip(histories, answers, strict=True)
+    ]
+    times, depth = np.cumsum([dt for _, dt in steps]), -np.array(moved) @ normal
+    force = np.array([np.linalg.norm(answer.force) for answer in answers])
+    report = artifact.parent / atlas.name / "report"
+    names = "time_s", "force_mN", "depth_full_mm", "depth_reduced_mm"
+    rows = np.column_stack([times, force, depth]).tolist()
+    write_csv(report / "relaxation.csv", [dict(zip(names, row, strict=True)) for row in rows])
+    _draw(report / "relaxation.png", times, force, *depth.T)
+    pressed, held, released = (np.cumsum([count for _, count, _ in PHASES]) - 1)[[0, 1, 3]]
     return {
-        "depth_pressed_mm": float(full[pressed]),
-        "depth_held_mm": float(full[held]),
-        "dent_left_mm": float(full[released]),
-        "largest_difference_mm": float(np.abs(full - reduced).max()),
-        "step_us": 1e6 * float(np.median([moment.solve_seconds for moment in moments])),
+        "depth_pressed_mm": float(depth[pressed, 0]),
+        "depth_held_mm": float(depth[held, 0]),
+        "dent_left_mm": float(depth[released, 0]),
+        "largest_difference_mm": float(np.abs(depth[:, 0] - depth[:, 1]).max()),
+        "step_us": 1e6 * float(np.median([answer.solve_seconds for answer in answers])),
     }
 
 
-def course(phases: Phases) -> list[tuple[float, float]]:
+def load_steps(phases: Phases) -> list[tuple[float, float]]:
     """Time steps (s) and shares of the load at their ends."""
-    course, level = [], 0.0
-    for seconds, steps, share in phases:
-        rest = share == level  # as less happens, steps grow
-        ends = seconds * np.linspace(0, 1, steps + 1) ** (2 if rest else 1)
-        levels = np.linspace(level, share, steps + 1)
-        course += list(zip(np.diff(ends).tolist(), levels[1:].tolist(), strict=True))
+    steps, level = [], 0.0
+    for seconds, count, share in phases:
+        # while the load rests, less and less happens, and steps grow
+        ends = seconds * np.linspace(0, 1, count + 1) ** (2 if share == level else 1)
+        levels = np.linspace(level, share, count + 1)
+        steps += list(zip(np.diff(ends).tolist(), levels[1:].tolist(), strict=True))
         level = share
-    return course
-
-
-def _full_depth(workshop: Workshop, presses: list[Press], normal: Array) -> Array:
-    history, depth = workshop.model.at_rest, []
-    for press in tqdm(presses, "full model"):
-        load = Load(press.position, press.direction, press.pressure)
-        _, history = workshop.model.step(history, workshop.load_vector(load), press.dt)
-        depth.append(-float(workshop.under(press.position, history.displacement) @ normal))
-    return np.array(depth)
-
-
-def _write(path: Path, *columns: Array) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["time_s", "force_mN", "depth_full_mm", "depth_reduced_mm"])
-        writer.writerows([[f"{value:.5g}" for value in row] for row in np.column_stack(columns)])
+    return steps
 
 
 def _draw(path: Path, times: Array, force: Array, full: Array, reduced: Array) -> None:
@@ -116,11 +109,10 @@ def _draw(path: Path, times: Array, force: Array, full: Array, reduced: Array) -
         for end in ends[1:-1]:
             axes.axvline(end, color="0.85", linewidth=0.8)
         axes.spines[["top", "right"]].set_visible(False)
-    start = np.zeros(1)
-    t = np.concatenate([start, times])
-    above.plot(t, np.concatenate([start, force]), color="0.3")
+    t = np.append(0.0, times)
+    above.plot(t, np.append(0.0, force), color="0.3")
     above.set_ylabel("force, mN")
-    below.plot(t, np.concatenate([start, full]), color="tab:blue", label="full model")
+    below.plot(t, np.append(0.0, full), color="tab:blue", label="full model")
     below.plot(times[::2], reduced[::2], ".", color="tab:orange", label="reduced model")
     below.set_ylabel("depth of the dent, mm")
     below.set_xlabel("time, s")

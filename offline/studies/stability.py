@@ -1,133 +1,120 @@
-"""Where methods fail, and whether they say so: a map of methods against what strains them.
+"""Where methods fail, and whether they say so: maps of methods against what strains them.
 
-Every method answers the same loads, inside the trained range and far out of it, for which the full
-model's answer is known.  A method that gives a wrong answer and vouches for it has failed silently,
-which is the one failure a user cannot guard against; most methods have no way to fail otherwise.
-One kind of wrong answer is told apart and counted with the others: where a load has several
-equilibria, that which its path does not lead to.
+Every method answers the same loads, inside the trained range and far out of it, or the same
+histories of visco-elastic tissue, for which the full model's answers are known.  An answer to a
+history is right if its errors over all moments are within the scene's tolerance, flagged if any of
+its moments is, and inverted if any of them turns an element inside out; of a moving tool and of
+long histories only the end counts.
 
-Tissue of another Poisson's ratio is a scene of its own, from which all methods are built anew but
-the artifact.  Only the artifact can start from its last answer: nothing else is asked on the way
-of a moving tool.
+Of loads, tissue of another Poisson's ratio is a scene of its own, from which all methods are built
+anew but the artifact.  Only the artifact can start from its last answer: no other method is asked
+under a moving tool.
 """
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import json
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from palpate.offline import methods as methods_package
-from palpate.offline.methods.catalogue import Snapshots, Training, build
-from palpate.offline.methods.deim import PlainNewton
-from palpate.offline.methods.galerkin import Cubature, Galerkin, GalerkinModel
-from palpate.offline.methods.mass_spring import MassSpring
-from palpate.offline.methods.method import Case, Method
-from palpate.offline.methods.shipped import Shipped
-from palpate.offline.methods.tensor_mass import TensorMass
-from palpate.offline.methods.tetrahedra import scaled
+from palpate.offline.methods.catalogue import Training, build
+from palpate.offline.methods.method import Case, Method, Snapshots
 from palpate.offline.run.checkpoint import Checkpoint, content_key
+from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.workers import worker_pool
 from palpate.offline.run.workshop import Workshop, open_artifact
-from palpate.offline.studies import hard_cases
+from palpate.offline.studies import trajectories
 from palpate.offline.studies.hard_cases import (
     CONTROL,
     HYSTERESIS,
     SEVERAL,
-    Stressors,
-    Trial,
-    Truth,
+    Equilibria,
+    HardCase,
+    HardLoads,
+    all_equilibria,
+    several,
     tissue,
-    truths,
 )
+from palpate.offline.studies.outcomes import (
+    DIVERGED,
+    REFUSED,
+    SILENT,
+    SILENT_OUTCOMES,
+    WRONG_FLAGGED,
+    Result,
+    classify,
+    flagged,
+    publish,
+    summary,
+)
+from palpate.offline.studies.references import Fields, Steps, full_histories, random_steps
+from palpate.offline.studies.tables import write_csv
 from palpate.offline.validate.loads import random_loads
+from palpate.offline.validate.norms import relative
+from palpate.shared.answer import Answer as Found
 from palpate.shared.artifact import read_artifact
-from palpate.shared.model import ReducedModel, Solution
+from palpate.shared.errors import PalpateError, QueryError
+from palpate.shared.model import ReducedModel
 
-Array = NDArray[np.float64]
+SNAPSHOTS, SNAPSHOTS_IN_TIME = 150, 12
+"""Full solutions of each tissue, or histories, that the methods learn from."""
 
-SNAPSHOTS = 150
-"""Full solutions of each tissue that the methods learn from."""
-
-LEARNING = 103
-"""Sets their random numbers apart."""
+MANY = 100_000
+"""Steps of the longest history."""
 
 SIZE, DERIVATIVES = 40, 19
-
-ROUGHLY = 0.1
-"""Error of displacement that a wrong answer may have to be roughly right; hardly any but the
-artifact is within the tolerance of a scene, and not even these have the stress."""
+LARGER = 5
+"""Steps of the full model that are made one."""
 
 ARTIFACT, WARM, FULL = "artifact", "artifact, warm", "full model, one jump"
+LOADS, TIP, STEPS = "artifact, loads", "artifact, tip", f"full model, {LARGER} x the step"
 
-RIGHT = "right"
-RIGHT_FLAGGED = "right but flagged"
-WRONG_FLAGGED = "wrong but flagged"
-ANOTHER_FLAGGED = "another equilibrium but flagged"
-REFUSED = "refused, or rightly none"
-DIVERGED = "not converged"
-ANOTHER = "silently another equilibrium"
-ROUGH = "silently wrong, displacement within 10 %"
-SILENT = "silently wrong"
-INVERTED = "silently inverted"
+METHODS: dict[str, tuple[str, float] | None] = {
+    ARTIFACT: ("artifact", 1),
+    WARM: ("artifact, warm", 1),
+    FULL: None,
+    f"derivatives {DERIVATIVES}": ("derivatives", DERIVATIVES),
+    **{
+        f"{name} {SIZE}": (name, SIZE)
+        for name in (
+            "pod", "pod, no line search", "pod-ecm", "pod-ecm, 1 point a mode", "pod-deim",
+            "pod-gappy", "modal", "ritz", "krylov", "linear", "regression",
+        )
+    },
+    "mass-spring": ("mass-spring", 1),
+    "tensor-mass": ("tensor-mass linear", 1),
+}  # fmt: skip
+"""Rows of the map of loads: names and sizes in the catalogue.  The full model's jump is known."""
 
-OUTCOMES = {
-    RIGHT: "#0072B2",
-    RIGHT_FLAGGED: "#8CC5E8",
-    WRONG_FLAGGED: "#C8C8C8",
-    ANOTHER_FLAGGED: "#EBC9DB",
-    REFUSED: "#ECECEC",
-    DIVERGED: "#7F7F7F",
-    ANOTHER: "#CC79A7",
-    ROUGH: "#F0E442",
-    SILENT: "#D55E00",
-    INVERTED: "#000000",
+METHODS_IN_TIME: dict[str, tuple[str, float]] = {
+    LOADS: ("artifact", 1),
+    TIP: ("artifact, tip", 1),
+    f"pod {SIZE}": ("pod", SIZE),
+    f"modal {SIZE}": ("modal", SIZE),
+    STEPS: ("full", 1),
 }
-"""What can become of an answer, and its colour: after Okabe & Ito, told apart by all eyes."""
-
-SILENT_OUTCOMES = (ANOTHER, ROUGH, SILENT, INVERTED)
+"""Rows of the map of histories."""
 
 
-@dataclass(frozen=True)
-class Reply:
-    """What became of a case.
+class Question(NamedTuple):
+    """A hard case and the full model's answer; of loads also in one jump, and if that differs."""
 
-    Attributes
-    ----------
-    outcome : str
-    displacement, von_mises : float
-        Relative errors, NaN without an answer or without an equilibrium.
-    inverted, nan, crashed : bool
-        Whether the answer turns an element inside out, is vouched for but not finite, is none
-        because the method raised.
-    details : dict
-        What the artifact says of a silent error.
-    """
-
-    outcome: str
-    displacement: float = float("nan")
-    von_mises: float = float("nan")
-    inverted: bool = False
-    nan: bool = False
-    crashed: bool = False
-    details: dict[str, Any] = field(default_factory=dict)
+    case: HardCase
+    exact: Fields | None
+    jump: Fields | None = None
+    other: Fields | None = None
 
 
-Question = tuple[Trial, Truth]
-
-Table = dict[str, dict[str, list[Reply]]]
-"""Replies by method and stressor."""
-
-Builder = Callable[[Training], Method]
+Questions = Mapping[str, Sequence[Question]]
+"""By kind of case."""
 
 
 def stability(
@@ -135,443 +122,361 @@ def stability(
     cases: int,
     seed: int,
     methods: Sequence[str] | None = None,
-    columns: Sequence[str] | None = None,
+    kinds: Sequence[str] | None = None,
     snapshots: int = SNAPSHOTS,
 ) -> dict[str, Any]:
-    """Map what becomes of the answers of methods under stress.
+    """Map what becomes of the answers of methods under hard loads.
 
     Parameters
     ----------
     artifact : Path
-        The map goes to ``NAME/report`` beside it: ``stability.csv``, a row per method and stressor;
+        The map goes to ``NAME/report`` beside it: ``stability.csv``, a row per method and kind;
         ``stability.png``; ``stability_silent.csv``, the artifact's silent errors.
     cases : int
-        Of each stressor.
+        Of each kind.
     seed : int
-    methods, columns : sequence of str, optional
-        Only these of ``METHODS``, and only these stressors; all if absent.
+    methods, kinds : sequence of str, optional
+        Only these of ``METHODS``, and only these kinds; all if absent.
     snapshots : int
         Full solutions that the methods learn from.
 
     Returns
     -------
     dict
-        ``artifact``: totals of its silent errors, of answers that are not finite and of crashes,
-        and the share of right answers that it flags, overall and in range; ``methods``: outcomes;
-        ``without_equilibrium``: cases that the full model has no answer to;
+        By method what ``outcomes.summary`` tells, of the artifact also ``right_but_flagged`` in
+        range; ``without_equilibrium``: cases of each kind that the full model has no answer to;
         ``with_several_equilibria``, ``with_hysteresis``: cases whose path and jump end apart, of
-        loads that are raised and that are lowered again, a column each if there are any.
+        loads that are raised and that are lowered again, a kind each if there are any.
     """
     atlas = ReducedModel.load(artifact)
     workshop = Workshop.of_artifact(read_artifact(artifact))
-    everything = Stressors(atlas, workshop, cases, seed).trials()
-    trials = {name: everything[name] for name in columns or everything}
-    poissons = sorted({trial.poisson for own in trials.values() for trial in own})
-    lessons = _lessons(atlas, workshop, poissons, snapshots)
-    key = _key(artifact, cases, seed, snapshots)
+    everything = HardLoads(atlas, workshop, cases, seed).cases()
+    chosen = {name: everything[name] for name in kinds or everything}
+    tissues = sorted({case.poisson for own in chosen.values() for case in own})
+    learning = _learning(atlas, workshop, tissues, snapshots)
+    key = _key(artifact, f"{cases} {seed} {snapshots}")
     solved = Checkpoint(artifact.parent / f".{artifact.stem}.stability-solved", key)
-    asked = Checkpoint(
-        artifact.parent / f".{artifact.stem}.stability-asked", _key_of_answers(key, trials)
+    answered = Checkpoint(
+        artifact.parent / f".{artifact.stem}.stability-answered",
+        _key(artifact, f"{cases} {seed} {snapshots} {list(chosen)}"),
     )
     with worker_pool(open_artifact, artifact) as pool:
-        found = truths({**trials, **lessons}, pool, solved)
-    questions = {
-        name: list(zip(own, found[name], strict=True)) for name, own in trials.items()
-    } | _several(trials, found, cases)
-    table: Table = {}
-    for poisson in poissons:
-        lesson = lessons[_lesson(poisson)]
-        training = _training(tissue(workshop, poisson), atlas, lesson, found[_lesson(poisson)])
-        asking = {n: own for n, own in questions.items() if own and own[0][0].poisson == poisson}
+        found = all_equilibria({**chosen, **learning}, pool, solved)
+    pairs = {name: list(zip(own, found[name], strict=True)) for name, own in chosen.items()}
+    pairs |= several(pairs, cases)
+    table: dict[str, dict[str, list[Result]]] = {}
+    for poisson in tissues:
+        own_tissue, own_learning = tissue(workshop, poisson), _learning_of(poisson)
+        training = _training(own_tissue, atlas, learning[own_learning], found[own_learning])
+        questions = {
+            name: [_question(own_tissue, *pair) for pair in own]
+            for name, own in pairs.items()
+            if own and own[0][0].poisson == poisson
+        }
         for name in tqdm(methods or METHODS, f"methods, Poisson {poisson:g}"):
-            own = {n: pairs for n, pairs in asking.items() if _applies(name, pairs[0][0], atlas)}
-            if own:
-                table.setdefault(name, {}).update(_replies(name, training, own, asked))
-    return _publish(artifact.parent / atlas.name / "report", table, questions, (solved, asked))
+            asked = {n: own for n, own in questions.items() if _applies(name, own[0].case, atlas)}
+            if asked:
+                answers = partial(_answers, METHODS[name], training)
+                label = f"{name} {poisson:g}"
+                table.setdefault(name, {}).update(_kept(label, answers, asked, answered))
+    report = artifact.parent / atlas.name / "report"
+    publish(report, "stability", table, [name for name, own in pairs.items() if own], "loads")
+    write_csv(report / "stability_silent.csv", list(_silent(table)))
+    for checkpoint in (solved, answered):
+        checkpoint.remove()
+    missing = {name: sum(truth.path is None for _, truth in own) for name, own in pairs.items()}
+    return _summaries(table) | {
+        "without_equilibrium": {name: count for name, count in missing.items() if count},
+        "with_several_equilibria": len(pairs.get(SEVERAL, ())),
+        "with_hysteresis": len(pairs.get(HYSTERESIS, ())),
+    }
 
 
-def _key(artifact: Path, cases: int, seed: int, snapshots: int) -> str:
-    """Of full solutions."""
-    settings = f"{cases} {seed} {snapshots}".encode()
-    made = Path(hard_cases.__file__).read_bytes()
-    own = hashlib.sha256(artifact.read_bytes() + made + settings).hexdigest()[:16]
+def stability_in_time(
+    artifact: Path,
+    cases: int,
+    seed: int,
+    many: int = MANY,
+    methods: Sequence[str] | None = None,
+    kinds: Sequence[str] | None = None,
+    snapshots: int = SNAPSHOTS_IN_TIME,
+) -> dict[str, Any]:
+    """Map what becomes of histories that strain methods.
+
+    Methods beside the artifact are Galerkin models with every quadrature point, on modes that
+    vibrate and on POD of random histories, and the full model in larger steps.
+
+    Parameters
+    ----------
+    artifact : Path
+        Of visco-elastic tissue.  The map goes to ``NAME/report`` beside it, as
+        ``stability_in_time.csv`` and ``.png``.
+    cases : int
+        Places in which each kind is tried.
+    seed : int
+    many : int
+        Steps of the longest history.
+    methods, kinds : sequence of str, optional
+        Only these of ``METHODS_IN_TIME``, and only these kinds; all if absent.
+    snapshots : int
+        Histories that POD learns from.
+
+    Returns
+    -------
+    dict
+        By method what ``outcomes.summary`` tells; ``drift``: how far the ends of long histories are
+        from the method's own answers to the brief ones that lead there too.
+    """
+    atlas = ReducedModel.load(artifact)
+    if atlas.models.viscous is None:
+        raise QueryError("scene", f"{atlas.name!r} is elastic: it has no histories")
+    workshop = Workshop.of_artifact(read_artifact(artifact))
+    with_tip = atlas.models.viscous_tips is not None
+    wanted = [name for name in methods or METHODS_IN_TIME if with_tip or name != TIP]
+    hard = {}
+    for tip in {name == TIP for name in wanted}:
+        found = trajectories.histories(atlas, workshop, tip, cases, seed, many)
+        hard[tip] = {name: own for name, own in found.items() if kinds is None or name in kinds}
+    key = _key(artifact, f"{cases} {seed} {many} {snapshots} {kinds}")
+    folder = artifact.parent / f".{artifact.stem}.stability-in-time"
+    checkpoint = Checkpoint(folder, key)
+    questions, training = _followed(artifact, atlas, workshop, hard, snapshots, checkpoint)
+    table = {}
+    for name in tqdm(wanted, "methods"):
+        answers = partial(
+            _answers, METHODS_IN_TIME[name], training, every=LARGER if name == STEPS else 1
+        )
+        table[name] = _kept(name, answers, questions[name == TIP], checkpoint)
+    report = artifact.parent / atlas.name / "report"
+    names = list(dict.fromkeys(name for own in questions.values() for name in own))
+    asked = "histories (one of those of many steps)"
+    publish(report, "stability_in_time", table, names, asked)
+    checkpoint.remove()
+    return _summaries(table)
+
+
+def _key(artifact: Path, settings: str) -> str:
+    """Hash of everything that results depend on."""
+    own = hashlib.sha256(artifact.read_bytes() + settings.encode()).hexdigest()[:16]
     return f"{content_key(ReducedModel.load(artifact).scene)}-{own}"
 
 
-def _lessons(
-    atlas: ReducedModel, workshop: Workshop, poissons: Iterable[float], count: int
-) -> dict[str, list[Trial]]:
+# --- what is asked -------------------------------------------------------------------------------
+
+
+def _learning(
+    atlas: ReducedModel, workshop: Workshop, tissues: Iterable[float], count: int
+) -> dict[str, list[HardCase]]:
     """What methods learn from in each tissue: random loads in range."""
-    rng = np.random.default_rng([atlas.scene.seed, LEARNING])
+    rng = stream(atlas.scene.seed, Stage.STABILITY_SNAPSHOTS)
     loads = random_loads(atlas.surface, atlas.limits, atlas.scene, count, rng)
     cases = [Case.of(workshop, load) for load in loads]
-    return {_lesson(p): [Trial(case, p) for case in cases] for p in poissons}
+    return {_learning_of(p): [HardCase(((case, 0.0),), p) for case in cases] for p in tissues}
 
 
-def _lesson(poisson: float) -> str:
-    return f"lesson {poisson:g}"
-
-
-def _key_of_answers(key: str, columns: Iterable[str]) -> str:
-    """As a key of full solutions, of the questions and of the methods."""
-    sha = hashlib.sha256(" ".join([key, *columns]).encode() + Path(__file__).read_bytes())
-    for source in sorted(Path(methods_package.__path__[0]).glob("*.py")):
-        sha.update(source.read_bytes())
-    return sha.hexdigest()[:16]
+def _learning_of(poisson: float) -> str:
+    return f"snapshots {poisson:g}"
 
 
 def _training(
-    workshop: Workshop, atlas: ReducedModel, lesson: Sequence[Trial], found: Sequence[Truth]
+    workshop: Workshop,
+    atlas: ReducedModel,
+    cases: Sequence[HardCase],
+    found: Sequence[Equilibria],
 ) -> Training:
-    known = [(t.case.contacts[0], u.jump) for t, u in zip(lesson, found, strict=True)]
-    pairs = [(load, jump) for load, jump in known if jump is not None]
-    displacements = np.stack([jump for _, jump in pairs])
-    return Training(workshop, Snapshots([load for load, _ in pairs], displacements), atlas)
+    pairs = [(case.last.contacts[0], own.jump) for case, own in zip(cases, found, strict=True)]
+    solved = [(load, jump) for load, jump in pairs if jump is not None]
+    displacements = np.stack([jump for _, jump in solved])
+    return Training(workshop, Snapshots([load for load, _ in solved], displacements), atlas)
 
 
-def _several(
-    trials: Mapping[str, Sequence[Trial]], found: Mapping[str, Sequence[Truth]], most: int
-) -> dict[str, list[Question]]:
-    """Of all loads that were followed, those of several equilibria: raised, and lowered again."""
-    followed: dict[str, list[Question]] = {}
-    for name, own in trials.items():
-        for trial, truth in zip(own, found[name], strict=True):
-            if trial.follow:
-                column = followed.setdefault(HYSTERESIS if trial.before else SEVERAL, [])
-                column += [(trial, truth)] if truth.several else []
-    return {name: own[:most] for name, own in followed.items()}
+def _question(workshop: Workshop, case: HardCase, truth: Equilibria) -> Question:
+    def fields(u: NDArray[np.float64] | None) -> Fields | None:
+        if u is None:
+            return None
+        u = u.reshape(-1, 3)
+        return Fields(u[None], workshop.von_mises(u)[None])
+
+    return Question(case, *map(fields, (truth.path, truth.jump, truth.other)))
 
 
-def _applies(method: str, trial: Trial, atlas: ReducedModel) -> bool:
+def _applies(method: str, case: HardCase, atlas: ReducedModel) -> bool:
     """Whether a method can be asked at all."""
-    if method in (ARTIFACT, WARM) and trial.poisson != atlas.scene.tissue.poisson:
+    if method in (ARTIFACT, WARM) and case.poisson != atlas.scene.tissue.poisson:
         return False
-    if trial.before:
-        return method in (ARTIFACT, WARM) or (method == FULL and trial.follow)
+    if len(case.steps) > 1:
+        return method in (ARTIFACT, WARM) or (method == FULL and case.follow)
     return method != WARM
 
 
-# --- methods -------------------------------------------------------------------------------------
-
-
-def _named(name: str, size: int = SIZE) -> Builder:
-    return lambda training: build(name, size, training)
-
-
-def _warm(training: Training) -> Method:
-    assert training.atlas is not None
-    return Shipped(training.atlas, training.atlas.new_state())
-
-
-def _sparse(training: Training) -> Method:
-    """As pod-ecm, but with a cubature of one point per mode instead of six."""
-    basis = training.pod(SIZE)
-    cubature = training.point_forces(basis).by_point(basis.shape[1], training.rng(SIZE))
-    return Galerkin("pod-ecm", "sparse", training.model, basis, cubature)
-
-
-def _whole_steps(training: Training) -> Method:
-    """As pod, but by plain Newton's method: no line search, no check of the tangent."""
-    basis = training.pod(SIZE)
-    reduced = GalerkinModel(training.model, SIZE, Cubature.full(training.model))
-    reduced.adopt(basis)
-    test = reduced.content.system.gradients
-    return PlainNewton("pod", "whole steps", basis.shape[1], reduced, test)
-
-
-def _springs(training: Training) -> Method:
-    return MassSpring(training.workshop, scaled(training.workshop.scene, 1))
-
-
-def _tensors(training: Training) -> Method:
-    return TensorMass(training.workshop, scaled(training.workshop.scene, 1))
-
-
-METHODS: dict[str, Builder | None] = {
-    ARTIFACT: _named("artifact"),
-    WARM: _warm,
-    FULL: None,
-    f"derivatives {DERIVATIVES}": _named("derivatives", DERIVATIVES),
-    f"pod {SIZE}": _named("pod"),
-    f"pod {SIZE}, no line search": _whole_steps,
-    f"pod-ecm {SIZE}": _named("pod-ecm"),
-    f"pod-ecm {SIZE}, 1 point a mode": _sparse,
-    f"pod-deim {SIZE}": _named("pod-deim"),
-    f"pod-gappy {SIZE}": _named("pod-gappy"),
-    f"modal {SIZE}": _named("modal"),
-    f"ritz {SIZE}": _named("ritz"),
-    f"krylov {SIZE}": _named("krylov"),
-    f"linear {SIZE}": _named("linear"),
-    f"regression {SIZE}": _named("regression"),
-    "mass-spring": _springs,
-    "tensor-mass": _tensors,
-}
-"""Rows of the map.  The full model's jump is known already; springs and tensors have a cell for
-each element of the scene."""
+def _followed(
+    artifact: Path,
+    atlas: ReducedModel,
+    workshop: Workshop,
+    hard: Mapping[bool, Mapping[str, Sequence[HardCase]]],
+    snapshots: int,
+    checkpoint: Checkpoint,
+) -> tuple[dict[bool, dict[str, list[Question]]], Training]:
+    """Histories with the full model's answers, and what methods learn from."""
+    tasks: dict[str, Steps] = {
+        f"{'tip' if tip else 'load'} {name} {i}": case.brief or case.steps
+        for tip, kinds in hard.items()
+        for name, own in kinds.items()
+        for i, case in enumerate(own)
+        if not case.nonsense
+    }
+    tips = {name for name in tasks if name.startswith("tip")}
+    rng = stream(atlas.scene.seed, Stage.STABILITY_IN_TIME_SNAPSHOTS)
+    for i, steps in enumerate(random_steps(atlas, workshop, snapshots, rng)):
+        tasks[f"snapshots {i}"] = steps
+    with worker_pool(open_artifact, artifact) as pool:
+        found = full_histories(tasks, tips, pool, checkpoint)
+    solved = [own.displacements for name, own in found.items() if name.startswith("snapshots")]
+    if not solved:
+        raise PalpateError("snapshots: the full model could follow none of the histories")
+    displacements = np.concatenate(solved).astype(float)
+    rows = Snapshots((), displacements.reshape(len(displacements), -1))
+    questions = {
+        tip: {
+            name: [
+                Question(case, found.get(f"{'tip' if tip else 'load'} {name} {i}"))
+                for i, case in enumerate(own)
+            ]
+            for name, own in kinds.items()
+        }
+        for tip, kinds in hard.items()
+    }
+    return questions, Training(workshop, rows, atlas, in_time=True)
 
 
 # --- answers -------------------------------------------------------------------------------------
 
 
-def _replies(
-    name: str, training: Training, questions: Mapping[str, Sequence[Question]], asked: Checkpoint
-) -> dict[str, list[Reply]]:
-    """What a method makes of the questions of each stressor; kept, for some take their time."""
-    label = f"{name} {training.workshop.scene.tissue.poisson:g}"
-    kept = asked.load(label)
+def _kept(
+    label: str,
+    answers: Callable[[Sequence[Question]], list[Result]],
+    questions: Questions,
+    checkpoint: Checkpoint,
+) -> dict[str, list[Result]]:
+    """A method's results by kind of case; kept, for some methods take their time."""
+    name = f"answers {label}"
+    kept = checkpoint.load(name)
     if kept is None:
-        rows = [vars(reply) for reply in _ask(name, training, questions)]
-        kept = {key: np.array([row[key] for row in rows]) for key in rows[0]}
-        kept["outcome"] = np.array([list(OUTCOMES).index(row["outcome"]) for row in rows])
-        kept["details"] = np.array([json.dumps(row["details"]) for row in rows], dtype=bytes)
-        asked.store(label, kept)
-    return _unpack(kept, questions)
+        found = answers([question for own in questions.values() for question in own])
+        text = json.dumps([vars(result) for result in found])
+        kept = {"results": np.array(text, dtype=bytes)}
+        checkpoint.store(name, kept)
+    rows = iter(json.loads(kept["results"].item()))
+    return {kind: [Result(**next(rows)) for _ in own] for kind, own in questions.items()}
 
 
-def _unpack(
-    kept: Mapping[str, NDArray[Any]], questions: Mapping[str, Sequence[Question]]
-) -> dict[str, list[Reply]]:
-    fields = {key: values.tolist() for key, values in kept.items()}
-    fields["outcome"] = [list(OUTCOMES)[i] for i in fields["outcome"]]
-    fields["details"] = [json.loads(text) for text in fields["details"]]
-    rows = (
-        Reply(**dict(zip(fields, row, strict=True))) for row in zip(*fields.values(), strict=True)
-    )
-    return {stressor: [next(rows) for _ in own] for stressor, own in questions.items()}
+def _answers(
+    named: tuple[str, float] | None,
+    training: Training,
+    questions: Sequence[Question],
+    every: int = 1,
+) -> list[Result]:
+    """What becomes of a method's answers; of the full model's jump if there is no method."""
+    workshop = training.workshop
+    if named is None:
+        return [classify(workshop, q.jump, q.jump is not None, q.exact, q.other) for q in questions]
+    method = build(*named, training)
+    return [_answer(method, workshop, question, every) for question in questions]
 
 
-def _ask(name: str, training: Training, questions: Mapping[str, Sequence[Question]]) -> list[Reply]:
-    pairs = [pair for own in questions.values() for pair in own]
-    builder = METHODS[name]
-    if builder is None:
-        return [_judge(training.workshop, u.jump, u.jump is not None, u) for _, u in pairs]
-    method = builder(training)
-    return [_reply(method, training, trial, truth) for trial, truth in pairs]
-
-
-def _reply(method: Method, training: Training, trial: Trial, truth: Truth) -> Reply:
-    """Put a question, after those on the way to it."""
-    for case in trial.before if isinstance(method, Shipped) else ():
-        method.solve(case)
+def _answer(method: Method, workshop: Workshop, question: Question, every: int) -> Result:
+    """What becomes of a case, answered in steps as large as ``every`` of its steps."""
+    case, exact = question.case, question.exact
+    steps = case.brief if every > 1 and case.brief else case.steps
+    ends = np.unique(np.append(np.arange(every, len(steps), every), len(steps))) - 1
+    counted = np.array([-1]) if case.end_only else ends
     try:
-        answer = method.solve(trial.case)
-        if answer.refused:
-            return Reply(REFUSED)
         with np.errstate(all="ignore"):
-            u = method.displacement(answer).ravel() if answer.converged else None
-            reply = _judge(training.workshop, u, answer.trusted, truth)
+            states, trusted, refused = _play(method, steps, ends, len(counted))
+            if refused:
+                return Result(REFUSED)
+            if case.nonsense and states:
+                return Result(SILENT if trusted else WRONG_FLAGGED)
+            if exact is not None:
+                exact = Fields(*(field[counted] for field in exact))
+            found = Fields.of(method, states) if states else None
+            result = classify(workshop, found, trusted, exact, question.other)
+            return replace(result, details=_details(method, case, result, states))
+    except ValueError:  # time that makes no sense
+        return Result(REFUSED if exact is None else DIVERGED)
     except Exception:  # whatever it is, a method must not raise
-        return Reply(DIVERGED, crashed=True)
-    if isinstance(answer.state, Solution) and reply.outcome in SILENT_OUTCOMES:
-        return replace(reply, details=_details(answer.state))
-    return reply
+        return Result(DIVERGED, crashed=True)
 
 
-def _judge(workshop: Workshop, u: Array | None, trusted: bool, truth: Truth) -> Reply:
-    """What became of a displacement (3 n,), None if the method has none."""
-    if u is None:
-        return Reply(DIVERGED if truth.path is not None else REFUSED)
-    if not np.isfinite(u).all():
-        return Reply(DIVERGED, nan=True)
-    inverted = not workshop.model.internal(u, np.empty_like(u))[1] > 0.0
-    errors, right = _against(workshop, u, truth.path)
-    another = not right and _against(workshop, u, truth.other)[1]
-    if not trusted:
-        outcome = RIGHT_FLAGGED if right else ANOTHER_FLAGGED if another else WRONG_FLAGGED
-    elif inverted:
-        outcome = INVERTED
-    elif right:
-        outcome = RIGHT
-    elif another:
-        outcome = ANOTHER
-    else:
-        outcome = ROUGH if errors[0] <= ROUGHLY else SILENT
-    return Reply(outcome, *errors, inverted)
+def _play(
+    method: Method, steps: Steps, ends: NDArray[np.int64], count: int
+) -> tuple[list[Any], bool, bool]:
+    """States at the last ``count`` of the ends, none if one is missing; trusted; refused."""
+    state, states, trusted, begun = method.at_rest(), [], True, 0
+    for number, end in enumerate(ends.tolist()):
+        counts = number >= len(ends) - count
+        dt = sum(seconds for _, seconds in steps[begun : end + 1])
+        answer = method.step(state, steps[end][0], dt)
+        # on the way of a moving tool a load may have no answer
+        if not answer.converged and (counts or dt):
+            return [], False, answer.refused
+        begun, state = end + 1, answer.state
+        if counts:
+            states.append(state)
+            trusted = trusted and answer.trusted
+    return states, trusted, False
 
 
-def _against(
-    workshop: Workshop, u: Array, reference: Array | None
-) -> tuple[tuple[float, float], bool]:
-    """Errors of displacement and stress, NaN without a reference; whether they are tolerated."""
-    if reference is None:
-        return (float("nan"), float("nan")), False
-    errors = workshop.errors(u.reshape(-1, 3), reference.reshape(-1, 3))
-    tolerance = workshop.scene.tolerance
-    return errors, errors[0] <= tolerance.displacement and errors[1] <= tolerance.von_mises
+SAID = (
+    "contact_point", "direction", "pressure", "pressure_limit", "distance", "tilt", "iterations",
+    "departure", "residual", "min_jacobian", "error_displacement", "error_von_mises", "features",
+)  # fmt: skip
+"""What an answer of the artifact tells of itself."""
 
 
-def _details(solution: Solution) -> dict[str, Any]:
-    """What an answer says of itself."""
-    return {
-        "contact": solution.contact_point.tolist(),
-        "direction": solution.direction.tolist(),
-        "pressure": solution.pressure,
-        "pressure_share": solution.pressure / solution.pressure_limit,
-        "distance": solution.distance,
-        "tilt": solution.tilt,
-        "iterations": solution.iterations,
-        "departure": solution.departure,
-        "residual": solution.residual,
-        "min_jacobian": solution.min_jacobian,
-        "estimated_displacement": solution.error_displacement,
-        "estimated_von_mises": solution.error_von_mises,
-        "features": solution.features.tolist(),
-    }
+def _details(
+    method: Method, case: HardCase, result: Result, states: Sequence[Any]
+) -> dict[str, Any]:
+    """What an artifact says of a silent error, or how far the end of a long history drifts."""
+    if states and case.brief:
+        brief, *_ = _play(method, case.brief, np.arange(len(case.brief)), 1)
+        ends = [method.displacement(state) for state in (states[-1], *brief)]
+        return {"drift": relative(*ends) if brief else float("nan")}
+    said = states[-1] if states else None
+    if not isinstance(said, Found) or result.outcome not in SILENT_OUTCOMES:
+        return {}
+    return {name: np.asarray(getattr(said, name)).tolist() for name in SAID}
 
 
 # --- report --------------------------------------------------------------------------------------
 
 
-def _publish(
-    report: Path,
-    table: Table,
-    questions: Mapping[str, Sequence[Question]],
-    checkpoints: Sequence[Checkpoint],
-) -> dict[str, Any]:
-    """Write the map, forget what it was made of, and sum it up."""
-    report.mkdir(parents=True, exist_ok=True)
-    rows = [
-        table_row(method, stressor, table[method][stressor])
-        for method in table
-        for stressor in questions
-        if stressor in table[method]
-    ]
-    silent = [
-        {"method": method, "stressor": stressor, "case": i}
-        | {"displacement": reply.displacement, "von_mises": reply.von_mises}
-        | reply.details
-        for method, columns in table.items()
-        for stressor, replies in columns.items()
-        for i, reply in enumerate(replies)
-        if reply.details
-    ]
-    write_table(report / "stability.csv", rows)
-    write_table(report / "stability_silent.csv", silent)
-    draw(report / "stability.png", rows, [name for name, own in questions.items() if own])
-    for checkpoint in checkpoints:
-        checkpoint.remove()
-    return _summary(table, questions)
+def _silent(table: Mapping[str, Mapping[str, Sequence[Result]]]) -> Iterable[dict[str, Any]]:
+    """Rows of the silent errors that say something of themselves."""
+    for method, results in table.items():
+        for kind, own in results.items():
+            for i, result in enumerate(own):
+                if result.details:
+                    yield {
+                        "method": method,
+                        "stressor": kind,
+                        "case": i,
+                        "displacement": result.displacement,
+                        "von_mises": result.von_mises,
+                    } | result.details
 
 
-def table_row(method: str, stressor: str, replies: Sequence[Reply]) -> dict[str, Any]:
-    """What became of the cases of a stressor: counts of outcomes, median and largest errors."""
-    counts = Counter(reply.outcome for reply in replies)
-    row: dict[str, Any] = {"method": method, "stressor": stressor, "cases": len(replies)}
-    row |= {outcome: counts[outcome] for outcome in OUTCOMES}
-    row["inverted"] = sum(reply.inverted for reply in replies)
-    for name in ("displacement", "von_mises"):
-        errors = np.array([getattr(reply, name) for reply in replies])
-        errors = errors[~np.isnan(errors)]
-        for key, of in (("median", np.median), ("max", np.max)):
-            row[f"{name}_{key}"] = float(of(errors)) if len(errors) else float("nan")
-    return row
-
-
-def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows of equal keys as CSV."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]) if rows else ["method"], lineterminator="\n")
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({key: _text(value) for key, value in row.items()})
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, list):
-        return " ".join(f"{x:.4g}" for x in value)
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def _summary(table: Table, questions: Mapping[str, Sequence[Question]]) -> dict[str, Any]:
-    missing = {
-        stressor: sum(truth.path is None for _, truth in own) for stressor, own in questions.items()
-    }
-    report: dict[str, Any] = {
-        "without_equilibrium": {stressor: n for stressor, n in missing.items() if n},
-        "with_several_equilibria": len(questions.get(SEVERAL, ())),
-        "with_hysteresis": len(questions.get(HYSTERESIS, ())),
-    }
-    for name in (ARTIFACT, WARM):
-        if name in table:
-            report[name] = _honesty(table[name])
-    report["methods"] = {
-        method: dict(Counter(reply.outcome for own in columns.values() for reply in own))
-        for method, columns in table.items()
-    }
+def _summaries(table: Mapping[str, Mapping[str, Sequence[Result]]]) -> dict[str, Any]:
+    report: dict[str, Any] = {}
+    for method, results in table.items():
+        report[method] = summary([result for own in results.values() for result in own])
+        if CONTROL in results:
+            report[method]["right_but_flagged_in_range"] = flagged(results[CONTROL])
+        drift = {
+            kind: own[0].details["drift"]
+            for kind, own in results.items()
+            if own and "drift" in own[0].details
+        }
+        if drift:
+            report[method]["drift"] = drift
     return report
-
-
-def _honesty(columns: Mapping[str, Sequence[Reply]]) -> dict[str, Any]:
-    """How far a method's word can be trusted."""
-    replies = [reply for own in columns.values() for reply in own]
-    return {
-        "cases": len(replies),
-        "silently_wrong": sum(reply.outcome in SILENT_OUTCOMES for reply in replies),
-        "of_these_another_equilibrium": sum(reply.outcome == ANOTHER for reply in replies),
-        "nan": sum(reply.nan for reply in replies),
-        "crashes": sum(reply.crashed for reply in replies),
-        "right_but_flagged": _flagged(replies),
-    } | ({"right_but_flagged_in_range": _flagged(columns[CONTROL])} if CONTROL in columns else {})
-
-
-def _flagged(replies: Sequence[Reply]) -> float:
-    """Share of right answers that are flagged."""
-    counts = Counter(reply.outcome for reply in replies)
-    right = counts[RIGHT] + counts[RIGHT_FLAGGED]
-    return counts[RIGHT_FLAGGED] / right if right else 0.0
-
-
-def draw(
-    path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str], asked: str = "loads"
-) -> None:
-    """Draw the map: a bar of outcomes for each method and stressor, its median error below."""
-    from matplotlib.figure import Figure
-    from matplotlib.patches import Patch
-
-    methods = list(dict.fromkeys(row["method"] for row in rows))
-    size = 3.2 + 0.72 * len(columns), 2.8 + 0.44 * len(methods)
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.add_subplot()
-    for row in rows:
-        _cell(axes, columns.index(row["stressor"]), methods.index(row["method"]), row)
-    axes.set_xticks(range(len(columns)), columns, rotation=40, ha="left", rotation_mode="anchor")
-    axes.xaxis.tick_top()
-    axes.set_yticks([y + MIDDLE for y in range(len(methods))], methods)
-    axes.set(xlim=(-0.55, len(columns) - 0.45), ylim=(len(methods) - 0.45, -0.55))
-    axes.tick_params(length=0)
-    axes.spines[:].set_visible(False)
-    handles = [Patch(facecolor=c, edgecolor="0.4", label=name) for name, c in OUTCOMES.items()]
-    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
-    figure.suptitle(
-        "Who fails under what, and who says so: what became of the answers to "
-        f"{rows[0]['cases']} {asked} of each kind\n"
-        "Below each bar: median error of displacement of the answers given, flagged ones included",
-        fontsize=13,
-    )
-    figure.savefig(path, dpi=100)
-
-
-MIDDLE = -0.12
-"""Of the bar in a cell, below the cell's own."""
-
-
-def _cell(axes: Any, x: int, y: int, row: Mapping[str, Any]) -> None:
-    """One cell of the map, a unit wide."""
-    left, cases = x - 0.45, int(row["cases"])
-    for outcome, colour in OUTCOMES.items():
-        width = 0.9 * int(row[outcome]) / cases
-        axes.barh(y + MIDDLE, width, 0.46, left, color=colour, linewidth=0)
-        left += width
-    axes.barh(y + MIDDLE, 0.9, 0.46, x - 0.45, fill=False, edgecolor="0.4", linewidth=0.5)
-    axes.text(x, y + 0.25, _percent(row["displacement_median"]), ha="center", va="center", size=8)
-
-
-def _percent(error: float) -> str:
-    """Two digits for people; a dash where there is no answer to have one."""
-    percent = 100 * error
-    if np.isnan(percent):
-        return "–"
-    if not 0.01 <= percent < 1000:
-        return "< 0.01 %" if percent < 0.01 else "> 999 %"
-    digits = 0 if percent > 9.95 else 1 if percent > 0.095 else 2
-    return f"{percent:.{digits}f} %"

@@ -20,12 +20,14 @@ from palpate.offline.validate.moments import (
     known_moments,
 )
 from palpate.offline.validate.norms import relative, statistics
+from palpate.shared.answer import Answer
 from palpate.shared.errors import QueryError
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.mechanics.footprint import pressure_limit
-from palpate.shared.model import Estimator, ReducedModel
-from palpate.shared.reduced.history import History, Moment
+from palpate.shared.model import ReducedModel
+from palpate.shared.reduced.transfer import REST
 from palpate.shared.scene import Scene
+from palpate.shared.tables import Estimator
 
 Array = NDArray[np.float64]
 
@@ -199,13 +201,15 @@ class HistoryComparison:
             moment.estimate(estimator)
 
 
-def play(atlas: ReducedModel, presses: Sequence[Press]) -> list[Moment]:
+def play(atlas: ReducedModel, presses: Sequence[Press]) -> list[Answer]:
     """Answers of the reduced model."""
-    history, moments = History(), []
+    past, warm, moments = REST, atlas.new_warm(), []
     for press in presses:
-        moment, history = atlas.step(
-            history, press.dt, press.position, press.pressure, press.direction
+        moment = atlas.press(
+            press.position, press.pressure, press.direction, past=past, dt=press.dt, warm=warm
         )
+        assert moment.past is not None
+        past = moment.past
         moments.append(moment)
     return moments
 

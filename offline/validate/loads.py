@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv as csv_format
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from palpate.offline.reduce.sampling import cone, random_points_and_rim
+from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.workers import completed, worker_pool
 from palpate.offline.run.workshop import Load, Workshop, open_artifact
 from palpate.offline.validate.norms import relative, statistics
@@ -20,13 +22,11 @@ from palpate.shared.artifact import read_artifact
 from palpate.shared.errors import PalpateError
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.mechanics.footprint import pressure_limit
-from palpate.shared.model import Estimator, ReducedModel
+from palpate.shared.model import ReducedModel
 from palpate.shared.scene import Scene
+from palpate.shared.tables import Estimator
 
 Array = NDArray[np.float64]
-
-UNSEEN = 100
-"""Sets these random numbers apart from those of the stages of training, which count from 1."""
 
 ESTIMATED = ("displacement", "von_mises")
 
@@ -48,7 +48,7 @@ class Comparison:
     load, tilt : float
         Fractions of the limits.
     departure, residual : float
-        Departure from the linear response and predicted residual, see ``shared.model.Solution``.
+        Departure from the linear response and predicted residual, see ``shared.answer.Answer``.
     features : ndarray
         Of the error estimate.
     displacement, von_mises : float
@@ -136,7 +136,7 @@ def unseen(artifact: Path, seed: int) -> tuple[ReducedModel, Workshop, np.random
     """An artifact, its full model, and random numbers that training has not seen."""
     atlas = ReducedModel.load(artifact)
     workshop = Workshop.of_artifact(read_artifact(artifact))
-    return atlas, workshop, np.random.default_rng([atlas.scene.seed, UNSEEN, seed])
+    return atlas, workshop, stream(atlas.scene.seed, Stage.UNSEEN, seed)
 
 
 def verdict(
@@ -175,7 +175,7 @@ def verdict(
 
 def unseen_loads(atlas: ReducedModel, count: int, seed: int) -> list[Load]:
     """Random loads that training has not seen, whatever the seed."""
-    rng = np.random.default_rng([atlas.scene.seed, UNSEEN, seed])
+    rng = stream(atlas.scene.seed, Stage.UNSEEN, seed)
     return random_loads(atlas.surface, atlas.limits, atlas.scene, count, rng)
 
 
@@ -199,7 +199,7 @@ def random_loads(
 
 def compare(workshop: Workshop, atlas: ReducedModel, load: Load, reference: Array) -> Comparison:
     """Answer a load with the reduced model and compare with the full ``reference`` (n, 3) mm."""
-    solution = atlas.solve(load.position, load.pressure, load.direction)
+    solution = atlas.press(load.position, load.pressure, load.direction)
     displacement = atlas.displacement(solution).astype(float)
     exact, stress = workshop.von_mises(reference), atlas.von_mises(solution).astype(float)
     kept = workshop.beyond_clamped_layer
@@ -292,7 +292,11 @@ def calibrate_by_halves(
 
 
 def coverage(rows: Sequence[Any], quantities: Sequence[str]) -> tuple[float, dict[str, float]]:
-    """Share of rows whose errors are all within their estimates; median of estimate over error."""
+    """Share of rows whose errors are all within their estimates; median of estimate over error.
+
+    Of the rows in range: outside it there is no estimate.
+    """
+    rows = [r for r in rows if getattr(r, f"estimated_{quantities[0]}") != math.inf]
     covered = [
         all(getattr(r, name) <= getattr(r, f"estimated_{name}") for name in quantities)
         for r in rows

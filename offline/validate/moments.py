@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from palpate.offline.validate.loads import calibrate, coverage
 from palpate.offline.validate.tip import OTHER_EQUILIBRIUM
-from palpate.shared.model import Estimator
-from palpate.shared.reduced.history import Moment
-from palpate.shared.reduced.touch import Touch
+from palpate.shared.answer import Answer
+from palpate.shared.tables import Estimator
 
 Array = NDArray[np.float64]
 
@@ -74,7 +73,7 @@ def _largest_so_far(a: NDArray[Any], b: NDArray[Any]) -> Array:
     return np.asarray(away / np.maximum(size, 1e-9 * max(float(size[-1]), 1e-300)))
 
 
-def known_moments(errors: Array, answers: Sequence[Moment | Touch]) -> list[KnownMoment]:
+def known_moments(errors: Array, answers: Sequence[Answer]) -> list[KnownMoment]:
     """Answers whose errors (quantities, t) are known."""
     return [
         KnownMoment(
@@ -85,7 +84,7 @@ def known_moments(errors: Array, answers: Sequence[Moment | Touch]) -> list[Know
             features=answer.features,
             estimated_displacement=answer.error_displacement,
             estimated_von_mises=answer.error_von_mises,
-            estimated_force=answer.error_force if isinstance(answer, Touch) else 0.0,
+            estimated_force=answer.error_force,
         )
         for own, answer in zip(errors.T.tolist(), answers, strict=True)
     ]

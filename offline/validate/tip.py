@@ -9,19 +9,17 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
-from palpate.offline.reduce.cubature import damped_fit
 from palpate.offline.reduce.sampling import random_points_and_rim
 from palpate.offline.run.workshop import TouchSample, Workshop
 from palpate.offline.validate.loads import calibrate, coverage, unseen, verdict
 from palpate.offline.validate.norms import relative, statistics
+from palpate.shared.answer import Answer
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.mechanics.footprint import TIP_DEPTH
-from palpate.shared.model import Estimator, ReducedModel
-from palpate.shared.reduced.press import RESIDUAL_FEATURES, residual_features
-from palpate.shared.reduced.touch import Touch
+from palpate.shared.model import ReducedModel
 from palpate.shared.scene import Scene
+from palpate.shared.tables import Estimator
 
 Array = NDArray[np.float64]
 
@@ -29,12 +27,6 @@ QUANTITIES = ("displacement", "von_mises", "force")
 
 COVERAGE, DAMPING = 0.96, 1.0
 """Of the error estimate: they scatter more than those of loads."""
-
-RESIDUAL_TOUCHES = 40
-"""Answers for each patch that tell the residual in the full model."""
-
-RESIDUAL_DAMPING = 0.15
-"""Of the fit of their logs: they scatter about any smooth function."""
 
 OTHER_EQUILIBRIUM = 0.1
 """Displacement error beyond which the models rest in different equilibria: a free edge can slip off
@@ -95,48 +87,6 @@ def calibrate_touches(rows: Sequence[TouchComparison]) -> Estimator:
     return calibrate(rows, QUANTITIES, COVERAGE, DAMPING)
 
 
-def fit_residuals(workshop: Workshop, atlas: ReducedModel, rng: np.random.Generator) -> Array:
-    """What answers under the tip leave in the full model, patch by patch: ``LocalTips.residuals``.
-
-    Answers at random positions count for all patches that share in them.
-    """
-    models = atlas.tips
-    assert models is not None, "or there would be no answers"
-    patches = models.centres.shape[1]
-    rows: list[list[Array]] = [[] for _ in range(patches)]
-    logs: list[list[float]] = [[] for _ in range(patches)]
-    count = RESIDUAL_TOUCHES * patches
-    positions = random_positions(atlas.surface, atlas.limits, atlas.scene, count, rng)
-    for position in tqdm(positions, "residuals under the tip"):
-        answer = atlas.touch(position)
-        residual = residual_left(workshop, atlas, answer) if answer.converged else np.inf
-        if 0.0 < residual < np.inf:
-            inward, share = -answer.features[4:7], answer.depth / answer.depth_limit
-            for k, _, _ in answer.patches:
-                row, centre = np.empty(RESIDUAL_FEATURES), models.centres[:, k]
-                residual_features(models.frames[k], centre, position, inward, share, row)
-                rows[k].append(row)
-                logs[k].append(float(np.log(residual)))
-    usual = float(np.mean(np.concatenate(logs)))
-    fitted = np.zeros((patches, RESIDUAL_FEATURES))
-    for k, (A, log) in enumerate(zip(rows, logs, strict=True)):
-        fitted[k, 0] = np.mean(log) if log else usual
-        if log:
-            rest = np.array(log)[:, None] - fitted[k, 0]
-            fitted[k] += damped_fit(np.array(A), rest, RESIDUAL_DAMPING)[:, 0]
-    return fitted
-
-
-def residual_left(workshop: Workshop, atlas: ReducedModel, answer: Touch) -> float:
-    """What an answer leaves in the full model, relative to it in the energy norm at rest."""
-    model, contact = workshop.model, workshop.contact
-    u = atlas.displacement(answer).astype(float).ravel()
-    contact.position[:] = answer.position
-    load = np.zeros_like(u)
-    contact.potential(u, load)
-    return float(model.relative_residuals(u[None, model.free], -load[None, model.free])[0])
-
-
 def random_positions(
     surface: Surface, limits: Array, scene: Scene, count: int, rng: np.random.Generator
 ) -> Array:
@@ -154,7 +104,7 @@ def random_positions(
 
 
 def compare_touch(
-    workshop: Workshop, atlas: ReducedModel, answer: Touch, sample: TouchSample
+    workshop: Workshop, atlas: ReducedModel, answer: Answer, sample: TouchSample
 ) -> TouchComparison:
     """Compare an answer with the full solution."""
     displacement = atlas.displacement(answer).astype(float)

@@ -21,13 +21,14 @@ from palpate.offline.validate.moments import (
 )
 from palpate.offline.validate.norms import relative, statistics
 from palpate.offline.validate.tip import OTHER_EQUILIBRIUM, QUANTITIES
+from palpate.shared.answer import Answer
 from palpate.shared.errors import QueryError
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.mechanics.footprint import TIP_DEPTH
-from palpate.shared.model import Estimator, ReducedModel
-from palpate.shared.reduced.history import History
-from palpate.shared.reduced.touch import Touch
+from palpate.shared.model import ReducedModel
+from palpate.shared.reduced.transfer import REST
 from palpate.shared.scene import Scene
+from palpate.shared.tables import Estimator
 
 Array = NDArray[np.float64]
 
@@ -63,11 +64,13 @@ def random_courses(
     return courses
 
 
-def play_course(atlas: ReducedModel, course: Course) -> list[Touch]:
+def play_course(atlas: ReducedModel, course: Course) -> list[Answer]:
     """Answers of the reduced model."""
-    history, answers = History(), []
+    past, warm, answers = REST, atlas.new_warm(), []
     for position, dt in zip(*course, strict=True):
-        answer, history = atlas.touch_step(history, dt, position)
+        answer = atlas.touch(position, past=past, dt=dt, warm=warm)
+        assert answer.past is not None
+        past = answer.past
         answers.append(answer)
     return answers
 

@@ -71,7 +71,7 @@ class Extrapolator:
     Parameters
     ----------
     most : float, mN
-        Largest force that the device may be told.
+        Largest force on the device.
 
     Examples
     --------

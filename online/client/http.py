@@ -3,26 +3,21 @@
 Sessions are opened by the clients here and live in `client.session`.
 """
 
-import asyncio
 import http.client
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, ParamSpec, Self, TypeVar
-from urllib.parse import quote, urlsplit
+from typing import Any, Self
+from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.online.client.session import AsyncSession, ServiceError, Session
+from palpate.online.client.session import ServiceError, Session, split_address
 from palpate.online.serve import wire
 from palpate.online.serve.negotiation import BINARY, JSON
 from palpate.shared.errors import PalpateError
-
-P = ParamSpec("P")
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -34,6 +29,7 @@ class Answer:
     contact, trust, timing : dict
         As `serve.schemas` describes them.
     force : ndarray, shape (3,), mN
+        On the tool.
     contact_displacement : ndarray, shape (3,), mm
     displacement : ndarray, shape (k, 3), float32, mm, or None if not asked for
     von_mises : ndarray, shape (k,), float32, kPa, or None if not asked for
@@ -75,13 +71,19 @@ class Accessible:
     Parameters
     ----------
     vertices, normals : ndarray, shape (v, 3), float32, mm and unit
+    pressure_limit : ndarray, shape (v,), float32, kPa
+        Largest trained pressure along the inward normal.
     triangles : ndarray, shape (t, 3), int32
         Indices into `vertices`, outward.
+    depth_limit : ndarray, shape (v,), float32, mm, or None
+        Largest trained depth of the tip; None if the scene was trained without a tip.
     """
 
     vertices: NDArray[np.float32]
     normals: NDArray[np.float32]
+    pressure_limit: NDArray[np.float32]
     triangles: NDArray[np.int32]
+    depth_limit: NDArray[np.float32] | None = None
 
 
 class Client:
@@ -98,29 +100,22 @@ class Client:
     Examples
     --------
     >>> with Client("http://127.0.0.1:8000") as client:             # doctest: +SKIP
-    ...     answer = client.solve("turbinate", (13.1, 20.0, 9.5), pressure=4.0, region="surface")
+    ...     answer = client.solve("turbinate", (10.0, 20.0, 11.0), pressure=3.5, region="surface")
     ...     print(answer.force, answer.displacement.max())
     """
 
     def __init__(self, url: str, token: str | None = None, timeout: float = 10.0) -> None:
-        parts = urlsplit(url)
-        if parts.scheme != "http" or parts.hostname is None:
-            raise PalpateError(f"{url}: not an address like http://127.0.0.1:8000")
+        parts = split_address(url)
         self._url, self._token, self._timeout = url, token, timeout
         self._headers = {"Content-Type": JSON}
         if token is not None:
             self._headers["Authorization"] = f"Bearer {token}"
-        self._connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=timeout)
+        self._connection = http.client.HTTPConnection(parts.netloc, timeout=timeout)
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._connection.close()
 
     def scenes(self) -> dict[str, Any]:
@@ -129,18 +124,16 @@ class Client:
 
     def scene(self, name: str) -> dict[str, Any]:
         """Ask what may be asked of a scene, and how well it is answered."""
-        return json.loads(self._request("GET", f"/scenes/{quote(name, safe='')}", JSON))
+        return json.loads(self._request("GET", _path(name), JSON))
 
     def mesh(self, name: str, region: str = "surface") -> Mesh:
         """Get the undeformed mesh of a region, ``surface`` or ``all``."""
-        path = f"/scenes/{quote(name, safe='')}/mesh?region={quote(region)}"
-        _, arrays = wire.decode(self._request("GET", path, BINARY))
+        _, arrays = self._document("GET", name, f"/mesh?region={quote(region)}")
         return Mesh(**arrays)
 
     def accessible(self, name: str) -> Accessible:
         """Get the undeformed surface that the endoscope can touch."""
-        path = f"/scenes/{quote(name, safe='')}/accessible"
-        _, arrays = wire.decode(self._request("GET", path, BINARY))
+        _, arrays = self._document("GET", name, "/accessible")
         return Accessible(**arrays)
 
     def solve(
@@ -173,14 +166,14 @@ class Client:
         ServiceError
             If the service refuses.
         """
-        contact: dict[str, Any] = {"position": list(position), "pressure": pressure}
-        if direction is not None:
-            contact["direction"] = list(direction)
-        if radius is not None:
-            contact["radius"] = radius
+        contact = {
+            "position": list(position),
+            "pressure": pressure,
+            "direction": None if direction is None else list(direction),
+            "radius": radius,
+        }
         body = json.dumps({"contacts": [contact], "outputs": list(outputs), "region": region})
-        path = f"/scenes/{quote(name, safe='')}/solve"
-        head, fields = wire.decode(self._request("POST", path, BINARY, body.encode()))
+        head, fields = self._document("POST", name, "/solve", body.encode())
         return Answer(
             contact=head["contact"],
             trust=head["trust"],
@@ -195,65 +188,22 @@ class Client:
         """Open a session of a scene, on a connection of its own; see `Session`."""
         return Session(self._url, name, self._token, self._timeout, record)
 
+    def _document(
+        self, method: str, name: str, rest: str, body: bytes | None = None
+    ) -> tuple[wire.Head, dict[str, NDArray[Any]]]:
+        return wire.decode(self._request(method, _path(name) + rest, BINARY, body))
+
     def _request(self, method: str, path: str, accept: str, body: bytes | None = None) -> bytes:
-        self._connection.request(method, path, body, {"Accept": accept, **self._headers})
-        response = self._connection.getresponse()
+        try:
+            self._connection.request(method, path, body, {"Accept": accept, **self._headers})
+            response = self._connection.getresponse()
+        except ConnectionRefusedError:
+            raise PalpateError(f"{self._url}: no service answers there") from None
         content = response.read()
         if response.status != 200:
             raise ServiceError(response.status, json.loads(content)["error"])
         return content
 
 
-class AsyncClient:
-    """The same client for asyncio; one request at a time.
-
-    Examples
-    --------
-    >>> async with AsyncClient("http://127.0.0.1:8000") as client:     # doctest: +SKIP
-    ...     answer = await client.solve("turbinate", (13.1, 20.0, 9.5), pressure=4.0)
-    ...     async with client.session("turbinate") as session:
-    ...         reply = await session.step((13.1, 20.0, 11.4))
-    """
-
-    def __init__(self, url: str, token: str | None = None, timeout: float = 10.0) -> None:
-        self._client = Client(url, token, timeout)
-        self._url, self._token, self._timeout = url, token, timeout
-        self._turn = asyncio.Lock()
-
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        async with self._turn:
-            self._client.__exit__(kind, error, trace)
-
-    async def scenes(self) -> dict[str, Any]:
-        """Ask what is served; see `Client.scenes`."""
-        return await self._call(self._client.scenes)
-
-    async def scene(self, name: str) -> dict[str, Any]:
-        """Ask about a scene; see `Client.scene`."""
-        return await self._call(self._client.scene, name)
-
-    async def mesh(self, name: str, region: str = "surface") -> Mesh:
-        """Get the mesh of a region; see `Client.mesh`."""
-        return await self._call(self._client.mesh, name, region)
-
-    async def solve(
-        self, name: str, position: Sequence[float], pressure: float, **options: Any
-    ) -> Answer:
-        """Press the tissue; see `Client.solve`."""
-        return await self._call(self._client.solve, name, position, pressure, **options)
-
-    def session(self, name: str, record: Path | None = None) -> AsyncSession:
-        """Make a session of a scene; ``async with`` opens it."""
-        return AsyncSession(self._url, name, self._token, self._timeout, record)
-
-    async def _call(self, method: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        async with self._turn:
-            return await asyncio.to_thread(method, *args, **kwargs)
+def _path(name: str) -> str:
+    return f"/scenes/{quote(name, safe='')}"

@@ -11,10 +11,10 @@ import gc
 import os
 import select
 import socket
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter_ns
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,8 +46,8 @@ class Log:
     sent, received : list of int
         When it was its turn, and when its answer was whole; 0 if never.
     outcome : list of int
-    solve_us : list of float, µs
-        What the server says it took to solve.
+    solve_us, recover_us : list of float, µs
+        What the server says it took to solve, and to recover the fields of a query.
     flags : list of int
         Of sessions' frames: `session.frames.Flag`.
     """
@@ -56,34 +56,62 @@ class Log:
         self.due: list[int] = (1e9 * due).astype(np.int64).tolist()
         count = len(self.due)
         self.sent, self.received, self.outcome, self.flags = ([0] * count for _ in range(4))
-        self.solve_us = [0.0] * count
+        self.solve_us, self.recover_us = [0.0] * count, [0.0] * count
 
 
-class Stream(Protocol):
+class Stream(ABC):
     """A source of messages, with a socket or several.
 
     Attributes
     ----------
     log : Log
-    sockets : sequence of socket
+    sockets : list of socket
         Not blocking.
+    complaint : str
+        What went wrong last; empty if nothing did.
     """
 
-    log: Log
-    sockets: Sequence[socket.socket]
+    def __init__(self, due: NDArray[np.float64], sockets: Sequence[socket.socket]) -> None:
+        self.log = Log(due)
+        self.sockets = list(sockets)
+        self.complaint = ""
+        for connection in self.sockets:
+            connection.setblocking(False)
 
     @property
+    @abstractmethod
     def waiting(self) -> bool:
         """Whether an answer may still come."""
 
+    @abstractmethod
     def send(self, number: int, now: int) -> None:
         """Send a message, now being `now` (ns)."""
 
-    def receive(self, connection: socket.socket, now: int) -> bool:
+    @abstractmethod
+    def take(self, connection: socket.socket, chunk: bytes, now: int) -> bool:
         """Take what has come at `now` (ns); tell whether more may come on this socket."""
+
+    def lose(self, connection: socket.socket, why: str) -> bool:
+        """Do without a socket that broke; nothing comes on it any more."""
+        self.complaint = why
+        return False
+
+    def receive(self, connection: socket.socket, now: int) -> bool:
+        """Read a socket at `now` (ns); tell whether more may come on it."""
+        try:
+            chunk = connection.recv(CHUNK)
+        except BlockingIOError:
+            return True
+        except OSError as error:
+            return self.lose(connection, f"the connection broke: {error.strerror}")
+        if not chunk:
+            return self.lose(connection, "the service hung up")
+        return self.take(connection, chunk, now)
 
     def close(self) -> None:
         """Hang up."""
+        for connection in self.sockets:
+            connection.close()
 
 
 @dataclass(frozen=True)

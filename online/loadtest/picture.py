@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from palpate.online.loadtest.report import Messages, quantiles
 from palpate.online.loadtest.run import Outcome
 
-KINDS = {"sessions": ("C0", "frames"), "queries": ("C1", "queries")}
+COLOURS = {"frames": "C0", "queries": "C1"}
 MARKS = {"p50_us": ("50 %", "top"), "p99_us": ("99 %", "top"), "p999_us": ("99.9 %", "bottom")}
 BINS_PER_DECADE = 40
 
@@ -21,8 +21,8 @@ def draw(outcome: Outcome, path: Path) -> None:
         figure = Figure(figsize=(11, 4.2), layout="constrained")
         over_time, counts = figure.subplots(1, 2, width_ratios=(3, 2), sharey=True)
         _shade(over_time, outcome)
-        for name, (colour, label) in KINDS.items():
-            messages: Messages | None = getattr(outcome, name)
+        for label, colour in COLOURS.items():
+            messages = outcome.messages.get(label)
             if messages is None:
                 continue
             milliseconds = messages.latency / 1e3

@@ -8,12 +8,11 @@ import json
 import re
 import socket
 from collections import deque
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.online.loadtest.generator import CHUNK, DROPPED, Log
+from palpate.online.loadtest.generator import DROPPED, Stream
 from palpate.online.loadtest.target import Target
 from palpate.online.serve.negotiation import BINARY, JSON
 
@@ -21,11 +20,11 @@ PATIENCE = 1.0
 """Seconds that a query waits for a free connection."""
 
 _LENGTH = re.compile(rb"\r\ncontent-length: *(\d+)", re.I)
-_SOLVE = re.compile(rb"\bsolve;dur=([\d.]+)")
+_PHASES = re.compile(rb"\bsolve;dur=([\d.]+), recover;dur=([\d.]+)")
 
 
-class Queries:
-    """Solves of the loads given, with fields in binary.
+class QueryStream(Stream):
+    """The loads given, to be solved with fields in binary or only checked.
 
     Parameters
     ----------
@@ -36,11 +35,8 @@ class Queries:
     region : str
         The nodes to ask fields for: ``none``, ``surface`` or ``all``.
     connections : int
-
-    Attributes
-    ----------
-    complaint : str
-        What went wrong last with a connection.
+    verb : str
+        Endpoint of the scene: ``solve`` or ``check``.
     """
 
     def __init__(
@@ -51,17 +47,14 @@ class Queries:
         pressures: NDArray[np.float64],
         region: str,
         connections: int,
+        verb: str = "solve",
     ) -> None:
-        self.log = Log(due)
-        self.complaint = ""
-        head = target.head("POST", "solve", accept=BINARY, content_type=JSON)
+        super().__init__(due, [target.connect() for _ in range(connections)])
+        head = target.head("POST", target.path(verb), accept=BINARY, content_type=JSON)
         self._requests = [
             _request(head, position, pressure, region)
             for position, pressure in zip(positions.tolist(), pressures.tolist(), strict=True)
         ]
-        self.sockets: Sequence[socket.socket] = [target.connect() for _ in range(connections)]
-        for connection in self.sockets:
-            connection.setblocking(False)
         self._free = deque(self.sockets)
         self._queue: deque[int] = deque()
         self._answers: dict[socket.socket, _Answer] = {}
@@ -79,29 +72,21 @@ class Queries:
         else:
             self._queue.append(number)
 
-    def receive(self, connection: socket.socket, now: int) -> bool:
-        """Take a part of an answer; tell whether the connection is still open."""
-        try:
-            chunk = connection.recv(CHUNK)
-        except BlockingIOError:
-            return True
-        except OSError as error:
-            return self._lose(connection, f"a connection broke: {error.strerror}")
-        if not chunk:
-            return self._lose(connection, "the service closed a connection")
+    def take(self, connection: socket.socket, chunk: bytes, now: int) -> bool:
+        """Take a part of an answer; the connection stays open."""
         answer = self._answers[connection]
         if not answer.take(chunk):
             return True
         log, number = self.log, answer.number
         log.received[number] = now
         log.outcome[number] = answer.status
-        log.solve_us[number] = answer.solve_us
+        log.solve_us[number], log.recover_us[number] = answer.phases_us
         del self._answers[connection]
         self._go_on(connection, now)
         return True
 
     def _go_on(self, connection: socket.socket, now: int) -> None:
-        """Send the next query that is worth it, if any waits."""
+        """Send the next query that has not waited too long, if there is one."""
         while self._queue:
             number = self._queue.popleft()
             if now - self.log.due[number] < 1e9 * PATIENCE:
@@ -115,21 +100,16 @@ class Queries:
         try:
             connection.sendall(self._requests[number])
         except OSError as error:
-            self.complaint = f"a connection broke: {error.strerror}"
+            self.complaint = f"the connection broke: {error.strerror}"
             return
         self._answers[connection] = _Answer(number)
 
-    def _lose(self, connection: socket.socket, why: str) -> bool:
-        self.complaint = why
+    def lose(self, connection: socket.socket, why: str) -> bool:
+        """Go on with the other connections."""
         self._answers.pop(connection, None)
         if connection in self._free:
             self._free.remove(connection)
-        return False
-
-    def close(self) -> None:
-        """Hang up."""
-        for connection in self.sockets:
-            connection.close()
+        return super().lose(connection, why)
 
 
 class _Answer:
@@ -138,7 +118,7 @@ class _Answer:
     def __init__(self, number: int) -> None:
         self.number = number
         self.status = 0
-        self.solve_us = 0.0
+        self.phases_us = 0.0, 0.0
         self._head = b""
         self._missing = 0
 
@@ -152,9 +132,10 @@ class _Answer:
             if not blank:
                 return False
             self.status = int(head[9:12])
-            length, solve = _LENGTH.search(head), _SOLVE.search(head)
+            length, phases = _LENGTH.search(head), _PHASES.search(head)
             self._missing = (int(length[1]) if length else 0) - len(body)
-            self.solve_us = 1e3 * float(solve[1]) if solve else 0.0
+            if phases:
+                self.phases_us = 1e3 * float(phases[1]), 1e3 * float(phases[2])
         return self._missing <= 0
 
 

@@ -18,15 +18,13 @@ from palpate.online.loadtest.generator import (
     Log,
     Machine,
 )
-from palpate.online.loadtest.queries import Queries
-from palpate.online.loadtest.sessions import Session
 from palpate.online.session.frames import Flag
 
 ON_TIME = 100.0
 """Latest that a message may be sent in a clean window, µs after it was due."""
 
 LONGEST = 6_000_000_000
-"""Longest latency that is told from longer ones: a minute, in steps of 10 ns."""
+"""Largest latency that is counted as it is: a minute, in steps of 10 ns."""
 
 QUANTILES = {"p50_us": 50.0, "p90_us": 90.0, "p99_us": 99.0, "p999_us": 99.9, "max_us": 100.0}
 
@@ -43,8 +41,8 @@ class Messages(NamedTuple):
         From when it was due to when its turn came; NaN if that never was.
     latency : ndarray, shape (n,), µs
         From due to answered; NaN without an answer.
-    solve : ndarray, shape (n,), µs
-        What the server says; NaN without an answer.
+    solve, recover : ndarray, shape (n,), µs
+        What the server says that it spent on them; NaN without an answer.
     outcome, flags : ndarray, shape (n,), int
     """
 
@@ -52,6 +50,7 @@ class Messages(NamedTuple):
     lateness: Array
     latency: Array
     solve: Array
+    recover: Array
     outcome: NDArray[np.int64]
     flags: NDArray[np.int64]
 
@@ -63,9 +62,9 @@ class Messages(NamedTuple):
 
 def gather(logs: Sequence[Log]) -> Messages:
     """Put the messages of several streams in one order."""
-    due, sent, received, outcome, solve, flags = (
+    due, sent, received, outcome, solve, recover, flags = (
         np.concatenate([getattr(log, name) for log in logs])
-        for name in ("due", "sent", "received", "outcome", "solve_us", "flags")
+        for name in ("due", "sent", "received", "outcome", "solve_us", "recover_us", "flags")
     )
     answered = outcome == ANSWERED
     messages = Messages(
@@ -73,6 +72,7 @@ def gather(logs: Sequence[Log]) -> Messages:
         np.where(sent > 0, 1e-3 * (sent - due), np.nan),
         np.where(answered, 1e-3 * (received - due), np.nan),
         np.where(answered, solve, np.nan),
+        np.where(answered, recover, np.nan),
         outcome,
         flags,
     )
@@ -114,51 +114,51 @@ def quantiles(microseconds: Array) -> dict[str, float | None]:
     }
 
 
-def summarize(messages: Messages, clean: NDArray[np.bool_]) -> dict[str, Any]:
-    """Say what became of messages, those marked `clean` apart."""
+def summarize(
+    messages: Messages, clean: NDArray[np.bool_], complaints: Sequence[str]
+) -> dict[str, Any]:
+    """Say what became of frames or queries, those marked `clean` apart.
+
+    A query is dropped that found no free connection in time; those refused are counted by status.
+    """
+    outcomes = Counter(messages.outcome.tolist())
+    flags = messages.flags[messages.outcome == ANSWERED]
     return {
         "due": len(messages.due),
-        "answered": int((messages.outcome == ANSWERED).sum()),
+        "answered": outcomes.pop(ANSWERED, 0),
+        "lost": outcomes.pop(LOST, 0),
+        "superseded": outcomes.pop(SUPERSEDED, 0),
+        "dropped": outcomes.pop(DROPPED, 0),
+        "refused": {str(status): number for status, number in sorted(outcomes.items())},
+        "flags": {bit.name: int((flags & bit > 0).sum()) for bit in Flag},
         "clean": quantiles(messages.latency[clean]),
         "all": quantiles(messages.latency),
         "solve_us": quantiles(messages.solve),
         "clean_solve_us": quantiles(messages.solve[clean]),
+        "complaints": sorted({complaint for complaint in complaints if complaint}),
     }
 
 
-def summarize_sessions(
-    sessions: Sequence[Session], messages: Messages, clean: NDArray[np.bool_]
-) -> dict[str, Any]:
-    """Say what became of the frames of sessions."""
-    answered = messages.flags[messages.outcome == ANSWERED]
-    return {
-        "lost": int((messages.outcome == LOST).sum()),
-        "superseded": int((messages.outcome == SUPERSEDED).sum()),
-        **summarize(messages, clean),
-        "flags": {bit.name: int((answered & bit > 0).sum()) for bit in Flag},
-        "complaints": sorted({session.complaint for session in sessions if session.complaint}),
-    }
+def summarize_added(messages: Messages, empty: Messages) -> dict[str, float]:
+    """Say what the service adds to a solve.
 
+    Parameters
+    ----------
+    messages : Messages
+        Queries, or frames of sessions.
+    empty : Messages
+        Queries that were only checked, or frames that were only echoed.
 
-def summarize_queries(
-    queries: Queries, messages: Messages, clean: NDArray[np.bool_]
-) -> dict[str, Any]:
-    """Say what became of queries.
-
-    Those refused are counted by status; dropped are those that found no free connection in time.
+    Returns
+    -------
+    dict
+        Medians: ``added_us``, round trips less what the service spent on solving and on recovering
+        fields; ``empty_us``, round trips of `empty`; and the first over the second, ``ratio``.
     """
-    outcomes = Counter(messages.outcome.tolist())
-    return {
-        "lost": outcomes[LOST],
-        "dropped": outcomes[DROPPED],
-        "refused": {
-            str(status): number
-            for status, number in sorted(outcomes.items())
-            if status not in (LOST, DROPPED, ANSWERED)
-        },
-        **summarize(messages, clean),
-        "complaints": [queries.complaint] if queries.complaint else [],
-    }
+    trip, empty_trip = (m.latency - m.lateness for m in (messages, empty))
+    added = float(np.nanmedian(trip - messages.solve - messages.recover))
+    empty_us = float(np.nanmedian(empty_trip))
+    return {"added_us": added, "empty_us": empty_us, "ratio": added / empty_us}
 
 
 def summarize_machine(machine: Machine, messages: Messages) -> dict[str, Any]:
@@ -175,7 +175,7 @@ def summarize_machine(machine: Machine, messages: Messages) -> dict[str, Any]:
 
 
 def summarize_overload(messages: Messages, machine: Machine, borders: Array) -> dict[str, Any]:
-    """Say how a service bore an overload and how soon it was as before.
+    """Describe latencies before, during and after an overload.
 
     Parameters
     ----------
@@ -220,21 +220,21 @@ def _worst(messages: Messages, window: NDArray[np.int64], chosen: int) -> float:
 
 
 def table(summary: dict[str, Any]) -> str:
-    """Write a summary for people: a row of Markdown per kind of message and of windows."""
+    """Write a summary for people: rows of Markdown per kind of message and of windows."""
     rows = [
-        "| | answered | lost | superseded or refused | p50 µs | p99 µs | p99.9 µs | max µs |",
-        "|---|---|---|---|---|---|---|---|",
+        "| | answered | lost | superseded | refused | p50 µs | p99 µs | p99.9 µs | max µs |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     kinds = {"frames" if summary["plan"]["sessions"] else "queries": summary}
     if "queries" in summary:
         kinds["queries"] = summary["queries"]
     for name, kind in kinds.items():
-        shed = kind["superseded"] if "superseded" in kind else sum(kind["refused"].values())
-        counts = f"{kind['answered']} | {kind['lost']} | {shed}"
+        refused = sum(kind["refused"].values()) + kind["dropped"]
+        counts = f"{kind['answered']} | {kind['lost']} | {kind['superseded']} | {refused}"
         rows += [
-            f"| {name}, clean windows | | | | {_row(kind['clean'])} |",
+            f"| {name}, clean windows | | | | | {_row(kind['clean'])} |",
             f"| {name}, all windows | {counts} | {_row(kind['all'])} |",
-            f"| {name}, solve alone | | | | {_row(kind['solve_us'])} |",
+            f"| {name}, solve alone | | | | | {_row(kind['solve_us'])} |",
         ]
     machine = summary["machine"]
     rows += [
@@ -244,6 +244,11 @@ def table(summary: dict[str, Any]) -> str:
         f"{machine['lateness_us']['p50_us']:.1f} µs (p50), {machine['lateness_us']['p99_us']:.1f} "
         "µs (p99)",
     ]
+    for name, added in summary.get("added", {}).items():
+        rows.append(
+            f"the service adds {added['added_us']:.0f} µs to what it spends on {name}: "
+            f"{added['ratio']:.2f} times an empty round trip ({added['empty_us']:.0f} µs)"
+        )
     if "overload" in summary:
         recovered = summary["overload"]["recovered_s"]
         rows.append("not recovered" if recovered is None else f"recovered after {recovered} s")

@@ -7,20 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.online.client.http import Client
+from palpate.online.loadtest import report
 from palpate.online.loadtest.generator import Machine, Stream, drive
 from palpate.online.loadtest.paths import Tip, tool_path
-from palpate.online.loadtest.queries import Queries
-from palpate.online.loadtest.report import (
-    Messages,
-    clean_windows,
-    gather,
-    summarize_machine,
-    summarize_overload,
-    summarize_queries,
-    summarize_sessions,
-    window_of,
-)
-from palpate.online.loadtest.sessions import Session
+from palpate.online.loadtest.queries import QueryStream
+from palpate.online.loadtest.report import Messages, clean_windows, gather, window_of
+from palpate.online.loadtest.sessions import FrameStream
 from palpate.online.loadtest.target import Target
 from palpate.shared.errors import PalpateError
 
@@ -35,30 +27,19 @@ SHARE = 0.15
 
 @dataclass(frozen=True)
 class Plan:
-    """What to put on a service.
+    """What to put on a service: the options of ``palpate loadtest``, whose help says more.
 
     Parameters
     ----------
-    url, scene : str
-    sessions : int
-    rate : float, Hz
-        Frames per second of each session.
-    queries : float, 1/s
-        Solves over HTTP, in all.
+    rate, queries : float, 1/s
+        Frames of each session, and queries in all.
     duration : float, s
     overload : float
         If above 1: what the rates are multiplied with for another `duration`, before a third one
         as the first.
-    region : str
-        Of the fields that queries ask for: ``none``, ``surface`` or ``all``.
-    connections : int
-        Of the queries.
     depth : float, mm
-        How deep the tools press at most.
     outputs : int
-        Bits of `session.frames.Output` that frames ask for.
-    token : str, optional
-    seed : int
+        Bits of `session.frames.Output`.
     """
 
     url: str
@@ -72,6 +53,7 @@ class Plan:
     connections: int = 4
     depth: float = 1.0
     outputs: int = 0
+    echo: bool = False
     token: str | None = None
     seed: int = 0
 
@@ -83,23 +65,23 @@ class Outcome:
     Parameters
     ----------
     summary : dict
-        For JSON.
+        JSON-able.
     machine : Machine
     clean : ndarray, shape (w,), bool
         Which windows of `machine` were clean.
-    sessions, queries : Messages or None
-        None if there were none of the kind.
+    messages : dict of Messages
+        By kind: ``frames`` and ``queries``, and ``echoes`` and ``checks`` to compare them with;
+        those that were sent.
     """
 
     summary: dict[str, Any]
     machine: Machine
     clean: NDArray[np.bool_]
-    sessions: Messages | None
-    queries: Messages | None
+    messages: dict[str, Messages]
 
 
 def run(plan: Plan) -> Outcome:
-    """Put a load on a service and tell how it bore it.
+    """Put a load on a service and report what became of it.
 
     Raises
     ------
@@ -114,24 +96,30 @@ def run(plan: Plan) -> Outcome:
         scene = client.scene(plan.scene)
         surface = client.accessible(plan.scene)
     target = Target(plan.url, plan.scene, plan.token)
-    sessions: list[Session] = []
-    queries: list[Queries] = []
+    streams: dict[str, list[Stream]] = {"frames": [], "queries": [], "echoes": [], "checks": []}
     try:
         for i in range(plan.sessions):
             due = _schedule(plan, plan.rate, i / plan.sessions)
             path = tool_path(surface, Tip(scene["ranges"]["radius"], plan.depth), due, rng)
-            sessions.append(Session(target, due, path, plan.outputs))
+            streams["frames"].append(FrameStream(target, due, path, plan.outputs))
+        if plan.sessions and plan.echo:
+            due = _schedule(plan, plan.rate, 0.5 / plan.sessions)
+            streams["echoes"].append(FrameStream(target, due, path, echo=True))
         if plan.queries:
             due = _schedule(plan, plan.queries, 0.5)
             places = rng.choice(surface.vertices, len(due))
             pressures = rng.uniform(0.0, SHARE * scene["ranges"]["pressure"][1], len(due))
-            queries.append(Queries(target, due, places, pressures, plan.region, plan.connections))
-        machine = drive([*sessions, *queries])
+            loads = places, pressures, plan.region, plan.connections
+            streams["queries"].append(QueryStream(target, due, *loads))
+            if plan.echo:
+                due = _schedule(plan, plan.queries, 0.0)
+                streams["checks"].append(QueryStream(target, due, *loads, verb="check"))
+        machine = drive([stream for kind in streams.values() for stream in kind])
     finally:
-        streams: list[Stream] = [*sessions, *queries]
-        for stream in streams:
-            stream.close()
-    return _judge(plan, machine, sessions, queries)
+        for kind in streams.values():
+            for stream in kind:
+                stream.close()
+    return _judge(plan, machine, streams)
 
 
 def _schedule(plan: Plan, rate: float, shift: float) -> Array:
@@ -145,24 +133,31 @@ def _schedule(plan: Plan, rate: float, shift: float) -> Array:
     )
 
 
-def _judge(
-    plan: Plan, machine: Machine, sessions: list[Session], queries: list[Queries]
-) -> Outcome:
-    every = gather([*(stream.log for stream in sessions), *(stream.log for stream in queries)])
+def _judge(plan: Plan, machine: Machine, streams: dict[str, list[Stream]]) -> Outcome:
+    every = gather([stream.log for kind in streams.values() for stream in kind])
+    messages = {name: gather([s.log for s in kind]) for name, kind in streams.items() if kind}
     clean = clean_windows(machine, every)
+    summaries = {
+        name: report.summarize(
+            messages[name],
+            clean[window_of(machine, messages[name])],
+            [stream.complaint for stream in streams[name]],
+        )
+        for name in ("frames", "queries")
+        if name in messages
+    }
     summary: dict[str, Any] = {"plan": asdict(plan) | {"token": None}}
-    frames = solves = None
-    if sessions:
-        frames = gather([stream.log for stream in sessions])
-        summary |= summarize_sessions(sessions, frames, clean[window_of(machine, frames)])
-    for asked in queries:
-        solves = gather([asked.log])
-        found = summarize_queries(asked, solves, clean[window_of(machine, solves)])
-        summary |= {"queries": found} if sessions else found
-    summary["machine"] = summarize_machine(machine, every)
+    summary |= summaries.pop("frames" if plan.sessions else "queries") | summaries
+    summary["machine"] = report.summarize_machine(machine, every)
+    if plan.echo:
+        summary["added"] = {
+            name: report.summarize_added(messages[name], messages[empty])
+            for name, empty in (("frames", "echoes"), ("queries", "checks"))
+            if name in messages
+        }
     if plan.overload > 1.0:
         borders = LEAD + np.arange(4.0) * plan.duration
-        summary["overload"] = summarize_overload(
-            every if frames is None else frames, machine, borders
+        summary["overload"] = report.summarize_overload(
+            messages.get("frames", every), machine, borders
         )
-    return Outcome(summary, machine, clean, frames, solves)
+    return Outcome(summary, machine, clean, messages)

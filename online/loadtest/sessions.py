@@ -1,20 +1,20 @@
 """Sessions as a stream of load: WebSocket frames on a bare socket, written before the test starts.
 
-Of a WebSocket library we would measure the library.
+With a WebSocket library the library would be measured too.
 """
 
 import base64
 import os
 import socket
 import struct
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.online.loadtest.generator import ANSWERED, CHUNK, SUPERSEDED, Log
+from palpate.online.loadtest.generator import ANSWERED, CHUNK, SUPERSEDED, Stream
 from palpate.online.loadtest.target import Target
 from palpate.online.session.frames import REPLY, REQUEST, VERSION
+from palpate.online.session.websocket import ECHO
 from palpate.shared.errors import PalpateError
 
 _TEXT, _BINARY, _CLOSE, _PING, _PONG = 1, 2, 8, 9, 10
@@ -26,15 +26,13 @@ def _offset(name: str) -> int:
     return int(REPLY.fields[name][1])
 
 
-_FLAGS_SEQ = struct.Struct("<HI")
-_SOLVE_TIME = struct.Struct("<f")
-_SUPERSEDED = struct.Struct("<I")
-_AT_FLAGS, _AT_SOLVE_TIME, _AT_SUPERSEDED = map(_offset, ("flags", "solve_time", "superseded"))
-assert _offset("seq") == _AT_FLAGS + 2
+_SOLVED, _DROPPED = _offset("solve_time"), _offset("superseded")
+_NEWS = struct.Struct(f"<2xHI{_SOLVED - 8}xf{_DROPPED - _SOLVED - 4}xI")
+"""Flags, number, solve_time and superseded of a reply."""
 
 
-class Session:
-    """One session that sends its positions when they are due.
+class FrameStream(Stream):
+    """One session that sends its positions when they are due; or an echo of the same frames.
 
     Parameters
     ----------
@@ -43,11 +41,8 @@ class Session:
     positions : ndarray, shape (n, 3), mm
     outputs : int
         Bits of `session.frames.Output`.
-
-    Attributes
-    ----------
-    complaint : str
-        What the server said last that was no answer.
+    echo : bool
+        Whether to send the frames to the service's echo rather than to a session.
     """
 
     def __init__(
@@ -56,17 +51,15 @@ class Session:
         due: NDArray[np.float64],
         positions: NDArray[np.float64],
         outputs: int = 0,
+        echo: bool = False,
     ) -> None:
-        self.log = Log(due)
-        self.complaint = ""
+        self._socket, self._received = _open(target, ECHO if echo else target.path("session"))
+        super().__init__(due, [self._socket])
         self._messages = _messages(due, positions, outputs)
         self._size = len(self._messages) // len(due)
         self._unsent = b""
         self._last_sent = self._last_answered = -1
         self._open = True
-        self._socket, self._received = _open(target)
-        self.sockets: Sequence[socket.socket] = (self._socket,)
-        self._socket.setblocking(False)
 
     @property
     def waiting(self) -> bool:
@@ -82,18 +75,8 @@ class Session:
         message = self._messages[number * self._size : (number + 1) * self._size]
         self._push(self._unsent + message if self._unsent else message)
 
-    def receive(self, connection: socket.socket, now: int) -> bool:
+    def take(self, connection: socket.socket, chunk: bytes, now: int) -> bool:
         """Take replies; tell whether the session is still open."""
-        try:
-            chunk = connection.recv(CHUNK)
-        except BlockingIOError:
-            return True
-        except OSError as error:
-            self._close(f"the connection broke: {error.strerror}")
-            return False
-        if not chunk:
-            self._close("the service hung up")
-            return False
         received = self._received + chunk if self._received else chunk
         start, end = 0, len(received)
         while (frame := _frame(received, start, end)) is not None:
@@ -108,13 +91,12 @@ class Session:
         return self._open
 
     def _record(self, received: bytes, begin: int, now: int) -> None:
-        flags, number = _FLAGS_SEQ.unpack_from(received, begin + _AT_FLAGS)
+        flags, number, solve_time, superseded = _NEWS.unpack_from(received, begin)
         log = self.log
         log.received[number] = now
         log.outcome[number] = ANSWERED
         log.flags[number] = flags
-        log.solve_us[number] = 1e6 * _SOLVE_TIME.unpack_from(received, begin + _AT_SOLVE_TIME)[0]
-        (superseded,) = _SUPERSEDED.unpack_from(received, begin + _AT_SUPERSEDED)
+        log.solve_us[number] = 1e6 * solve_time
         for dropped in range(max(number - superseded, self._last_answered + 1), number):
             log.outcome[dropped] = SUPERSEDED
         self._last_answered = number
@@ -123,7 +105,7 @@ class Session:
         if opcode == _PING:
             self._push(self._unsent + _message(_PONG, payload))
         elif opcode == _CLOSE:
-            self._close(payload[2:].decode() or "the service ended the session")
+            self.lose(self._socket, payload[2:].decode() or "the service ended the session")
         elif opcode == _TEXT:
             self.complaint = payload.decode()
 
@@ -134,19 +116,20 @@ class Session:
         except BlockingIOError:
             sent = 0
         except OSError as error:
-            self._close(f"the connection broke: {error.strerror}")
+            self.lose(self._socket, f"the connection broke: {error.strerror}")
             return
         self._unsent = message[sent:]
 
-    def _close(self, reason: str) -> None:
+    def lose(self, connection: socket.socket, why: str) -> bool:
+        """End the session."""
         self._open = False
-        self.complaint = reason
+        return super().lose(connection, why)
 
     def close(self) -> None:
-        """Hang up, with a word if there is anybody to hear it."""
+        """Hang up, with a close message if there is anybody to hear it."""
         if self._open:
             self._push(self._unsent + _message(_CLOSE, struct.pack("!H", 1000)))
-        self._socket.close()
+        super().close()
 
 
 def _messages(due: NDArray[np.float64], positions: NDArray[np.float64], outputs: int) -> bytes:
@@ -182,20 +165,20 @@ def _frame(received: bytes, start: int, end: int) -> tuple[int, int, int] | None
     return received[start] & 0x0F, begin, begin + length
 
 
-def _open(target: Target) -> tuple[socket.socket, bytes]:
-    """Open a session and wait for its hello; returns the socket and what came after that."""
+def _open(target: Target, path: str) -> tuple[socket.socket, bytes]:
+    """Open a session and wait for its greeting; return the socket and what came after that."""
     connection = target.connect()
     try:
-        return connection, _shake_hands(connection, target)
+        return connection, _shake_hands(connection, target, path)
     except BaseException:
         connection.close()
         raise
 
 
-def _shake_hands(connection: socket.socket, target: Target) -> bytes:
+def _shake_hands(connection: socket.socket, target: Target, path: str) -> bytes:
     head = target.head(
         "GET",
-        "session",
+        path,
         connection="upgrade",
         upgrade="websocket",
         sec_websocket_version="13",
@@ -207,12 +190,12 @@ def _shake_hands(connection: socket.socket, target: Target) -> bytes:
         received += _more(connection)
     answer, _, received = received.partition(b"\r\n\r\n")
     if not answer.startswith(b"HTTP/1.1 101"):
-        raise PalpateError(f"no session: {answer.decode('latin-1').splitlines()[0]} {received!r}")
-    while (hello := _frame(received, 0, len(received))) is None:
+        hint = " (start the service with: palpate serve --echo)" if path == ECHO else ""
+        status = answer.decode("latin-1").splitlines()[0]
+        raise PalpateError(f"{path}: {status} {received.decode('latin-1')}{hint}")
+    while (greeting := _frame(received, 0, len(received))) is None:
         received += _more(connection)
-    if hello[0] != _TEXT:
-        raise PalpateError("the session does not begin with a hello")
-    return received[hello[2] :]
+    return received[greeting[2] :]
 
 
 def _more(connection: socket.socket) -> bytes:

@@ -25,10 +25,14 @@ class Target(NamedTuple):
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return connection
 
-    def head(self, method: str, verb: str, **headers: str) -> str:
-        """Write the head of a request to the scene, but for the blank line that ends it."""
+    def path(self, verb: str) -> str:
+        """Return the path of an endpoint of the scene."""
+        return f"/scenes/{quote(self.scene, safe='')}/{verb}"
+
+    def head(self, method: str, path: str, **headers: str) -> str:
+        """Write the head of a request, but for the blank line that ends it."""
         lines = [
-            f"{method} /scenes/{quote(self.scene, safe='')}/{verb} HTTP/1.1",
+            f"{method} {path} HTTP/1.1",
             f"host: {urlsplit(self.url).netloc}",
             *(f"{name.replace('_', '-')}: {value}" for name, value in headers.items()),
             *([f"authorization: Bearer {self.token}"] if self.token else []),

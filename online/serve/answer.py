@@ -1,88 +1,77 @@
 """From the bytes of a request to those of its answer: decode, solve, recover, encode.
 
 The service's hot path. Nothing here awaits: an answer has the model for itself from its first line
-to its last.
+to its last; the number of steps of a history bounds how long others wait.
 """
 
 import math
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 from starlette.responses import Response
 
 from palpate.online.serve import wire
-from palpate.online.serve.errors import Refusal
+from palpate.online.serve.errors import Refusal, check_json_size
 from palpate.online.serve.metrics import PHASES, Metrics
 from palpate.online.serve.negotiation import JSON
-from palpate.online.serve.schemas import HistoryRequest, SolveRequest, parse_request
-from palpate.online.serve.store import Model
-from palpate.shared.answer import describe
+from palpate.online.serve.schemas import Contact, HistoryRequest, SolveRequest, parse
+from palpate.online.serve.store import ServedModel
+from palpate.shared.answer import Answer, describe
 from palpate.shared.errors import QueryError
-from palpate.shared.model import ReducedModel, Solution
-from palpate.shared.reduced.history import Moment
-
-ABSURD = 10.0
-"""Multiple of the largest trained pressure from which on there is no answer at all."""
+from palpate.shared.model import ReducedModel, Warm
+from palpate.shared.reduced.transfer import REST, Past
 
 
 def answer(
-    model: Model, body: bytes, media_type: str, max_json_numbers: int, metrics: Metrics
+    served: ServedModel,
+    kind: type[SolveRequest] | type[HistoryRequest],
+    body: bytes,
+    media_type: str,
+    max_json_numbers: int,
+    metrics: Metrics,
 ) -> Response:
     """Solve a request from rest and write the answer.
 
     Each request is answered on its own: the same request has the same answer, whatever came
     before it. Sessions are for clients that want a warm start.
 
+    Parameters
+    ----------
+    served : ServedModel
+    kind : SolveRequest or HistoryRequest
+        What the body holds.
+    body : bytes
+    media_type : str
+        Of the answer.
+    max_json_numbers : int
+        Largest number of field values in JSON.
+    metrics : Metrics
+
     Raises
     ------
     Refusal
-        If the request is malformed, the load is not one the model can be asked about, or it has
-        no equilibrium.
+        If the request is malformed, a load is not one the model can be asked about, or it has no
+        equilibrium; or if a history is asked of elastic tissue.
     """
     received = perf_counter()
-    request = parse_request(body)
-    atlas = model.atlas
-    contact = request.contacts[0]
+    request = parse(kind, body)
+    model = served.model
     if media_type == JSON:
-        check_size(atlas, request, max_json_numbers)
-    if contact.pressure > ABSURD * atlas.pressure_max:
-        raise Refusal(
-            "unanswerable_query",
-            "contacts.0.pressure",
-            f"More than {ABSURD:g} times the {atlas.pressure_max:.3g} kPa of the training",
-            {"le": ABSURD * atlas.pressure_max},
-        )
-
+        check_json_size(_count(model, request), max_json_numbers, "region")
     start = perf_counter()
-    try:
-        solution = atlas.solve(
-            contact.position, contact.pressure, contact.direction, contact.radius
-        )
-    except QueryError as error:
-        raise Refusal("unanswerable_query", f"contacts.0.{error.field}", error.message) from None
+    if isinstance(request, SolveRequest):
+        answers = _solve(model, request)
+    else:
+        answers = _follow(model, request)
     solved = perf_counter()
-    if not solution.converged:
-        raise Refusal(
-            "no_equilibrium",
-            "contacts.0.pressure",
-            "There is no equilibrium under this load; the model was trained for up to "
-            f"{solution.pressure_limit:.3g} kPa there",
-            {"le": solution.pressure_limit},
-        )
-
-    fields = recover(atlas, solution, request)
+    fields = _recover(model, answers[-1], request)
     recovered = perf_counter()
-
-    head = describe(atlas.name, solution)
-    _check_finite(solution, fields)
-    head["timing"] = {
-        "solve_us": 1e6 * (solved - start),
-        "recover_us": 1e6 * (recovered - solved),
-    }
+    head = _head(model, answers)
+    head["timing"] = {"solve_us": 1e6 * (solved - start), "recover_us": 1e6 * (recovered - solved)}
     content = wire.encode(media_type, head, fields)
-    encoded = perf_counter()
-    borders = (received, start, solved, recovered, encoded)
-    metrics.count_query(borders, solution.in_range)
+    borders = (received, start, solved, recovered, perf_counter())
+    metrics.count_query(borders, all(answer.in_range for answer in answers))
     timing = ", ".join(
         f"{phase};dur={1e3 * (end - begin):.4f}"
         for phase, begin, end in zip(PHASES, borders, borders[1:], strict=False)
@@ -90,45 +79,78 @@ def answer(
     return Response(content, media_type=media_type, headers={"server-timing": timing})
 
 
-def check_size(atlas: ReducedModel, request: SolveRequest | HistoryRequest, limit: int) -> None:
-    """Refuse fields that would keep the event loop busy writing decimals."""
-    nodes = {"none": 0, "surface": len(atlas.surface_nodes), "all": len(atlas.nodes)}
+def _count(model: ReducedModel, request: SolveRequest | HistoryRequest) -> int:
+    """Count the numbers in the fields that a request wants."""
+    nodes = {"none": 0, "surface": len(model.surface_nodes), "all": len(model.nodes)}
     per_node = 3 * ("displacement" in request.outputs) + ("von_mises" in request.outputs)
-    numbers = per_node * nodes[request.region]
-    if numbers > limit:
+    return per_node * nodes[request.region]
+
+
+def _solve(model: ReducedModel, request: SolveRequest) -> list[Answer]:
+    return [_press(model, request.contacts[0], "contacts.0")]
+
+
+def _follow(model: ReducedModel, request: HistoryRequest) -> list[Answer]:
+    if not model.scene.tissue.prony:
+        raise Refusal("no_time", "name", "The tissue of this scene is elastic; ask it to solve")
+    past: Past | None = REST
+    warm, now, answers = model.new_warm(), 0.0, []
+    for number, step in enumerate(request.steps):
+        path = f"steps.{number}.contact"
+        found = _press(model, step.contact, path, past, step.time - now, warm)
+        past, now = found.past, step.time
+        answers.append(found)
+    return answers
+
+
+def _press(
+    model: ReducedModel,
+    contact: Contact | None,
+    path: str,
+    past: Past | None = None,
+    dt: float = 0.0,
+    warm: Warm | None = None,
+) -> Answer:
+    """Answer a load, at once or `dt` (s) after a past; `path` is where the request has it."""
+    load: tuple[Any, ...] = None, 0.0
+    if contact is not None:
+        load = contact.position, contact.pressure, contact.direction, contact.radius
+    try:
+        found = model.press(*load, past=past, dt=dt, warm=warm)
+    except QueryError as error:
+        raise Refusal("unanswerable_query", f"{path}.{error.field}", error.message) from None
+    if not found.converged:
         raise Refusal(
-            "too_large_for_json",
-            "region",
-            f"{numbers} numbers are too many for JSON; accept application/octet-stream instead",
-            {"max_numbers": limit},
+            "no_equilibrium",
+            f"{path}.pressure",
+            "There is no equilibrium under this load; the model was trained for up to "
+            f"{found.pressure_limit:.3g} kPa there",
+            {"le": found.pressure_limit},
         )
+    if not math.isfinite(found.force.sum() + found.contact_displacement.sum() + found.min_jacobian):
+        raise Refusal("no_equilibrium", f"{path}.pressure", "The answer to this load is not finite")
+    return found
 
 
-def recover(
-    atlas: ReducedModel, answer: Solution | Moment, request: SolveRequest | HistoryRequest
+def _recover(
+    model: ReducedModel, answer: Answer, request: SolveRequest | HistoryRequest
 ) -> wire.Arrays:
-    """Fields that a request wants of an answer."""
+    """Get the fields that a request wants; they are finite."""
     fields = {}
     if request.region != "none":
-        displacement = atlas.displacement(answer)
+        displacement = model.displacement(answer)
         if "displacement" in request.outputs:
-            nodes = atlas.surface_nodes if request.region == "surface" else slice(None)
+            nodes = model.surface_nodes if request.region == "surface" else slice(None)
             fields["displacement"] = displacement[nodes]
         if "von_mises" in request.outputs:
-            fields["von_mises"] = atlas.von_mises(answer, request.region, displacement)
+            fields["von_mises"] = model.von_mises(answer, request.region, displacement)
+    if not all(np.isfinite(field).all() for field in fields.values()):
+        raise Refusal("no_equilibrium", "region", "The fields of this answer are not finite")
     return fields
 
 
-def _check_finite(solution: Solution, fields: wire.Arrays) -> None:
-    """Let no NaN and no infinity out, whatever the model thinks of itself."""
-    scalars = (
-        solution.force.sum()
-        + solution.contact_displacement.sum()
-        + solution.error_displacement
-        + solution.error_von_mises
-        + solution.min_jacobian
-    )
-    if not (math.isfinite(scalars) and all(np.isfinite(f).all() for f in fields.values())):
-        raise Refusal(
-            "no_equilibrium", "contacts.0.pressure", "The answer to this load is not finite"
-        )
+def _head(model: ReducedModel, answers: list[Answer]) -> dict[str, Any]:
+    """Write all but the fields, JSON-able."""
+    if answers[0].past is None:
+        return {"scene": model.name} | describe(answers[0])
+    return {"scene": model.name, "steps": [describe(answer) for answer in answers]}

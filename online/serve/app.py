@@ -6,6 +6,7 @@ import logging
 import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
+from functools import partial
 from importlib.metadata import version
 from typing import Any
 
@@ -15,14 +16,13 @@ from pydantic.json_schema import models_json_schema
 
 from palpate.online.serve import errors, guard
 from palpate.online.serve.answer import answer
-from palpate.online.serve.history import answer_history
 from palpate.online.serve.metrics import Metrics
 from palpate.online.serve.negotiation import JSON, OFFERED
-from palpate.online.serve.routes import add_routes
-from palpate.online.serve.schemas import HistoryRequest, SolveRequest
+from palpate.online.serve.routes import Service, add_routes
+from palpate.online.serve.schemas import CONVENTIONS, HistoryRequest, SolveRequest
 from palpate.online.serve.settings import Settings
-from palpate.online.serve.store import Model, Store
-from palpate.online.session import session
+from palpate.online.serve.store import ServedModel, Store
+from palpate.online.session.session import Sessions
 
 logger = logging.getLogger(__name__)
 
@@ -50,10 +50,11 @@ def create_app(
     """
     models = Store(settings.artifacts) if store is None else store
     counts = Metrics() if metrics is None else metrics
+    sessions = Sessions(models, settings, counts)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        preparing = asyncio.create_task(_prepare(models, on_ready))
+        preparing = asyncio.create_task(_prepare(models, sessions, on_ready))
         if settings.workers > 1:
             await preparing
         yield
@@ -65,22 +66,24 @@ def create_app(
         title="Palpate",
         version=version("palpate"),
         summary="Press soft tissue and get its answer in real time",
-        description="Units are mm, mN, kPa and s throughout.",
+        description=CONVENTIONS,
         lifespan=lifespan,
         redirect_slashes=False,
         redoc_url=None,
         # Even unused it looks for a tracer in every request; the service times itself.
         telemetry={"tracing": False, "metrics": False, "logs": False},
     )
-    app.state.metrics = counts
+    app.state.service = Service(models, settings, counts)
     errors.install(app)
     guard.install(app, settings, counts)
-    add_routes(app, models, settings, counts)
+    add_routes(app, sessions, settings.echo)
     _describe_request(app)
     return app
 
 
-async def _prepare(store: Store, on_ready: Callable[[Store], None] | None) -> None:
+async def _prepare(
+    store: Store, sessions: Sessions, on_ready: Callable[[Store], None] | None
+) -> None:
     """Load and warm the models in a thread, then keep the collector away from them."""
     loop = asyncio.get_running_loop()
     opened: asyncio.Future[bool] = loop.create_future()
@@ -92,7 +95,7 @@ async def _prepare(store: Store, on_ready: Callable[[Store], None] | None) -> No
     def load() -> None:
         done = False
         try:
-            store.open(_warm)
+            store.open(partial(_warm, sessions))
             done = True
         except Exception:
             logger.exception("the models could not be loaded")
@@ -100,7 +103,7 @@ async def _prepare(store: Store, on_ready: Callable[[Store], None] | None) -> No
             loop.call_soon_threadsafe(tell, done)
 
     logger.info("loading models; where kernels are compiled for the first time, it takes minutes")
-    # a daemon: a service that is told to stop does not wait for it
+    # a daemon: a service that has to stop does not wait for it
     threading.Thread(target=load, name="loading", daemon=True).start()
     if not await opened:
         return
@@ -111,29 +114,27 @@ async def _prepare(store: Store, on_ready: Callable[[Store], None] | None) -> No
         on_ready(store)
 
 
-def _warm(model: Model) -> None:
+def _warm(sessions: Sessions, served: ServedModel) -> None:
     """Call every kernel and encoder once, so that no client pays for a first time."""
     uncounted = Metrics()
     for region in ("none", "surface", "all"):
-        body = orjson.dumps({"contacts": [model.example], "region": region})
+        body = orjson.dumps({"contacts": [served.example], "region": region})
         for media_type in OFFERED:
-            answer(model, body, media_type, 10**9, uncounted)
-    _warm_history(model, uncounted)
-    session.warm(model, uncounted)
-
-
-def _warm_history(model: Model, metrics: Metrics) -> None:
-    """From one local model to the next and back: everything that a history may need."""
-    models = model.atlas.models
-    if models.viscous is None:
-        return
-    here, there = models.centres[models.viscous.pairs[0]].tolist()
-    steps = [
-        {"time": 0.1 * number, "contact": {"position": position, "pressure": 0.1}}
-        for number, position in enumerate((here, there, here))
-    ]
-    body = orjson.dumps({"steps": steps, "region": "all"})
-    answer_history(model, body, JSON, 10**9, metrics)
+            answer(served, SolveRequest, body, media_type, 10**9, uncounted)
+    models, radius = served.model.models, served.model.scene.endoscope.radius
+    tour: list[int] = []
+    if models.viscous is not None:  # a history goes from one local model to the next and back
+        here, there = models.viscous.pairs[0]
+        tour = [here, there, here]
+        steps = [
+            {"time": 0.1 * number, "contact": {"position": position, "pressure": 0.1}}
+            for number, position in enumerate(models.centres[tour].tolist())
+        ]
+        body = orjson.dumps({"steps": steps, "region": "all"})
+        answer(served, HistoryRequest, body, JSON, 10**9, uncounted)
+    if served.model.has_tip:
+        above = [models.centres[k] + 0.9 * radius * models.frames[k, 0] for k in tour]
+        sessions.prepare(served, [position.tolist() for position in above])
 
 
 def _describe_request(app: FastAPI) -> None:

@@ -17,31 +17,23 @@ from starlette.requests import ClientDisconnect
 
 from palpate.shared.errors import PalpateError
 
-STATUS = {
-    "unauthorized": 401,
-    "foreign_origin": 403,
-    "unknown_scene": 404,
-    "no_tip": 404,
-    "no_time": 404,
-    "unknown_snapshot": 404,
-    "not_found": 404,
-    "method_not_allowed": 405,
-    "not_acceptable": 406,
-    "body_too_large": 413,
-    "unsupported_media_type": 415,
-    "foreign_host": 421,
-    "upgrade_required": 426,
-    "invalid_json": 422,
-    "invalid_value": 422,
-    "unanswerable_query": 422,
-    "no_equilibrium": 422,
-    "too_large_for_json": 422,
-    "too_many_requests": 429,
-    "internal": 500,
-    "overloaded": 503,
-    "not_ready": 503,
-    "too_many_sessions": 503,
+_CODES = {
+    401: "unauthorized",
+    403: "foreign_origin",
+    404: "unknown_scene no_tip no_time unknown_snapshot not_found",
+    405: "method_not_allowed",
+    406: "not_acceptable",
+    413: "body_too_large",
+    415: "unsupported_media_type",
+    421: "foreign_host",
+    422: "invalid_json invalid_value unanswerable_query no_equilibrium too_large_for_json",
+    426: "upgrade_required",
+    429: "too_many_requests",
+    500: "internal",
+    503: "overloaded not_ready too_many_sessions",
 }
+STATUS = {code: status for status, codes in _CODES.items() for code in codes.split()}
+"""HTTP status of every code of a refusal."""
 
 
 class Refusal(PalpateError):
@@ -78,14 +70,24 @@ class Refusal(PalpateError):
 
     def response(self) -> Response:
         """Make the HTTP response that says so."""
-        error = {
-            "code": self.code,
-            "field": self.field,
-            "message": self.message,
-            "allowed": self.allowed,
-        }
-        return Response(
-            orjson.dumps({"error": error}), STATUS[self.code], self.headers, "application/json"
+        body = error_body(self.code, self.field, self.message, self.allowed)
+        return Response(body, STATUS[self.code], self.headers, "application/json")
+
+
+def error_body(code: str, field: str, message: str, allowed: Any = None) -> bytes:
+    """Write the JSON of an error."""
+    error = {"code": code, "field": field, "message": message, "allowed": allowed}
+    return orjson.dumps({"error": error})
+
+
+def check_json_size(numbers: int, limit: int, field: str) -> None:
+    """Refuse fields that would keep the event loop busy with writing decimals."""
+    if numbers > limit:
+        raise Refusal(
+            "too_large_for_json",
+            field,
+            f"{numbers} numbers are too many for JSON; ask for a binary format instead",
+            {"max_numbers": limit},
         )
 
 
@@ -99,7 +101,7 @@ def invalid(details: Sequence[Any], names: Mapping[str, Sequence[str]] | None = 
     names : mapping from table to keys, optional
         The valid keys of the body (``""``) and of its tables (``"contacts"``).
     """
-    # A misspelt key also leaves its right name missing; the misspelling is the news.
+    # a misspelt key also leaves its right name missing; the misspelling comes first
     first = min(details, key=lambda detail: detail["type"] != "extra_forbidden")
     path = [str(part) for part in first["loc"]]
     field = ".".join(path) or "body"
@@ -114,7 +116,7 @@ def invalid(details: Sequence[Any], names: Mapping[str, Sequence[str]] | None = 
 
 def _refuse(request: Request, refusal: Refusal) -> Response:
     """Count a refusal and answer with it."""
-    request.app.state.metrics.count_refusal(refusal.code)
+    request.app.state.service.metrics.count_refusal(refusal.code)
     return refusal.response()
 
 
@@ -135,19 +137,11 @@ async def _http(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     if error.status_code == 405:
         methods = Headers(error.headers).get("allow", "").split(", ")
-        return _refuse(
-            request,
-            Refusal(
-                "method_not_allowed",
-                "method",
-                "Not a method of this path",
-                methods,
-                error.headers,
-            ),
-        )
-    return _refuse(
-        request, Refusal("not_found", "path", "There is nothing at this path; see /docs")
-    )
+        message = "Not a method of this path"
+        refusal = Refusal("method_not_allowed", "method", message, methods, error.headers)
+    else:
+        refusal = Refusal("not_found", "path", "There is nothing at this path; see /docs")
+    return _refuse(request, refusal)
 
 
 async def _gone(request: Request, error: Exception) -> Response:
@@ -161,7 +155,7 @@ async def _bug(request: Request, error: Exception) -> Response:
 
 
 def install(app: FastAPI) -> None:
-    """Make `app` answer every error in the one shape, and count it in ``app.state.metrics``."""
+    """Make `app` answer every error in the one shape, and count it in ``app.state.service``."""
     app.add_exception_handler(Refusal, _refusal)
     app.add_exception_handler(RequestValidationError, _parameters)
     app.add_exception_handler(HTTPException, _http)

@@ -37,10 +37,10 @@ MOST_CLIENTS = 10_000
 
 
 def install(app: FastAPI, settings: Settings, metrics: Metrics) -> None:
-    """Put `app` behind the guard; with origins to allow, browsers are told of them."""
+    """Put `app` behind the guard; browsers learn which origins are allowed, if there are any."""
     app.add_middleware(Guard, settings=settings, metrics=metrics)
     if settings.origins:
-        # Outermost: preflights carry no token, and refusals must be readable by the page too.
+        # outermost: preflights carry no token, and refusals must be readable by the page too
         app.add_middleware(
             CORSMiddleware,
             allow_origins=settings.origins,
@@ -51,7 +51,7 @@ def install(app: FastAPI, settings: Settings, metrics: Metrics) -> None:
 
 
 class Guard:
-    """Lets pass what may pass and refuses the rest, in the shape of every refusal."""
+    """Passes on what may pass and refuses the rest."""
 
     def __init__(self, app: ASGIApp, settings: Settings, metrics: Metrics) -> None:
         self._app = app
@@ -89,16 +89,10 @@ class Guard:
         A page of another site may have its own name lead here (DNS rebinding); its origin is then
         that of the service.
         """
-        if not self._hosts:
-            return
         host = _host(headers.get(b"host", b""))
-        if host not in self._hosts and not _is_loopback_address(host):
-            raise Refusal(
-                "foreign_host",
-                "host",
-                "The service does not go by this name",
-                sorted({*self._hosts, "127.0.0.1"}),
-            )
+        if self._hosts and host not in self._hosts and not _is_loopback_address(host):
+            allowed = sorted({*self._hosts, "127.0.0.1"})
+            raise Refusal("foreign_host", "host", "The service does not go by this name", allowed)
 
     def _check_origin(self, headers: Mapping[bytes, bytes]) -> None:
         """Refuse other sites' pages: a browser would lend them the user's place in the network."""
@@ -106,15 +100,13 @@ class Guard:
         if origin is None or origin in self._origins or b"*" in self._origins:
             return
         if origin.partition(b"://")[2] != headers.get(b"host"):
-            raise Refusal(
-                "foreign_origin", "origin", "Pages of this origin may not use the service"
-            )
+            message = "Pages of this origin may not use the service"
+            raise Refusal("foreign_origin", "origin", message)
 
     def _check_token(self, headers: Mapping[bytes, bytes]) -> None:
-        if self._secret is None:
-            return
-        # Takes as long for a token that is nearly right as for any other.
-        if not hmac.compare_digest(headers.get(b"authorization", b""), self._secret):
+        given = headers.get(b"authorization", b"")
+        # takes as long for a token that is nearly right as for any other
+        if self._secret is not None and not hmac.compare_digest(given, self._secret):
             raise Refusal(
                 "unauthorized",
                 "authorization",
@@ -135,11 +127,8 @@ class Guard:
             )
 
     def _check_rate(self, scope: Scope, now: float) -> None:
-        if self._rates is None:
-            return
         client = scope.get("client")
-        wait = self._rates.take(client[0] if client else "", now)
-        if wait > 0.0:
+        if self._rates and (wait := self._rates.take(client[0] if client else "", now)) > 0.0:
             raise Refusal(
                 "too_many_requests",
                 "",

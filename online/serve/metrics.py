@@ -12,7 +12,7 @@ import mmap
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from itertools import accumulate
+from itertools import accumulate, product
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -62,47 +62,24 @@ class Family(NamedTuple):
         return len(BOUNDS) + 2 if self.type == "histogram" else 1
 
 
+_TIMED = tuple(product(KINDS, PHASES))
+_OF_FLAGS = (("query", "out_of_range"), *product(("session",), FLAGS.values()))
+_CODES, _OUTCOMES = tuple(product(STATUS)), tuple(product(FRAMES))
+
 FAMILIES = (
+    Family("histogram", "palpate_phase_seconds", "Time per phase", ("kind", "phase"), _TIMED),
     Family(
-        "histogram",
-        "palpate_phase_seconds",
-        "Time to answer a query or a session's frame, by phase",
-        ("kind", "phase"),
-        tuple((kind, phase) for kind in KINDS for phase in PHASES),
+        "histogram", "palpate_queue_seconds", "Wait for a turn", ("kind",), tuple(product(KINDS))
     ),
-    Family(
-        "histogram",
-        "palpate_queue_seconds",
-        "Time from when a request or frame was read to when its turn came",
-        ("kind",),
-        tuple((kind,) for kind in KINDS),
-    ),
-    Family(
-        "counter",
-        "palpate_flags_total",
-        "Answers by what is to be said of them",
-        ("kind", "flag"),
-        (("query", "out_of_range"), *(("session", flag) for flag in FLAGS.values())),
-    ),
-    Family(
-        "counter",
-        "palpate_refusals_total",
-        "Requests refused, by the code of the refusal",
-        ("code",),
-        tuple((code,) for code in STATUS),
-    ),
-    Family(
-        "counter",
-        "palpate_frames_total",
-        "Session frames, by what became of them",
-        ("outcome",),
-        tuple((outcome,) for outcome in FRAMES),
-    ),
+    Family("counter", "palpate_flags_total", "Answers by flag", ("kind", "flag"), _OF_FLAGS),
+    Family("counter", "palpate_refusals_total", "Requests refused", ("code",), _CODES),
+    Family("counter", "palpate_frames_total", "Session frames", ("outcome",), _OUTCOMES),
     Family("gauge", "palpate_sessions", "Open sessions"),
     Family("counter", "palpate_sessions_opened_total", "Sessions opened"),
     Family("counter", "palpate_worker_starts_total", "Starts of the worker"),
     Family("gauge", "palpate_worker_pid", "Process number of the worker"),
 )
+"""A query's or a frame's wait is from when it was read to when its turn came."""
 
 _FIRST = (0, *accumulate(len(family.values) * family.width for family in FAMILIES))
 WIDTH = _FIRST[-1]

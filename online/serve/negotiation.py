@@ -22,21 +22,12 @@ def negotiate(accept: str) -> str:
 
     Of types liked equally, the one named more exactly wins, then the first on offer.
     """
-    if not accept.strip():
-        return JSON
-    ranges = [_parse(part) for part in accept.split(",")]
+    ranges = [_parse(part) for part in accept.split(",")] if accept.strip() else [("*/*", 1.0)]
     best, score = "", (0.0, 0)
     for offered in OFFERED:
-        # The most exact range that matches a type decides on it, even if it says no.
-        exactness, quality = max(
-            (
-                (_exactness(pattern, offered), quality)
-                for pattern, quality in ranges
-                if _exactness(pattern, offered) > 0
-            ),
-            default=(0, 0.0),
-        )
-        if quality > 0 and (quality, exactness) > score:
+        # the most exact range that matches a type decides on it, even if it says no
+        exactness, quality = max((_exactness(pattern, offered), q) for pattern, q in ranges)
+        if exactness > 0 and quality > 0.0 and (quality, exactness) > score:
             best, score = offered, (quality, exactness)
     if not best:
         raise Refusal(

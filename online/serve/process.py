@@ -55,22 +55,16 @@ def _http(response: Response) -> bytes:
     return STATUS_LINE[response.status_code] + head + b"\r\n" + bytes(response.body)
 
 
-FULL = _http(
-    Refusal(
-        "overloaded",
-        "",
-        "The service has no place for another connection",
-        {"max_connections": MOST_CONNECTIONS},
-        {"Retry-After": "1", "Connection": "close"},
-    ).response()
-)
-"""What a client is told for whom there is no place."""
+_NO_PLACE = "The service has no place for another connection"
+_LIMIT, _LATER = {"max_connections": MOST_CONNECTIONS}, {"Retry-After": "1", "Connection": "close"}
+FULL = _http(Refusal("overloaded", "", _NO_PLACE, _LIMIT, _LATER).response())
+"""The response to a client for whom there is no place."""
 
 
-class Protocol(HttpToolsProtocol):
+class HttpProtocol(HttpToolsProtocol):
     """Uvicorn's HTTP, which also notes when it read a request, and whom it waits for.
 
-    A connection beyond `MOST_CONNECTIONS` is told so and closed, and one whose request is not
+    A connection beyond `MOST_CONNECTIONS` is refused and closed, and one whose request is not
     whole after `PATIENCE` is closed: it holds a place and memory.
     """
 
@@ -207,7 +201,7 @@ def _config(settings: Settings, host: str, port: int) -> uvicorn.Config:
         host=host,
         port=port,
         workers=settings.workers,
-        http=Protocol,
+        http=HttpProtocol,
         log_config=None,
         access_log=settings.access_log,
         **OPTIONS,

@@ -1,16 +1,18 @@
 """What goes over the wire, for the validator and for the reader of the OpenAPI page.
 
-Units are mm, mN, kPa and s. Requests are checked against these models; answers are written straight
-from arrays (`serve.answer`), and their models below only describe them.
+Requests are checked against these models; answers are written straight from arrays
+(`serve.answer`), and their models below only describe them.
 """
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, field_validator
 from pydantic_core import PydanticCustomError
 
-from palpate.online.serve.errors import Refusal, invalid
-from palpate.online.session.frames import Output, Request
+from palpate.online.serve.errors import invalid
+
+CONVENTIONS = "Units are mm, mN, kPa and s throughout; forces are those of the tissue on the tool."
+"""Of every endpoint and of sessions."""
 
 FieldName = Literal["displacement", "von_mises"]
 Region = Literal["none", "surface", "all"]
@@ -21,43 +23,35 @@ Component = Annotated[float, Field(ge=-1e3, le=1e3)]
 Position = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
 Direction = Annotated[list[Component], Field(min_length=3, max_length=3)]
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+Triangle = Annotated[list[int], Field(min_length=3, max_length=3)]
 
 SHORTEST_DIRECTION = 1e-3
 
-EXAMPLE_CONTACT: dict[str, JsonValue] = {
+MOST_STEPS = 200
+"""Largest number of steps of a history: so many keep others waiting for some 50 ms."""
+
+EXAMPLE_CONTACT: JsonValue = {
     "position": [5.0, 5.0, 5.0],
     "pressure": 4.0,
     "direction": [0.1, 0.0, -1.0],
 }
-EXAMPLE: dict[str, JsonValue] = {
+EXAMPLE: JsonValue = {
     "contacts": [EXAMPLE_CONTACT],
     "outputs": ["displacement"],
     "region": "surface",
 }
-
-
-MOST_STEPS = 200
-"""Of a history: they keep others waiting for some 50 ms."""
-
-MOST_SNAPSHOTS = 8
-"""That a session keeps."""
-
-EXAMPLE_HISTORY: dict[str, JsonValue] = {
-    "steps": [
-        {"time": 0.1, "contact": EXAMPLE_CONTACT},
-        {"time": 1.0, "contact": EXAMPLE_CONTACT},
-        {"time": 1.1, "contact": None},
-    ],
+EXAMPLE_HISTORY: JsonValue = {
+    "steps": [{"time": 0.1, "contact": EXAMPLE_CONTACT}, {"time": 1.1, "contact": None}]
 }
 
 
-class _Strict(BaseModel):
+class Strict(BaseModel):
     """Refuses unknown keys, NaN, infinities, and booleans or strings in place of numbers."""
 
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
 
-class Contact(_Strict):
+class Contact(Strict):
     """One endoscope pressing on the tissue."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [EXAMPLE_CONTACT]})
@@ -91,7 +85,19 @@ class Contact(_Strict):
         return direction
 
 
-class SolveRequest(_Strict):
+class _Asking(Strict):
+    outputs: list[FieldName] = Field(
+        ["displacement", "von_mises"], max_length=2, description="The fields to return."
+    )
+    region: Region = Field(
+        "none",
+        description="The nodes to return fields for, in the order of the mesh of that region; with "
+        "none, the answer holds the contact, the force and the trust block. Of a history the "
+        "fields are those of the last step.",
+    )
+
+
+class SolveRequest(_Asking):
     """A load, and what to answer about it."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [EXAMPLE]})
@@ -99,17 +105,9 @@ class SolveRequest(_Strict):
     contacts: list[Contact] = Field(
         min_length=1, max_length=1, description="The endoscopes at work; one, for now."
     )
-    outputs: list[FieldName] = Field(
-        ["displacement", "von_mises"], max_length=2, description="The fields to return."
-    )
-    region: Region = Field(
-        "none",
-        description="The nodes to return fields for, in the order of the mesh of that region; with "
-        "none, the answer holds the contact, the force and the trust block.",
-    )
 
 
-class Step(_Strict):
+class Step(Strict):
     """What presses at a time."""
 
     time: float = Field(ge=0, le=1e6, description="Since rest, s; no less than the step before.")
@@ -118,7 +116,7 @@ class Step(_Strict):
     )
 
 
-class HistoryRequest(_Strict):
+class HistoryRequest(_Asking):
     """Loads over time on tissue at rest, and what to answer about their end."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [EXAMPLE_HISTORY]})
@@ -128,12 +126,6 @@ class HistoryRequest(_Strict):
         max_length=MOST_STEPS,
         description="In order of time. Steps should be short beside the time constants of the "
         "tissue while the load changes; two at one time are a sudden change.",
-    )
-    outputs: list[FieldName] = Field(
-        ["displacement", "von_mises"], max_length=2, description="The fields to return."
-    )
-    region: Region = Field(
-        "none", description="The nodes to return the fields of the last step for, as in solve."
     )
 
     @field_validator("steps")
@@ -145,83 +137,22 @@ class HistoryRequest(_Strict):
         return steps
 
 
-class SessionRequest(_Strict):
-    """A position of the tip, in the JSON mode of a session."""
-
-    seq: int = Field(0, ge=0, lt=2**32, description="The client's number of this message, echoed.")
-    client_time: float = Field(
-        0.0, description="The client's clock, s, echoed; the time of visco-elastic tissue."
-    )
-    position: Position = Field(description="Centre of the tip, [x, y, z] mm.")
-    outputs: list[Literal["coordinates", "displacement", "von_mises", "stress"]] = Field(
-        [], max_length=4, description="What is wanted beyond force and tangent."
-    )
-
-
-class SessionCommand(_Strict):
-    """A request to keep the state of a session's tissue, or to go back to one that was kept."""
-
-    snapshot: int | None = Field(None, ge=0, lt=MOST_SNAPSHOTS, description="Number to keep it by.")
-    restore: int | None = Field(None, ge=0, lt=MOST_SNAPSHOTS, description="Number to go back to.")
-
-
-_NAMES = {"": list(SolveRequest.model_fields), "contacts": list(Contact.model_fields)}
-
-
-def parse_request(body: bytes) -> SolveRequest:
-    """Make a request of its JSON text; raise `Refusal` with the field that is wrong."""
-    try:
-        return SolveRequest.model_validate_json(body)
-    except ValidationError as error:
-        details = error.errors(include_url=False, include_input=False)
-        raise invalid(details, _NAMES) from None
-
-
-_HISTORY_NAMES = {
-    "": list(HistoryRequest.model_fields),
+_TABLES = {
+    "contacts": list(Contact.model_fields),
     "steps": [*Step.model_fields, *Contact.model_fields],
 }
+"""Valid keys of the tables in a request."""
+
+M = TypeVar("M", bound=Strict)
 
 
-def parse_history(body: bytes) -> HistoryRequest:
-    """Make a history of its JSON text; raise `Refusal` with the field that is wrong."""
+def parse(kind: type[M], text: bytes | str) -> M:
+    """Read a message from its JSON text; raise `Refusal` with the field that is wrong."""
     try:
-        return HistoryRequest.model_validate_json(body)
+        return kind.model_validate_json(text)
     except ValidationError as error:
         details = error.errors(include_url=False, include_input=False)
-        raise invalid(details, _HISTORY_NAMES) from None
-
-
-def parse_session_request(text: str) -> Request:
-    """Make a request frame of its JSON text; raise `Refusal` with the field that is wrong."""
-    try:
-        read = SessionRequest.model_validate_json(text)
-    except ValidationError as error:
-        details = error.errors(include_url=False, include_input=False)
-        raise invalid(details, {"": list(SessionRequest.model_fields)}) from None
-    outputs = sum(Output[name.upper()] for name in set(read.outputs))
-    x, y, z = read.position
-    return Request(read.seq, read.client_time, (x, y, z), outputs)
-
-
-def is_command(text: str) -> bool:
-    """Whether a text message is a `SessionCommand` rather than a position."""
-    return '"snapshot"' in text or '"restore"' in text
-
-
-def parse_session_command(text: str) -> tuple[bool, int]:
-    """Read a command: whether it restores, and the number; raise `Refusal` for nonsense."""
-    names = list(SessionCommand.model_fields)
-    try:
-        read = SessionCommand.model_validate_json(text)
-    except ValidationError as error:
-        details = error.errors(include_url=False, include_input=False)
-        raise invalid(details, {"": names}) from None
-    if read.snapshot is not None and read.restore is None:
-        return False, read.snapshot
-    if read.restore is not None and read.snapshot is None:
-        return True, read.restore
-    raise Refusal("invalid_value", "snapshot", "One of snapshot and restore is wanted", names)
+        raise invalid(details, {"": list(kind.model_fields), **_TABLES}) from None
 
 
 class ContactAnswer(BaseModel):
@@ -234,16 +165,20 @@ class ContactAnswer(BaseModel):
     pressure: float = Field(description="kPa")
     radius: float = Field(description="mm")
     pressure_limit: float = Field(description="Largest pressure trained for there, kPa.")
+    depth_limit: float | None = Field(
+        description="Largest depth of the tip trained for there, mm; null in a scene without a tip."
+    )
 
 
 class ErrorEstimate(BaseModel):
     """Relative L2 errors against the full model that 95 % of answers stay within, as fractions.
 
-    Over a history: the largest so far, over the largest so far of the field.
+    Null where nothing is known of them: outside the trained range. In a history: the largest error
+    so far relative to the largest norm so far of the field.
     """
 
-    displacement: float
-    von_mises: float
+    displacement: float | None
+    von_mises: float | None
 
 
 class Trust(BaseModel):
@@ -273,33 +208,32 @@ class Timing(BaseModel):
     recover_us: float
 
 
-class Answer(BaseModel):
+class _Answer(BaseModel):
+    contact: ContactAnswer
+    force: Vector = Field(description="mN")
+    contact_displacement: Vector = Field(description="Displacement of the contact point, mm.")
+    trust: Trust
+
+
+class Answer(_Answer):
     """How the tissue answers a load."""
 
     scene: str
-    contact: ContactAnswer
-    force: Vector = Field(description="Force on the tissue, mN.")
-    contact_displacement: Vector = Field(description="Displacement of the contact point, mm.")
-    trust: Trust
     fields: Fields
     timing: Timing
 
 
-class MomentAnswer(BaseModel):
+class StepAnswer(_Answer):
     """How the tissue answers at the time of a step."""
 
     time: float = Field(description="s")
-    contact: ContactAnswer
-    force: Vector = Field(description="Force on the tissue, mN.")
-    contact_displacement: Vector = Field(description="Displacement of the contact point, mm.")
-    trust: Trust
 
 
 class HistoryAnswer(BaseModel):
     """How the tissue answers a history."""
 
     scene: str
-    steps: list[MomentAnswer]
+    steps: list[StepAnswer]
     fields: Fields
     timing: Timing
 
@@ -308,7 +242,7 @@ class MeshFields(BaseModel):
     """Nodes and the surface they make."""
 
     nodes: list[Vector] = Field(description="mm; the order of every field of this region.")
-    triangles: list[Annotated[list[int], Field(min_length=3, max_length=3)]] = Field(
+    triangles: list[Triangle] = Field(
         description="The body's surface: indices into nodes, counter-clockwise from outside."
     )
     surface_nodes: list[int] = Field(
@@ -330,7 +264,15 @@ class AccessibleFields(BaseModel):
 
     vertices: list[Vector] = Field(description="mm")
     normals: list[Vector] = Field(description="Outward unit normals at the vertices.")
-    triangles: list[Annotated[list[int], Field(min_length=3, max_length=3)]] = Field(
+    pressure_limit: list[float] = Field(
+        description="Per vertex: largest pressure trained for along the inward normal, kPa."
+    )
+    depth_limit: list[float] | None = Field(
+        None,
+        description="Per vertex: largest depth of the tip trained for, mm. Absent if the scene was "
+        "trained without a tip.",
+    )
+    triangles: list[Triangle] = Field(
         description="Indices into vertices, counter-clockwise from outside."
     )
 
@@ -342,13 +284,6 @@ class Accessible(BaseModel):
     fields: AccessibleFields
 
 
-class Refused(BaseModel):
-    """A file that is not served."""
-
-    file: str
-    reason: str
-
-
 class SceneEntry(BaseModel):
     """A scene that is served."""
 
@@ -356,18 +291,29 @@ class SceneEntry(BaseModel):
     description: str
 
 
+class RefusedFile(BaseModel):
+    """An artifact that is not served, and why."""
+
+    file: str
+    reason: str
+
+
 class SceneList(BaseModel):
     """What is served and what could not be."""
 
     scenes: list[SceneEntry]
-    refused: list[Refused]
+    refused: list[RefusedFile]
 
 
 class Ranges(BaseModel):
     """The loads the model was trained for; outside, answers say in_range: false."""
 
     pressure: list[float] = Field(
-        description="[from, to] kPa, where the surface takes most; see pressure_limit"
+        description="[from, to] kPa, where the limit is largest; see pressure_limit of /accessible"
+    )
+    depth: list[float] | None = Field(
+        description="[from, to] mm of the tip in a session, where the limit is largest; see "
+        "depth_limit of /accessible. Null if the scene was trained without a tip."
     )
     tilt: list[float] = Field(description="[from, to] degrees between push and inward normal")
     radius: float = Field(description="mm")

@@ -1,4 +1,4 @@
-"""What the service can be told; ``palpate serve --help`` says how."""
+"""The settings of a service."""
 
 import ipaddress
 import socket
@@ -10,43 +10,10 @@ from palpate.shared.errors import PalpateError
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of one service.
+    """Settings of one service: the options of ``palpate serve``, whose help says what they mean.
 
-    Parameters
-    ----------
-    artifacts : Path
-        Directory of the artifacts to serve.
-    token : str, optional
-        What clients must present as ``Authorization: Bearer``. Default: nobody is asked.
-    origins : tuple of str
-        Origins whose web pages may use the service, besides its own; ``*`` for any.
-    hosts : tuple of str
-        Names that clients may call the service by, besides loopback addresses. Default: any.
-    max_body : int, bytes
-        Largest request body. A query needs some hundred bytes.
-    max_json_numbers : int
-        Most field values in one JSON answer. The event loop serves nobody else while it writes
-        them (about 25 ns each); larger fields are for the binary formats.
-    rate_limit : float, 1/s
-        Requests per second and client address that are answered in the long run, and at once
-        after a pause of a second; 0 for no limit. Of sessions only the opening counts.
-    max_wait : float, s
-        Longest that a request may have waited for its turn when it gets it; one that has waited
-        longer is told to come back, so that a queue never grows beyond what is useful.
-    max_sessions : int
-        Most sessions at a time, of one worker.
-    session_idle : float, s
-        A session that has sent nothing for so long is closed.
-    workers : int
-        Processes that share the work.
-    realtime : bool
-        Whether to ask the system for real-time scheduling.
-    log_format, log_level : str
-        One of `serve.logs.FORMATS` and of `serve.logs.LEVELS`.
-    access_log : bool
-        Whether to log every request.
-    echo : bool
-        Whether ``/echo`` answers, for measurements.
+    Only ``hosts`` is no option: names that clients may call the service by, besides loopback
+    addresses; any, if there are none.
     """
 
     artifacts: Path

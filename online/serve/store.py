@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from palpate.online.serve.errors import Refusal
-from palpate.online.session.follower import Follower
 from palpate.shared.errors import PalpateError
 from palpate.shared.model import ReducedModel
 
@@ -15,28 +14,24 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass
-class Model:
-    """An artifact in memory, warm.
+class ServedModel:
+    """A reduced model that is served, and what requests need beside it.
 
     Parameters
     ----------
-    atlas : ReducedModel
-        What answers.
+    model : ReducedModel
     example : dict
         ``position`` (mm) and ``pressure`` (kPa) of a contact that it can answer.
     tip : list of 3 floats, mm
         A position of the tip's centre at which it presses a little.
     meshes : dict from (region, media type) to bytes
         The mesh documents asked for so far.
-    followers : list of Follower
-        Spare ones for sessions to come: a new one takes longer than many a solve.
     """
 
-    atlas: ReducedModel
+    model: ReducedModel
     example: dict[str, Any]
     tip: list[float]
     meshes: dict[tuple[str, str], bytes] = field(default_factory=dict)
-    followers: list[Follower] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -55,73 +50,66 @@ class Store:
     directory : Path
         Searched for ``*.h5``, in order of name.
     load : callable, optional
-        Makes an atlas of a file; raises `PalpateError` for a file it refuses.
+        Reads a file; raises `PalpateError` for a file it refuses.
     """
 
     def __init__(
         self, directory: Path, load: Callable[[Path], ReducedModel] = ReducedModel.load
     ) -> None:
         self.directory = directory
-        self.models: dict[str, Model] = {}
+        self.models: dict[str, ServedModel] = {}
         self.refused: list[RefusedFile] = []
         self.ready = False
         self._load = load
 
-    def open(self, warm: Callable[[Model], Any]) -> None:
+    def open(self, warm: Callable[[ServedModel], Any]) -> None:
         """Load and warm every model; a file that fails is refused and the others still served."""
         for path in sorted(self.directory.glob("*.h5")):
             try:
-                atlas = self._load(path)
-                model = Model(atlas, _example(atlas), _tip(atlas))
-                if model.atlas.name in self.models:
-                    raise PalpateError(f"{path}: another file already holds {model.atlas.name!r}")
-                warm(model)
+                served = _served(self._load(path))
+                name = served.model.name
+                if name in self.models:
+                    raise PalpateError(f"{path}: another file already holds {name!r}")
+                warm(served)
             except PalpateError as error:
                 self._refuse(path, str(error))
             except Exception as error:
-                # A bug in reading one file is no reason to withhold the others.
+                # a bug in reading one file is no reason to withhold the others
                 logger.exception("failed on %s", path)
                 self._refuse(path, f"{path}: cannot be used: {type(error).__name__}")
             else:
-                self.models[model.atlas.name] = model
-                logger.info("serving %s from %s", model.atlas.name, path)
+                self.models[name] = served
+                logger.info("serving %s from %s", name, path)
 
     def require_ready(self) -> None:
         """Raise `Refusal` while models are being loaded."""
         if not self.ready:
             raise Refusal("not_ready", "", "The models are being loaded; try again in a moment")
 
-    def model(self, name: str) -> Model:
+    def model(self, name: str) -> ServedModel:
         """Find the model called `name`; raise `Refusal` if there is none (yet)."""
         self.require_ready()
-        model = self.models.get(name)
-        if model is None:
+        served = self.models.get(name)
+        if served is None:
             raise Refusal("unknown_scene", "name", "No such scene is served", sorted(self.models))
-        return model
+        return served
 
     def _refuse(self, path: Path, reason: str) -> None:
         logger.error("refused %s", reason)
         self.refused.append(RefusedFile(path.name, reason))
 
 
-def _middle(atlas: ReducedModel) -> int:
-    """Vertex amid the accessible surface."""
-    vertices = atlas.surface.vertices
-    return int(((vertices - vertices.mean(axis=0)) ** 2).sum(axis=1).argmin())
+def _served(model: ReducedModel) -> ServedModel:
+    """Make examples that a model can answer.
 
-
-def _example(atlas: ReducedModel) -> dict[str, Any]:
-    """Make a contact that `atlas` can answer: amid its surface, at half the pressure limit."""
-    middle = _middle(atlas)
-    return {
-        "position": atlas.surface.vertices[middle].round(3).tolist(),
-        "pressure": round(0.5 * float(atlas.limits[middle, 0]), 3),
+    A contact in the middle of its surface, at half the pressure limit; and there a position of the
+    tip's centre, a tenth of its radius deep.
+    """
+    vertices, radius = model.surface.vertices, model.scene.endoscope.radius
+    middle = int(((vertices - vertices.mean(axis=0)) ** 2).sum(axis=1).argmin())
+    tip = vertices[middle] + 0.9 * radius * model.surface.normals[middle]
+    example = {
+        "position": vertices[middle].round(3).tolist(),
+        "pressure": round(0.5 * float(model.limits[middle, 0]), 3),
     }
-
-
-def _tip(atlas: ReducedModel) -> list[float]:
-    """Make a position of the tip amid the surface, a tenth of its radius deep."""
-    middle, radius = _middle(atlas), atlas.scene.endoscope.radius
-    centre = atlas.surface.vertices[middle] + 0.9 * radius * atlas.surface.normals[middle]
-    position: list[float] = centre.round(3).tolist()
-    return position
+    return ServedModel(model, example, tip.round(3).tolist())

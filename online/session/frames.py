@@ -1,11 +1,12 @@
 """Frames of a session: the binary layout of what a tool sends and what it feels.
 
-Version 1, everything little-endian, every field at a fixed offset that is a multiple of its size:
+Version 2, everything little-endian, every field at a fixed offset that is a multiple of its size:
 a C struct with the same members in the same order has this layout. One request frame asks for one
-reply frame. The tables in the README, in the OpenAPI document and in a session's hello are made
-from `REQUEST_FIELDS` and `REPLY_FIELDS`.
+reply frame. The tables in ``online/PROTOCOL.md``, in the OpenAPI document and in a session's
+greeting are made from `REQUEST_FIELDS` and `REPLY_FIELDS`.
 
-After the fields of a reply follows what was asked for, without gaps, in this order:
+Replies of version 1 had neither `depth_limit` nor `reason`; requests were the same. The fields of a
+reply are followed by what was asked for, without gaps, in this order:
 
 1. ``COORDINATES``: float32 (4, coordinates), mm mN energy norm; a row per local model, zeros where
    `model` is -1;
@@ -21,7 +22,7 @@ import math
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntFlag
+from enum import IntEnum, IntFlag
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -30,9 +31,9 @@ from numpy.typing import NDArray
 from palpate.shared.errors import QueryError
 
 if TYPE_CHECKING:
-    from palpate.online.session.follower import Step
+    from palpate.shared.answer import Answer
 
-VERSION = 1
+VERSION = 2
 
 MODELS = 4
 """Local models that can take part in an answer."""
@@ -62,7 +63,15 @@ class Flag(IntFlag):
     STALLED = 32
 
 
-_OUTPUTS_MEAN = {
+class Reason(IntEnum):
+    """Why a reply is not for the position asked for."""
+
+    NONE = 0
+    NO_EQUILIBRIUM = 1
+    BELOW_SURFACE = 2
+
+
+OUTPUTS_MEAN = {
     Output.COORDINATES: "reduced coordinates",
     Output.DISPLACEMENT: "displacement of the surface",
     Output.VON_MISES: "von Mises stress of the surface",
@@ -70,13 +79,19 @@ _OUTPUTS_MEAN = {
     Output.HALF: "fields as float16",
 }
 
-_FLAGS_MEAN = {
+FLAGS_MEAN = {
     Flag.CONTACT: "the tip touches",
     Flag.CONVERGED: "an equilibrium was found at `position`",
     Flag.IN_RANGE: "the state is of the kind the model was trained for",
     Flag.CLAMPED: "the step was too long for its time: `position` is short of the one asked for",
-    Flag.FALLBACK: "no answer there: everything is the last good answer's",
+    Flag.FALLBACK: "no answer there: all is the last good answer's, but the errors are infinite",
     Flag.STALLED: "more time than `longest_step` had passed, or less than none: it was cut to that",
+}
+
+REASONS_MEAN = {
+    Reason.NONE: "",
+    Reason.NO_EQUILIBRIUM: "no equilibrium was found there",
+    Reason.BELOW_SURFACE: "the tip's centre lies below the surface of the tissue",
 }
 
 
@@ -92,20 +107,15 @@ class Field:
 
 
 REQUEST_FIELDS = (
-    Field("version", "uint16", "", "of this layout, 1"),
+    Field("version", "uint16", "", "of this layout, 2"),
     Field("outputs", "uint16", "", "what is wanted, bits"),
     Field("seq", "uint32", "", "the client's number of this frame, echoed"),
-    Field(
-        "client_time",
-        "float64",
-        "s",
-        "the client's clock, echoed; the time of visco-elastic tissue",
-    ),
+    Field("client_time", "float64", "s", "echoed; the time of visco-elastic tissue"),
     Field("position", "float64", "mm", "centre of the tip", (3,)),
 )
 
 REPLY_FIELDS = (
-    Field("version", "uint16", "", "of this layout, 1"),
+    Field("version", "uint16", "", "of this layout, 2"),
     Field("flags", "uint16", "", "bits"),
     Field("seq", "uint32", "", "of the request that is answered"),
     Field("client_time", "float64", "s", "of the request"),
@@ -116,7 +126,7 @@ REPLY_FIELDS = (
     Field("tangent", "float64", "mN/mm", "derivative of `force` by `position`, by rows", (3, 3)),
     Field("energy", "float64", "mN mm", "stored in the tissue"),
     Field("solve_time", "float32", "s", "spent on solving"),
-    Field("valid_radius", "float32", "mm", "how far from `position` force and tangent may serve"),
+    Field("valid_radius", "float32", "mm", "how far from `position` force and tangent hold"),
     Field("contact_point", "float32", "mm", "on the tissue", (3,)),
     Field("normal", "float32", "", "outward, unit, at the contact", (3,)),
     Field("depth", "float32", "mm", "of the tip below the surface at rest"),
@@ -134,7 +144,9 @@ REPLY_FIELDS = (
     Field("iterations", "uint16", "", "Newton steps taken"),
     Field("steps", "uint16", "", "positions solved on the way here"),
     Field("coordinates", "uint16", "", "reduced coordinates per local model that follow, or 0"),
-    Field("outputs", "uint16", "", "what follows or holds, bits"),
+    Field("outputs", "uint16", "", "what follows or is filled in, bits"),
+    Field("depth_limit", "float32", "mm", "largest trained depth there"),
+    Field("reason", "uint32", "", "why `position` is not the one asked for; 0 if it is"),
 )
 
 
@@ -158,10 +170,8 @@ _REPLY = _struct(REPLY_FIELDS)
 _OUTPUTS = sum(Output)
 _LARGEST = float(np.finfo(np.float32).max)
 # enumerations are slow to calculate with
-_COORDINATES, _DISPLACEMENT, _VON_MISES = map(
-    int, (Output.COORDINATES, Output.DISPLACEMENT, Output.VON_MISES)
-)
-_HALF = int(Output.HALF)
+_COORDINATES, _DISPLACEMENT, _VON_MISES, _, _HALF = map(int, Output)
+_IN_RANGE = int(Flag.IN_RANGE)
 
 
 class FrameError(QueryError):
@@ -199,7 +209,7 @@ def decode_request(frame: bytes) -> Request:
         If its size, a bit or a number is wrong.
     """
     if len(frame) >= 2 and (version := int.from_bytes(frame[:2], "little")) != VERSION:
-        raise VersionError("version", f"is {version}; this is version {VERSION}")
+        raise VersionError("version", f"is {version}; this service speaks version {VERSION}")
     if len(frame) != _REQUEST.size:
         raise FrameError("frame", f"must have {_REQUEST.size} bytes, not {len(frame)}")
     _, outputs, seq, client_time, x, y, z = _REQUEST.unpack(frame)
@@ -207,7 +217,7 @@ def decode_request(frame: bytes) -> Request:
 
 
 def check_request(request: Request) -> Request:
-    """Pass a request on whose numbers make sense; raise `FrameError` for others."""
+    """Return a request whose numbers make sense; raise `FrameError` for any other."""
     if request.outputs & ~_OUTPUTS:
         raise FrameError("outputs", f"has bits other than those of {_OUTPUTS}")
     if not math.isfinite(request.client_time):
@@ -242,9 +252,34 @@ class Extras(NamedTuple):
 NO_EXTRAS = Extras()
 
 
+class ToolAnswer(NamedTuple):
+    """The answer to a position of the tool.
+
+    Parameters
+    ----------
+    touch : Answer
+    flags : int
+        Bits of `Flag`.
+    steps : int
+        Positions solved on the way.
+    valid_radius : float, mm
+        How far from the position force and tangent hold.
+    solve_seconds : float
+    reason : int
+        A `Reason`.
+    """
+
+    touch: Answer
+    flags: int
+    steps: int
+    valid_radius: float
+    solve_seconds: float
+    reason: int
+
+
 def encode_reply(
     request: Request,
-    step: Step,
+    answer: ToolAnswer,
     extras: Extras = NO_EXTRAS,
     superseded: int = 0,
     received: float = 0.0,
@@ -256,19 +291,20 @@ def encode_reply(
     ----------
     request : Request
         What is answered.
-    step : Step
-        The answer.
+    answer : ToolAnswer
+        Outside the trained range its estimated errors count as infinite.
     extras : Extras
         C-contiguous.
     superseded : int
     received, sent : float, s
         On the server's clock.
     """
-    touch = step.touch
-    patches = touch.patches
+    touch = answer.touch
+    patches = touch.parts
+    unknown = 0.0 if answer.flags & _IN_RANGE else math.inf
     head = _REPLY.pack(
         VERSION,
-        step.flags,
+        answer.flags,
         request.seq,
         request.client_time,
         received,
@@ -277,15 +313,15 @@ def encode_reply(
         *touch.force.tolist(),
         *touch.tangent.ravel().tolist(),
         touch.energy,
-        step.solve_seconds,
-        step.valid_radius,
+        answer.solve_seconds,
+        answer.valid_radius,
         *touch.contact_point.tolist(),
         *touch.normal.tolist(),
         touch.depth,
         touch.penetration,
-        _estimate(touch.error_displacement),
-        _estimate(touch.error_von_mises),
-        _estimate(touch.error_force),
+        _estimate(touch.error_displacement + unknown),
+        _estimate(touch.error_von_mises + unknown),
+        _estimate(touch.error_force + unknown),
         touch.min_jacobian,
         extras.max_von_mises,
         extras.p99_von_mises,
@@ -294,9 +330,11 @@ def encode_reply(
         superseded,
         _nodes(extras),
         touch.iterations,
-        step.steps,
+        answer.steps,
         0 if extras.coordinates is None else extras.coordinates.shape[1],
         extras.outputs,
+        touch.depth_limit,
+        answer.reason,
     )
     if extras is NO_EXTRAS:
         return head
@@ -305,7 +343,7 @@ def encode_reply(
 
 
 def _estimate(error: float) -> float:
-    """Call an error unknown that is too large for a float32."""
+    """Return an error that fits into a float32; infinity, which means unknown, if it does not."""
     return error if error <= _LARGEST else math.inf
 
 
@@ -354,6 +392,8 @@ class Reply(NamedTuple):
     iterations: int
     steps: int
     outputs: int
+    depth_limit: float
+    reason: int
     coordinates: NDArray[np.float32] | None
     displacement: NDArray[Any] | None
     von_mises: NDArray[Any] | None
@@ -409,62 +449,3 @@ def decode_reply(frame: bytes) -> Reply:
     values: list[Any] = [record[name] for name in _HEAD]
     head = [value.item() if value.ndim == 0 else value for value in values]
     return Reply(*head, *arrays.values())
-
-
-def layout() -> dict[str, Any]:
-    """Describe the layout, for the hello of a session; JSON-able."""
-    return {
-        "version": VERSION,
-        "byte_order": "little",
-        "request": _layout(REQUEST_FIELDS, REQUEST),
-        "reply": _layout(REPLY_FIELDS, REPLY),
-        "outputs": {bit.name: bit.value for bit in Output},
-        "flags": {bit.name: bit.value for bit in Flag},
-    }
-
-
-def _layout(fields: Sequence[Field], dtype: np.dtype[Any]) -> dict[str, Any]:
-    return {
-        "size": dtype.itemsize,
-        "fields": [
-            {
-                "name": field.name,
-                "offset": _offset(dtype, field),
-                "type": field.type,
-                "shape": field.shape,
-                "unit": field.unit,
-                "meaning": field.meaning,
-            }
-            for field in fields
-        ],
-    }
-
-
-def tables() -> str:
-    """Describe the layout in Markdown."""
-    lines = []
-    for title, fields, dtype in (
-        ("Request", REQUEST_FIELDS, REQUEST),
-        ("Reply", REPLY_FIELDS, REPLY),
-    ):
-        lines += [f"{title}, {dtype.itemsize} bytes:", ""]
-        lines += ["| offset | field | type | unit | meaning |", "|---|---|---|---|---|"]
-        lines += [
-            f"| {_offset(dtype, f)} | {f.name} | {f.type}{_suffix(f)} | {f.unit} | {f.meaning} |"
-            for f in fields
-        ]
-        lines.append("")
-    for title, bits in (("outputs", _OUTPUTS_MEAN), ("flags", _FLAGS_MEAN)):
-        lines += [f"| bit of {title} | name | meaning |", "|---|---|---|"]
-        lines += [f"| {bit.value} | {bit.name} | {meaning} |" for bit, meaning in bits.items()]
-        lines.append("")
-    return "\n".join(lines)
-
-
-def _offset(dtype: np.dtype[Any], field: Field) -> int:
-    assert dtype.fields is not None
-    return int(dtype.fields[field.name][1])
-
-
-def _suffix(field: Field) -> str:
-    return "".join(f"[{n}]" for n in field.shape)

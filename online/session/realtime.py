@@ -91,7 +91,7 @@ class BusyWait:
         self._until = self._looked = self._spent = self._ahead = 0.0
 
     def keep(self) -> None:
-        """Keep watch for the frame after the one that has just come."""
+        """Stay awake for the frame after the one that has just come."""
         if not self._enabled:
             return
         self._until = perf_counter() + LINGER

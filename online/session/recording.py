@@ -1,15 +1,14 @@
-"""What a tool did and felt, in a file.
+"""The positions of a tool and the answers to them, in a file.
 
 A recording is an HDF5 file with one dataset for each field of a reply (`session.frames`), with a
 row for each reply in order of arrival, and beside them what was asked for and when. Every dataset
 has ``units`` and a ``description``. Since an answer depends on those before it, and on how many
 positions were solved for each (``steps``), the recording of a whole session is enough to answer it
-anew, bit for bit (`session.replay`).
+again, bit for bit (`session.replay`).
 """
 
 import json
 from pathlib import Path
-from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 import h5py
@@ -20,7 +19,7 @@ from palpate.online.session.frames import REPLY, REPLY_FIELDS, Field, Request
 from palpate.shared.errors import PalpateError
 
 FORMAT = "palpate-session"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 
 CHUNK = 2000
 """Replies that are kept in memory until they are written."""
@@ -36,9 +35,9 @@ ASKED = (
 
 
 class Command(NamedTuple):
-    """A snapshot that was taken or gone back to."""
+    """A snapshot that was taken or restored."""
 
-    replies: int  # that had come before
+    replies: int  # number of those that had come before
     restores: bool
     number: int
 
@@ -54,24 +53,25 @@ class Recorder:
     ----------
     path : Path
         Overwritten.
-    hello : dict
+    greeting : dict
         Of the session.
     """
 
-    def __init__(self, path: Path, hello: dict[str, Any]) -> None:
+    def __init__(self, path: Path, greeting: dict[str, Any]) -> None:
         self._requests: dict[int, Request] = {}
         self._asked: list[tuple[Any, ...]] = []
         self._replies: list[bytes] = []
         self._file = h5py.File(path, "w")
         self._file.attrs["format"] = FORMAT
         self._file.attrs["format_version"] = FORMAT_VERSION
-        self._file.attrs["scene"] = hello["scene"]
-        self._file.attrs["hello"] = json.dumps(hello)
+        self._file.attrs["scene"] = greeting["scene"]
+        self._file.attrs["greeting"] = json.dumps(greeting)
         self._count = 0
         commands = self._file.create_dataset("commands", (0, 3), "uint32", maxshape=(None, 3))
         commands.attrs["units"] = ""
         commands.attrs["description"] = (
-            "snapshots: replies before, 0 if taken or 1 if gone back to, number"
+            "a row per snapshot taken or restored: number of replies before it; "
+            "0 if it was taken, 1 if it was restored; number of the snapshot"
         )
         for field in (*ASKED, *REPLY_FIELDS):
             dataset = self._file.create_dataset(
@@ -87,12 +87,7 @@ class Recorder:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def sent(self, request: Request) -> None:

@@ -1,4 +1,4 @@
-"""Recorded sessions answered anew, to the bit."""
+"""Recorded sessions answered again, bit for bit."""
 
 from typing import Any, NamedTuple
 
@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from palpate.online.session import frames
 from palpate.online.session.frames import REPLY
 from palpate.online.session.recording import Recording, RecordingError
-from palpate.online.session.session import recover
-from palpate.online.session.timed_follower import follower_of
+from palpate.online.session.tracker import Snapshot, ToolTracker, recover
 from palpate.shared.model import ReducedModel
 
 VOLATILE = ("server_received", "server_sent", "solve_time", "superseded")
@@ -36,33 +35,33 @@ class Replay(NamedTuple):
     force_difference: float
 
 
-def replay(recording: Recording, atlas: ReducedModel) -> Replay:
-    """Answer a recorded session anew and compare.
+def replay(recording: Recording, model: ReducedModel) -> Replay:
+    """Answer a recorded session again and compare.
 
     Raises
     ------
     RecordingError
         If the recording is of another scene.
     """
-    if atlas.name != recording.scene:
+    if model.name != recording.scene:
         raise RecordingError(
-            f"the recording is of scene {recording.scene!r}, the artifact of {atlas.name!r}"
+            f"the recording is of scene {recording.scene!r}, the artifact of {model.name!r}"
         )
-    follower = follower_of(atlas)
-    snapshots: dict[int, Any] = {}
+    tracker = ToolTracker(model)
+    snapshots: dict[int, Snapshot] = {}
     commands = list(recording.commands)
     again = np.zeros_like(recording.replies)
     for i, request in enumerate(recording.requests):
         while commands and commands[0].replies <= i:
             command = commands.pop(0)
             if command.restores:
-                follower.restore(snapshots[command.number])
+                tracker.restore(snapshots[command.number])
             else:
-                snapshots[command.number] = follower.snapshot()
+                snapshots[command.number] = tracker.snapshot()
         steps = int(recording.replies["steps"][i])
-        step = follower.repeat(request.position, steps, request.client_time)
-        extras = recover(atlas, step.touch, request.outputs)
-        frame = frames.encode_reply(request, step, extras)
+        answer = tracker.repeat(request.position, steps, request.client_time)
+        extras = recover(model, answer.touch, request.outputs)
+        frame = frames.encode_reply(request, answer, extras)
         again[i] = np.frombuffer(frame, REPLY, 1)[0]
     for name in VOLATILE:
         again[name] = recording.replies[name]

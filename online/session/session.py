@@ -8,34 +8,32 @@ the solve. A client that does not read its replies holds up itself alone, and is
 
 import asyncio
 import logging
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from enum import Enum, auto
 from time import perf_counter
 from typing import Any
 
-import numpy as np
 import orjson
 from starlette.types import Message, Receive, Scope, Send
 
-from palpate.online.serve.errors import Refusal
+from palpate.online.serve.errors import Refusal, check_json_size, error_body
 from palpate.online.serve.metrics import Metrics
-from palpate.online.serve.schemas import (
+from palpate.online.serve.settings import Settings
+from palpate.online.serve.store import ServedModel, Store
+from palpate.online.session import frames
+from palpate.online.session.frames import FrameError, Output, Request, VersionError
+from palpate.online.session.protocol import layout
+from palpate.online.session.realtime import BusyWait
+from palpate.online.session.text import (
     MOST_SNAPSHOTS,
     is_command,
-    parse_session_command,
-    parse_session_request,
+    read_command,
+    read_request,
+    write_reply,
 )
-from palpate.online.serve.settings import Settings
-from palpate.online.serve.store import Model, Store
-from palpate.online.session import frames
-from palpate.online.session.follower import Follower, Step
-from palpate.online.session.frames import Extras, Flag, FrameError, Output, Request, VersionError
-from palpate.online.session.realtime import BusyWait
-from palpate.online.session.timed_follower import LONGEST, follower_of
+from palpate.online.session.tracker import LONGEST, Snapshot, ToolTracker, recover
 from palpate.online.session.websocket import LINGER, MOST_FRAMES, PENDING, READ_AT, STOPPING
-from palpate.shared.model import ReducedModel
-from palpate.shared.reduced.touch import Touch
 
 logger = logging.getLogger(__name__)
 
@@ -52,12 +50,30 @@ PATIENCE = 5.0
 """Seconds a client may leave a reply unread."""
 
 SPARE = 4
-"""Sessions that can be opened at no cost to those under way."""
+"""Sessions of each scene that can be opened at no cost to those under way."""
 
 GOING_AWAY, FAILED, IDLE, WRONG_VERSION = 1001, 1011, 4000, 4001
 """Codes that a session is closed with."""
 
-_COORDINATES, _DISPLACEMENT, _VON_MISES, _STRESS, _HALF = map(int, Output)
+
+class State(Enum):
+    """What a session is doing."""
+
+    CONNECTING = auto()  # the handshake is not answered yet
+    WAITING = auto()  # for a message of the client
+    SENDING = auto()  # until the client has taken most of what was sent
+    CLOSING = auto()  # the service ends it and says why
+    CLOSED = auto()
+
+
+_NEXT = {
+    State.CONNECTING: {State.SENDING},
+    State.WAITING: {State.SENDING, State.CLOSING, State.CLOSED},
+    State.SENDING: {State.WAITING, State.CLOSED},
+    State.CLOSING: {State.CLOSED},
+    State.CLOSED: set(),
+}
+"""States that may follow each."""
 
 
 class Sessions:
@@ -68,40 +84,70 @@ class Sessions:
     store : Store
     settings : Settings
     metrics : Metrics
+
+    Attributes
+    ----------
+    busy_wait : BusyWait
+        Of the event loop.
     """
 
     def __init__(self, store: Store, settings: Settings, metrics: Metrics) -> None:
+        self.settings = settings
+        self.metrics = metrics
+        self.busy_wait = BusyWait(settings.workers if settings.realtime else 0)
         self._store = store
-        self._settings = settings
-        self._metrics = metrics
-        self._vigil = BusyWait(settings.workers if settings.realtime else 0)
         self._open = 0
+        # a new tracker takes longer than most solves
+        self._spare: dict[str, list[ToolTracker]] = {}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Refuse a session or run it until it ends."""
-        model = self._store.model(scope["path_params"]["name"])
-        if model.atlas.tips is None:
+        served = self._store.model(scope["path_params"]["name"])
+        if not served.model.has_tip:
             raise Refusal(
                 "no_tip", "name", "This scene was trained without a tip; it only answers loads"
             )
-        most = self._settings.max_sessions
+        most = self.settings.max_sessions
         if self._open >= most:
             raise Refusal(
                 "too_many_sessions", "", f"{self._open} sessions are open", {"max_sessions": most}
             )
         self._open += 1
-        self._metrics.count_session(opened=True)
-        follower = model.followers.pop() if model.followers else follower_of(model.atlas)
+        self.metrics.count_session(opened=True)
+        spare = self._spare.setdefault(served.model.name, [])
+        tracker = spare.pop() if spare else ToolTracker(served.model)
         try:
-            session = Session(
-                model, follower, self._settings, self._metrics, self._vigil, scope, receive, send
-            )
-            await session.run()
+            await Session(self, served, tracker, scope, receive, send).run()
         finally:
             self._open -= 1
-            self._metrics.count_session(opened=False)
-            follower.restart()
-            model.followers.append(follower)
+            self.metrics.count_session(opened=False)
+            tracker.restart()
+            spare.append(tracker)
+
+    def prepare(self, served: ServedModel, path: Sequence[Sequence[float]]) -> None:
+        """Call everything that a session calls once, and make spare trackers.
+
+        Parameters
+        ----------
+        served : ServedModel
+        path : sequence of positions of the tip, mm
+            Leads through all that the tissue's history may need.
+        """
+        uncounted, spare = Metrics(), []
+        x, y, z = served.tip
+        request = Request(0, 0.0, (x, y, z), sum(Output))
+        for _ in range(SPARE):
+            tracker = ToolTracker(served.model)
+            for number, position in enumerate(path):
+                tracker.follow(position, BUDGET, 0.01 * number)
+            tracker.restart()
+            answer = tracker.follow(request.position, BUDGET)
+            extras = recover(served.model, answer.touch, request.outputs)
+            write_reply(frames.encode_reply(request, answer, extras))
+            uncounted.count_frame(0.0, (0.0, 0.0, 0.0, 0.0, 0.0), answer.flags, 0)
+            tracker.restart()
+            spare.append(tracker)
+        self._spare[served.model.name] = spare
 
 
 class Session:
@@ -109,276 +155,211 @@ class Session:
 
     Parameters
     ----------
-    model : Model
-    follower : Follower
-        Fresh or restarted.
-    settings : Settings
-    metrics : Metrics
-    vigil : BusyWait
-        Of the event loop.
+    sessions : Sessions
+        What it is one of.
+    served : ServedModel
+    tracker : ToolTracker
+        New or restarted.
     scope, receive, send
-        As ASGI gives them; of `session.websocket.Protocol`.
+        As ASGI gives them; of `session.websocket.SessionProtocol`.
     """
 
     def __init__(
         self,
-        model: Model,
-        follower: Follower,
-        settings: Settings,
-        metrics: Metrics,
-        vigil: BusyWait,
+        sessions: Sessions,
+        served: ServedModel,
+        tracker: ToolTracker,
         scope: Scope,
         receive: Receive,
         send: Send,
     ) -> None:
-        self._model = model
-        self._atlas = model.atlas
-        self._settings = settings
-        self._metrics = metrics
-        self._vigil = vigil
-        self._receive = receive
-        self._send = send
+        self._sessions = sessions
+        self._served = served
+        self._model = served.model
+        self._tracker = tracker
+        self._receive, self._send = receive, send
         self._pending: Callable[[], bool] = scope["extensions"][PENDING]
         self._read_at: Callable[[], float] = scope["extensions"][READ_AT]
-        self._follower = follower
-        self._snapshots: dict[int, Any] = {}
-        self._received = perf_counter()
+        self._snapshots: dict[int, Snapshot] = {}
+        self._received = 0.0
         self._superseded = 0
-        self._sending_since = math.inf
         self._full_at = 0.0
-        self._farewell: tuple[int, str] | None = None
+        self._state = State.CONNECTING
+        self._since = perf_counter()
+        self._close_reason = 0, ""
 
     async def run(self) -> None:
-        """Welcome the client and answer it until it goes or is told to."""
+        """Greet the client and answer it until either side ends the session."""
         await self._receive()
         await self._send({"type": "websocket.accept"})
         watching = asyncio.create_task(self._watch())
         try:
             with suppress(TimeoutError):
                 async with asyncio.timeout(None) as self._interruption:
-                    await self._deliver({"type": "websocket.send", "text": self._hello()})
+                    await self._deliver({"type": "websocket.send", "text": self._greeting()})
                     await self._converse()
         finally:
             watching.cancel()  # there is nothing to interrupt any more
-        if self._farewell is not None:
-            code, reason = self._farewell
+        if self._state is State.CLOSING:
+            code, reason = self._close_reason
             # a client that does not listen is cut off when this returns
             with suppress(TimeoutError):
                 async with asyncio.timeout(LINGER):
                     await self._send({"type": "websocket.close", "code": code, "reason": reason})
+            self._enter(State.CLOSED)
 
-    async def _converse(self) -> None:
-        """Answer the newest message, again and again."""
-        while self._farewell is None:
-            message = newest = await self._receive()
-            for more in reversed(range(MOST_AT_ONCE)):
-                if message["type"] != "websocket.receive":
-                    break
-                self._note()
-                newest = message
-                if is_command(message.get("text") or "") or not (more and self._pending()):
-                    break
-                message = await self._receive()
-                if is_command(message.get("text") or ""):  # it is of the state after the newest
-                    await self._deliver(self._reply(newest))
-                else:
-                    self._superseded += message["type"] == "websocket.receive"
-            if newest["type"] == "websocket.receive":
-                await self._deliver(self._reply(newest))
-            if message["type"] != "websocket.receive":
-                if message["code"] == STOPPING:
-                    self._farewell = GOING_AWAY, "the service is stopping"
-                return
-            self._vigil.keep()
-            # only now: a message that waits must not grow older for those behind it
-            if (excess := self._full_at - perf_counter() - BURST) > 0.0:
-                await asyncio.sleep(excess)
+    def _enter(self, state: State) -> None:
+        """Go from one state to another one."""
+        if state not in _NEXT[self._state]:
+            raise RuntimeError(f"a session cannot go from {self._state} to {state}")
+        self._state = state
+        self._since = perf_counter()
 
-    def _note(self) -> None:
-        """Note that a message has come."""
-        self._received = self._read_at()
-        self._full_at = max(self._full_at, perf_counter()) + 1.0 / MOST_FRAMES
-
-    async def _deliver(self, message: Message) -> None:
-        """Send a message; wait until the client has taken most of those before it."""
-        self._sending_since = perf_counter()
-        await self._send(message)
-        self._sending_since = math.inf
+    def _close(self, code: int, reason: str) -> None:
+        """Let the session end with a reason."""
+        self._enter(State.CLOSING)
+        self._close_reason = code, reason
 
     async def _watch(self) -> None:
-        """Interrupt a session whose client is silent, or does not listen."""
-        idle = self._settings.session_idle
+        """Interrupt a session whose client is silent, or does not read."""
+        idle = self._sessions.settings.session_idle
         while True:
             await asyncio.sleep(min(0.25, 0.25 * idle))
-            now = perf_counter()
-            if now - self._sending_since > PATIENCE:
+            passed = perf_counter() - self._since
+            if self._state is State.SENDING and passed > PATIENCE:
                 logger.warning("a session is cut off: its client leaves replies unread")
+                self._enter(State.CLOSED)
                 break
-            if now - self._received > idle:
-                self._farewell = IDLE, f"no frame for {idle:g} s"
+            if self._state is State.WAITING and passed > idle:
+                self._close(IDLE, f"no frame for {idle:g} s")
                 break
         self._interruption.reschedule(asyncio.get_running_loop().time())
 
-    def _reply(self, message: Message) -> Message:
-        """Answer a message or say what is wrong with it."""
+    async def _converse(self) -> None:
+        """Answer the newest message, again and again."""
+        while self._state is State.WAITING:
+            messages, last = await self._take()
+            for message in messages:
+                await self._respond(message)
+            if last is not None and self._state is State.WAITING:
+                if last["code"] == STOPPING:
+                    self._close(GOING_AWAY, "the service is stopping")
+                else:
+                    self._enter(State.CLOSED)
+            self._sessions.busy_wait.keep()
+            # only now: a message that waits must not grow older because of those behind it
+            if (excess := self._full_at - perf_counter() - BURST) > 0.0:
+                await asyncio.sleep(excess)
+
+    async def _take(self) -> tuple[list[Message], Message | None]:
+        """Wait for messages; return those to answer, in order, and the one that ends the session.
+
+        Of several frames only the newest is answered. A command comes after the frame before it.
+        """
+        messages: list[Message] = []
+        for more in reversed(range(MOST_AT_ONCE)):
+            message = await self._receive()
+            if message["type"] != "websocket.receive":
+                return messages, message
+            self._received = self._read_at()
+            self._full_at = max(self._full_at, perf_counter()) + 1.0 / MOST_FRAMES
+            if is_command(message.get("text")):
+                return [*messages, message], None
+            self._superseded += len(messages)
+            messages = [message]
+            if not (more and self._pending()):
+                break
+        return messages, None
+
+    async def _respond(self, message: Message) -> None:
+        """Answer a message or say what is wrong with it, unless the session is ending."""
+        if self._state is not State.WAITING:
+            return
+        ending = None
         try:
-            frame = message.get("bytes")
-            if frame is not None:
-                return {"type": "websocket.send", "bytes": self._answer_frame(frame)}
-            return {"type": "websocket.send", "text": self._answer_text(message["text"])}
+            reply = self._reply(message)
         except VersionError as error:
-            self._farewell = WRONG_VERSION, str(error)
-            return self._complain("unknown_version", error.field, error.message)
+            reply = self._complaint("unknown_version", error.field, error.message)
+            ending = WRONG_VERSION, str(error)
         except FrameError as error:
-            return self._complain("invalid_frame", error.field, error.message)
+            reply = self._complaint("invalid_frame", error.field, error.message)
         except Refusal as refusal:
-            return self._complain(refusal.code, refusal.field, refusal.message, refusal.allowed)
+            reply = self._complaint(refusal.code, refusal.field, refusal.message, refusal.allowed)
         except Exception:
             logger.exception("a session failed")
-            self._farewell = FAILED, "the service failed; its log says why"
-            return self._complain("internal", "", "The service failed; its log says why")
+            reply = self._complaint("internal", "", "The service failed; its log says why")
+            ending = FAILED, "the service failed; its log says why"
+        await self._deliver(reply)
+        if ending is not None:
+            self._close(*ending)
 
-    def _answer_frame(self, frame: bytes) -> bytes:
-        start = perf_counter()
-        return self._solve(frames.decode_request(frame), start)[0]
+    async def _deliver(self, message: Message) -> None:
+        """Send a message; wait until the client has taken most of those before it."""
+        self._enter(State.SENDING)
+        await self._send(message)
+        if self._state is State.SENDING:  # it was not cut off meanwhile
+            self._enter(State.WAITING)
 
-    def _answer_text(self, text: str) -> str:
-        """Answer in JSON: the same fields by name, bits as lists of names, and a reason."""
+    def _complaint(self, *error: Any) -> Message:
+        self._sessions.metrics.count_refused_frame()
+        return {"type": "websocket.send", "text": error_body(*error).decode()}
+
+    def _reply(self, message: Message) -> Message:
+        start, frame, text = perf_counter(), message.get("bytes"), message.get("text") or ""
+        if frame is not None:
+            reply = self._answer(frames.decode_request(frame), start)
+            return {"type": "websocket.send", "bytes": reply}
         if is_command(text):
-            return self._obey(text)
-        start = perf_counter()
-        request = parse_session_request(text)
-        self._check_size(request.outputs)
-        frame, step = self._solve(request, start)
-        reply = frames.decode_reply(frame)
-        document = {name: value for name, value in reply._asdict().items() if value is not None}
-        document["flags"] = _names(Flag(reply.flags))
-        document["outputs"] = _names(Output(reply.outputs))
-        document["reason"] = step.reason
-        return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY).decode()
+            return {"type": "websocket.send", "text": self._obey(text)}
+        request = read_request(text)
+        outputs = Output(request.outputs)
+        per_node = 3 * (Output.DISPLACEMENT in outputs) + (Output.VON_MISES in outputs)
+        numbers = per_node * len(self._model.surface_nodes)
+        check_json_size(numbers, self._sessions.settings.max_json_numbers, "outputs")
+        return {"type": "websocket.send", "text": write_reply(self._answer(request, start))}
 
-    def _obey(self, text: str) -> str:
-        """Keep the state of the tissue or go back to one that was kept; echo the command."""
-        restores, number = parse_session_command(text)
-        if not restores:
-            self._snapshots[number] = self._follower.snapshot()
-        elif number in self._snapshots:
-            self._follower.restore(self._snapshots[number])
-        else:
-            raise Refusal(
-                "unknown_snapshot", "restore", "None was kept by this number",
-                sorted(self._snapshots),
-            )  # fmt: skip
-        return orjson.dumps({"restore" if restores else "snapshot": number}).decode()
-
-    def _solve(self, request: Request, start: float) -> tuple[bytes, Step]:
-        """Answer a request whose decoding began at `start`: the reply's frame and its content."""
+    def _answer(self, request: Request, start: float) -> bytes:
+        """Answer a request whose decoding began at `start`."""
         decoded = perf_counter()
-        step = self._follower.follow(request.position, BUDGET, request.client_time)
+        answer = self._tracker.follow(request.position, BUDGET, request.client_time)
         solved = perf_counter()
-        extras = recover(self._atlas, step.touch, request.outputs)
+        extras = recover(self._model, answer.touch, request.outputs)
         recovered = perf_counter()
         superseded, self._superseded = self._superseded, 0
         frame = frames.encode_reply(
-            request, step, extras, superseded, self._received, perf_counter()
+            request, answer, extras, superseded, self._received, perf_counter()
         )
         borders = (start, decoded, solved, recovered, perf_counter())
-        self._metrics.count_frame(start - self._received, borders, step.flags, superseded)
-        return frame, step
+        self._sessions.metrics.count_frame(
+            start - self._received, borders, answer.flags, superseded
+        )
+        return frame
 
-    def _complain(self, code: str, field: str, message: str, allowed: Any = None) -> Message:
-        self._metrics.count_refused_frame()
-        error = {"code": code, "field": field, "message": message, "allowed": allowed}
-        return {"type": "websocket.send", "text": orjson.dumps({"error": error}).decode()}
+    def _obey(self, text: str) -> str:
+        """Keep the state of the tissue or go back to one that was kept; echo the command."""
+        restores, number = read_command(text)
+        if not restores:
+            self._snapshots[number] = self._tracker.snapshot()
+        elif number in self._snapshots:
+            self._tracker.restore(self._snapshots[number])
+        else:
+            kept = sorted(self._snapshots)
+            raise Refusal("unknown_snapshot", "restore", "None was kept by this number", kept)
+        return orjson.dumps({"restore" if restores else "snapshot": number}).decode()
 
-    def _check_size(self, outputs: int) -> None:
-        """Refuse fields that would keep the event loop busy writing decimals."""
-        per_node = 3 * bool(outputs & _DISPLACEMENT) + bool(outputs & _VON_MISES)
-        numbers = per_node * len(self._atlas.surface_nodes)
-        if numbers > self._settings.max_json_numbers:
-            raise Refusal(
-                "too_large_for_json",
-                "outputs",
-                f"{numbers} numbers are too many for JSON; send binary frames instead",
-                {"max_numbers": self._settings.max_json_numbers},
-            )
-
-    def _hello(self) -> str:
+    def _greeting(self) -> str:
         """Say what is served and how to speak with it."""
-        atlas = self._atlas
+        model = self._model
         document = {
-            "scene": atlas.name,
-            "tip_radius": atlas.scene.endoscope.radius,
-            "example": {"position": self._model.tip},
-            "nodes": len(atlas.surface_nodes),
-            "idle_timeout": self._settings.session_idle,
+            "scene": model.name,
+            "tip_radius": model.scene.endoscope.radius,
+            "example": {"position": self._served.tip},
+            "nodes": len(model.surface_nodes),
+            "idle_timeout": self._sessions.settings.session_idle,
             "max_frames_per_second": MOST_FRAMES,
-            "longest_step": LONGEST if atlas.scene.tissue.prony else None,
+            "longest_step": LONGEST if model.scene.tissue.prony else None,
             "snapshots": MOST_SNAPSHOTS,
             "server_time": perf_counter(),
-            "layout": frames.layout(),
+            "layout": layout(),
         }
         return orjson.dumps(document).decode()
-
-
-def warm(model: Model, metrics: Metrics) -> None:
-    """Call all that a session calls once, and keep what the first sessions need at hand."""
-    if model.atlas.tips is None:
-        return
-    x, y, z = model.tip
-    request = Request(0, 0.0, (x, y, z), sum(Output))
-    for _ in range(SPARE):
-        follower = follower_of(model.atlas)
-        _wander(follower, model.atlas)
-        step = follower.follow(request.position, BUDGET)
-        frames.encode_reply(request, step, recover(model.atlas, step.touch, request.outputs))
-        metrics.count_frame(0.0, (0.0, 0.0, 0.0, 0.0, 0.0), step.flags, 0)
-        follower.restart()
-        model.followers.append(follower)
-
-
-def _wander(follower: Follower, atlas: ReducedModel) -> None:
-    """Go from one local model to the next and back: all that a history may need."""
-    models = atlas.models
-    if models.viscous is None:
-        return
-    over = models.centres + 0.9 * atlas.scene.endoscope.radius * models.frames[:, 0]
-    here, there = models.viscous.pairs[0]
-    for number, k in enumerate((here, there, here)):
-        follower.follow(over[k].tolist(), BUDGET, 0.01 * number)
-    follower.restart()
-
-
-def recover(atlas: ReducedModel, touch: Touch, outputs: int) -> Extras:
-    """Get what a request asked for beyond force and tangent."""
-    if not outputs & ~_HALF:
-        return frames.NO_EXTRAS
-    kind = np.float16 if outputs & _HALF else np.float32
-    coordinates = displacement = von_mises = None
-    largest = percentile = 0.0
-    if outputs & _COORDINATES:
-        coordinates = _coordinates(touch)
-    if outputs & (_DISPLACEMENT | _VON_MISES | _STRESS):
-        everywhere = atlas.displacement(touch)
-        if outputs & _DISPLACEMENT:
-            displacement = everywhere[atlas.surface_nodes].astype(kind)
-        if outputs & (_VON_MISES | _STRESS):
-            stress = atlas.von_mises(touch, "all", everywhere)
-            if outputs & _VON_MISES:
-                von_mises = stress[atlas.surface_nodes].astype(kind)
-            if outputs & _STRESS:
-                largest, percentile = np.percentile(stress, (100.0, 99.0)).tolist()
-    return Extras(outputs, coordinates, displacement, von_mises, largest, percentile)
-
-
-def _coordinates(touch: Touch) -> np.ndarray:
-    """Reduced coordinates (MODELS, r), a row per local model."""
-    r = max((len(c) for _, _, c in touch.patches), default=0)
-    rows = np.zeros((frames.MODELS, r), np.float32)
-    for row, (_, _, c) in zip(rows, touch.patches, strict=False):
-        row[:] = c
-    return rows
-
-
-def _names(bits: Any) -> list[str]:
-    return [bit.name.lower() for bit in bits]

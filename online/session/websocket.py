@@ -1,4 +1,4 @@
-"""Uvicorn's WebSockets, bounded: what a client may pile up here, and how it is told to go."""
+"""Uvicorn's WebSockets with limits on what a client may send, and a way to close them in order."""
 
 import asyncio
 import logging
@@ -6,14 +6,20 @@ import socket
 from time import perf_counter
 from typing import Any
 
+from starlette.types import Receive, Scope, Send
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.frames import Frame
 from websockets.http11 import Request
 
+from palpate.online.session.frames import REPLY
+
 logger = logging.getLogger(__name__)
 
+ECHO = "/echo"
+"""Path of the `Echo`, if the service has one."""
+
 STOPPING = 1012
-"""Code of the ``websocket.disconnect`` that asks an application to say goodbye itself."""
+"""Code of the ``websocket.disconnect`` that asks an application to close the connection itself."""
 
 PENDING = "palpate.pending"
 """Key of the ASGI scope's extensions: a function that tells whether a message can be received
@@ -42,7 +48,7 @@ LINGER = 1.0
 """Seconds a client gets to take what was sent before its connection is cut."""
 
 
-class Protocol(WebSocketsSansIOProtocol):
+class SessionProtocol(WebSocketsSansIOProtocol):
     """Like uvicorn's, but for eight things.
 
     An application can tell whether there is more to read, and when it was read. The system's
@@ -135,8 +141,25 @@ class Protocol(WebSocketsSansIOProtocol):
         self.loop.call_later(LINGER, self.transport.abort)
 
 
+class Echo:
+    """The ASGI application that answers frames with empty replies of their number.
+
+    It has a session's sizes and none of its work: what a WebSocket costs by itself.
+    """
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer until the client goes."""
+        await receive()
+        await send({"type": "websocket.accept"})
+        await send({"type": "websocket.send", "text": "{}"})
+        rest = bytes(REPLY.itemsize - 8)
+        while (message := await receive())["type"] == "websocket.receive":
+            reply = bytes(4) + (message.get("bytes") or b"")[4:8] + rest
+            await send({"type": "websocket.send", "bytes": reply})
+
+
 OPTIONS: dict[str, Any] = {
-    "ws": Protocol,
+    "ws": SessionProtocol,
     # deflating a frame takes longer than solving it
     "ws_per_message_deflate": False,
     # sessions watch for silent clients themselves

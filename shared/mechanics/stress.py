@@ -12,6 +12,17 @@ from numba import njit
 from numpy.typing import NDArray
 
 from palpate.shared.mechanics import tissue, viscosity
+from palpate.shared.mechanics.tensors import (
+    FAST,
+    add_identity,
+    add_to_packed,
+    load,
+    load_packed,
+    packed,
+    trace,
+    twice_deviator,
+    unpacked,
+)
 
 
 class StressRecovery(NamedTuple):
@@ -26,7 +37,7 @@ class StressRecovery(NamedTuple):
     midsides: NDArray[np.int32]  # (k, 3) midside node and the corners either side of it
 
 
-@njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc", "nsz"})
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
 def nodal_von_mises(mesh, u, out):
     """Write the von Mises stress (nodes,) kPa of the displacement ``u`` (nodes, 3) mm to ``out``.
 
@@ -51,12 +62,7 @@ def nodal_von_mises(mesh, u, out):
                 H[48 + k] += z * gradients[k]
         mu, lam = mesh.mu[e], mesh.lam[e]
         for q in range(8):
-            at_points[q] = tissue.von_mises(
-                1.0 + H[q], H[8 + q], H[16 + q],
-                H[24 + q], 1.0 + H[32 + q], H[40 + q],
-                H[48 + q], H[56 + q], 1.0 + H[64 + q],
-                mu, lam,
-            )  # fmt: skip
+            at_points[q] = tissue.von_mises(add_identity(load(H, q, 8), 1.0), mu, lam)
         for corner in range(8):
             value = 0.0
             for q in range(8):
@@ -65,7 +71,7 @@ def nodal_von_mises(mesh, u, out):
     _average(mesh, out)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc", "nsz"})
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
 def remember(mesh, u, share, B):
     """Add to ``B`` (e, 6, 8) what a displacement ``u`` (nodes, 3) mm of the past drives it to.
 
@@ -76,21 +82,13 @@ def remember(mesh, u, share, B):
     H = np.empty(72)
     for e in range(len(mesh.connectivity)):
         _gradients(mesh.connectivity[e], flat[e], u, H)
-        b = B[e]
+        b = B[e].reshape(-1)
         for q in range(8):
-            f0, f1, f2 = 1.0 + H[q], H[8 + q], H[16 + q]
-            f3, f4, f5 = H[24 + q], 1.0 + H[32 + q], H[40 + q]
-            f6, f7, f8 = H[48 + q], H[56 + q], 1.0 + H[64 + q]
-            m0, m1, m2, m3, m4, m5 = viscosity.driven(f0, f1, f2, f3, f4, f5, f6, f7, f8)
-            b[0, q] += share * m0
-            b[1, q] += share * m1
-            b[2, q] += share * m2
-            b[3, q] += share * m3
-            b[4, q] += share * m4
-            b[5, q] += share * m5
+            m = viscosity.driven(add_identity(load(H, q, 8), 1.0))
+            add_to_packed(share, m, b, q, 8)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc", "nsz"})
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
 def remember_linearly(mesh, u, B):
     """The same of a small displacement (mm) that stands for all shares."""
     nodes = mesh.connectivity.shape[1]
@@ -98,18 +96,13 @@ def remember_linearly(mesh, u, B):
     H = np.empty(72)
     for e in range(len(mesh.connectivity)):
         _gradients(mesh.connectivity[e], flat[e], u, H)
-        b = B[e]
+        b = B[e].reshape(-1)
         for q in range(8):
-            third = (H[q] + H[32 + q] + H[64 + q]) / 3.0
-            b[0, q] -= 2.0 * (H[q] - third)
-            b[1, q] -= 2.0 * (H[32 + q] - third)
-            b[2, q] -= 2.0 * (H[64 + q] - third)
-            b[3, q] -= H[40 + q] + H[56 + q]
-            b[4, q] -= H[16 + q] + H[48 + q]
-            b[5, q] -= H[8 + q] + H[24 + q]
+            G = load(H, q, 8)
+            add_to_packed(-1.0, packed(twice_deviator(G, trace(G) / 3.0)), b, q, 8)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc", "nsz"})
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
 def nodal_von_mises_after(mesh, u, B, out):
     """As ``nodal_von_mises`` of tissue with a past: ``B`` (e, 6, 8), point index last."""
     nodes = mesh.connectivity.shape[1]
@@ -118,15 +111,10 @@ def nodal_von_mises_after(mesh, u, B, out):
     out[:] = 0.0
     for e in range(len(mesh.connectivity)):
         _gradients(mesh.connectivity[e], flat[e], u, H)
-        b, mu, lam = B[e], mesh.mu[e], mesh.lam[e]
+        b, mu, lam = B[e].reshape(-1), mesh.mu[e], mesh.lam[e]
         for q in range(8):
-            at_points[q] = viscosity.von_mises(
-                1.0 + H[q], H[8 + q], H[16 + q],
-                H[24 + q], 1.0 + H[32 + q], H[40 + q],
-                H[48 + q], H[56 + q], 1.0 + H[64 + q],
-                b[0, q], b[1, q], b[2, q], b[3, q], b[4, q], b[5, q],
-                mu, lam,
-            )  # fmt: skip
+            F, past = add_identity(load(H, q, 8), 1.0), unpacked(load_packed(b, q, 8))
+            at_points[q] = viscosity.von_mises(F, past, mu, lam)
         for corner in range(8):
             value = 0.0
             for q in range(8):
@@ -135,7 +123,7 @@ def nodal_von_mises_after(mesh, u, B, out):
     _average(mesh, out)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc", "nsz"})
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
 def _average(mesh, out):
     """Turn sums over elements at nodes into means, and set nodes on edges between theirs."""
     for node in range(len(mesh.elements_at)):
@@ -145,7 +133,7 @@ def _average(mesh, out):
         out[mesh.midsides[k, 0]] = 0.5 * (out[mesh.midsides[k, 1]] + out[mesh.midsides[k, 2]])
 
 
-@njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc", "nsz"})
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
 def _gradients(connectivity, flat, u, H):
     """Displacement gradients (72,) at the points of an element."""
     H[:] = 0.0

@@ -33,9 +33,9 @@ second order in the step for others::
 solved, and ``Psi`` with that ``B`` is an incremental potential: stress and symmetric tangent are
 its derivatives, and an energy line search works as for elastic tissue.
 
-A *history* is an array (terms + 1, 7): of every term ``H - I`` and ``c_a - 1``, in the last row
-``m - I`` and ``c - 1`` at the last time.  Rest is zero.  A symmetric tensor is kept as 00, 11, 22,
-12, 02, 01; other tensors as in ``mechanics.tissue``.
+A *history* is an array (terms + 1, n): of every term ``H - I``, in the last row ``m - I`` at the
+last time, of many points one after the other or component by component.  Rest is zero.  Tensors are
+those of ``mechanics.tensors``; those of a history are packed.
 """
 
 import math
@@ -46,12 +46,26 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from palpate.shared.mechanics.tissue import equivalent, first_piola, inverse_and_jacobian
+from palpate.shared.mechanics.tensors import (
+    FAST,
+    add,
+    cofactor,
+    constant,
+    ddot,
+    det,
+    dot,
+    gram,
+    inline,
+    load,
+    scale,
+    store,
+    subtract,
+    transposed,
+    unit,
+)
+from palpate.shared.mechanics.tissue import equivalent, first_piola
 
 Array = NDArray[np.float64]
-
-COMPONENTS = 7
-"""Of one term of a history: a symmetric tensor and a scalar."""
 
 
 class Weights(NamedTuple):
@@ -82,233 +96,120 @@ def step_weights(prony: Sequence[tuple[float, float]], dt: float) -> Weights:
     return Weights(*np.array(terms, dtype=float).reshape(-1, 4).T.copy())
 
 
-@njit(cache=True, error_model="numpy")
-def driving(F, Finv, m):
-    """What the history tends to: ``m - I`` and ``c - 1`` of a deformation gradient.
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def predict(history, weights, out):
+    """What of ``B`` is known before a step is solved, but for the multiple of ``I`` in it.
 
     Parameters
     ----------
-    F : ndarray, shape (9,)
-    Finv : ndarray, shape (9,), out
-    m : ndarray, shape (7,), out
-    """
-    J = inverse_and_jacobian(F, Finv)
-    third = 0.0
-    for i in range(9):
-        third += F[i] * F[i] / 3.0
-    for a in range(6):
-        i, j = _pair(a)
-        product = 0.0  # C^-1 = F^-1 F^-T
-        for k in range(3):
-            product += Finv[3 * i + k] * Finv[3 * j + k]
-        m[a] = third * product
-    for a in range(3):
-        m[a] -= 1.0
-    m[6] = J ** (-2.0 / 3.0) * third - 1.0
+    history : ndarray, shape (terms + 1, n)
+    weights : Weights
+        Of the step.
+    out : ndarray, shape (n,), out
+        ``sum g (decay (H - I) + old (m - I))``; ``B`` is that less ``loss I``.
 
-
-@njit(cache=True, error_model="numpy", inline="always")
-def _pair(a):
-    """Row and column of component ``a`` of a symmetric tensor."""
-    if a < 3:
-        return a, a
-    return (1 if a == 3 else 0), (2 if a < 5 else 1)
-
-
-@njit(cache=True, error_model="numpy")
-def predict(history, weights, B):
-    """What of ``B`` is known before a step is solved, (7,): the tensor, and its mean of ``c``.
-
-    history (terms + 1, 7), weights ``Weights`` of the step.
+    Returns
+    -------
+    loss : float
+        ``sum g new``.
     """
     terms = len(history) - 1
-    B[:] = 0.0
+    last = history[terms]
+    loss = 0.0
+    out[:] = constant(0.0, last[0])
     for a in range(terms):
-        g = weights.share[a]
-        for i in range(COMPONENTS):
-            B[i] += g * (weights.decay[a] * history[a, i] + weights.old[a] * history[terms, i])
-        for i in (0, 1, 2, 6):
-            B[i] -= g * weights.new[a]
+        row = history[a]
+        loss += weights.share[a] * weights.new[a]
+        kept = constant(weights.share[a] * weights.decay[a], last[0])
+        old = constant(weights.share[a] * weights.old[a], last[0])
+        for i in range(len(out)):
+            out[i] += kept * row[i] + old * last[i]
+    return loss
 
 
-@njit(cache=True, error_model="numpy")
-def advance(history, m, weights):
-    """Go to the end of a step, where ``driving`` is ``m``, in place."""
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def advance(m, weights, history):
+    """Go to the end of a step, where ``m - I`` is ``m`` (n,); history (terms + 1, n) in place."""
     terms = len(history) - 1
-    for i in range(COMPONENTS):
-        for a in range(terms):
-            history[a, i] = (
-                weights.decay[a] * history[a, i]
-                + weights.old[a] * history[terms, i]
-                + weights.new[a] * m[i]
-            )
-        history[terms, i] = m[i]
+    last = history[terms]
+    for a in range(terms):
+        row = history[a]
+        decay = constant(weights.decay[a], last[0])
+        old, new = constant(weights.old[a], last[0]), constant(weights.new[a], last[0])
+        for i in range(len(row)):
+            row[i] = decay * row[i] + old * last[i] + new * m[i]
+    for i in range(len(last)):
+        last[i] = m[i]
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def driven(f0, f1, f2, f3, f4, f5, f6, f7, f8):
-    """``m - I`` of a deformation gradient in scalars, for loops over many points."""
-    c0, c1, c2 = f4 * f8 - f5 * f7, f5 * f6 - f3 * f8, f3 * f7 - f4 * f6
-    c3, c4, c5 = f2 * f7 - f1 * f8, f0 * f8 - f2 * f6, f1 * f6 - f0 * f7
-    c6, c7, c8 = f1 * f5 - f2 * f4, f2 * f3 - f0 * f5, f0 * f4 - f1 * f3
-    J = f0 * c0 + f1 * c1 + f2 * c2  # c = J F^-T
-    trace = f0 * f0 + f1 * f1 + f2 * f2 + f3 * f3 + f4 * f4 + f5 * f5 + f6 * f6 + f7 * f7 + f8 * f8
-    s = trace / (3.0 * J * J)
-    return (
-        s * (c0 * c0 + c3 * c3 + c6 * c6) - 1.0,
-        s * (c1 * c1 + c4 * c4 + c7 * c7) - 1.0,
-        s * (c2 * c2 + c5 * c5 + c8 * c8) - 1.0,
-        s * (c1 * c2 + c4 * c5 + c7 * c8),
-        s * (c0 * c2 + c3 * c5 + c6 * c8),
-        s * (c0 * c1 + c3 * c4 + c6 * c7),
-    )
+def driven(F):
+    """``m - I`` of a deformation gradient, packed."""
+    C = cofactor(F)  # J F^-T
+    J = det(F, C)
+    s = ddot(F, F) / (3.0 * J * J)
+    a, b, c, d, e, f = gram(C)
+    return s * a - 1.0, s * b - 1.0, s * c - 1.0, s * d, s * e, s * f
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def overstress(f0, f1, f2, f3, f4, f5, f6, f7, f8, b0, b1, b2, b3, b4, b5, J, scale):
-    """``scale (F B - (C:B)/3 F^-T)`` in scalars, for loops over many points.
+def overstress(F, B, J, modulus):
+    """What the past adds to the stress: ``modulus (F B - (C:B)/3 F^-T)``.
 
     Parameters
     ----------
-    f0 ... f8 : float
-        Deformation gradient.
-    b0 ... b5 : float
-        ``B``.
-    J, scale : float
-        det F, and ``mu J^-2/3`` in kPa.
+    F, B : tuple of 9 floats
+    J, modulus : float
+        det F > 0, and ``mu J^-2/3`` in kPa.
 
     Returns
     -------
     contraction : float
-        ``C : B``.
-    p0 ... p8 : float, kPa
-        What the past adds to the first Piola-Kirchhoff stress.
+        ``C : B``.  ``modulus/2 C:B`` is what the past adds to the energy density, but for a
+        constant of the step beside which small energies would drown.
+    P : tuple of 9 floats, kPa
     """
-    n0, n1, n2 = (
-        f0 * b0 + f1 * b5 + f2 * b4,
-        f0 * b5 + f1 * b1 + f2 * b3,
-        f0 * b4 + f1 * b3 + f2 * b2,
-    )
-    n3, n4, n5 = (
-        f3 * b0 + f4 * b5 + f5 * b4,
-        f3 * b5 + f4 * b1 + f5 * b3,
-        f3 * b4 + f4 * b3 + f5 * b2,
-    )
-    n6, n7, n8 = (
-        f6 * b0 + f7 * b5 + f8 * b4,
-        f6 * b5 + f7 * b1 + f8 * b3,
-        f6 * b4 + f7 * b3 + f8 * b2,
-    )
-    contraction = (
-        f0 * n0 + f1 * n1 + f2 * n2 + f3 * n3 + f4 * n4 + f5 * n5 + f6 * n6 + f7 * n7 + f8 * n8
-    )
+    N = dot(F, B)
+    contraction = ddot(F, N)
     s = contraction / (3.0 * J)
-    return (
-        contraction,
-        scale * (n0 - s * (f4 * f8 - f5 * f7)),
-        scale * (n1 - s * (f5 * f6 - f3 * f8)),
-        scale * (n2 - s * (f3 * f7 - f4 * f6)),
-        scale * (n3 - s * (f2 * f7 - f1 * f8)),
-        scale * (n4 - s * (f0 * f8 - f2 * f6)),
-        scale * (n5 - s * (f1 * f6 - f0 * f7)),
-        scale * (n6 - s * (f1 * f5 - f2 * f4)),
-        scale * (n7 - s * (f2 * f3 - f0 * f5)),
-        scale * (n8 - s * (f0 * f4 - f1 * f3)),
-    )
-
-
-@njit(cache=True, error_model="numpy")
-def add_stress(F, B, mu, J, P):
-    """Add what the past does to the stress ``P`` (9,) kPa; return what it adds to the energy (kPa).
-
-    Without ``-3/2 mu B[6]``, a constant of the step beside which small energies would drown.
-    F (9,) with det F = ``J > 0``; B (7,) from ``predict``; ``mu`` kPa.
-    """
-    scale = mu * J ** (-2.0 / 3.0)
-    contraction, p0, p1, p2, p3, p4, p5, p6, p7, p8 = overstress(
-        F[0], F[1], F[2], F[3], F[4], F[5], F[6], F[7], F[8],
-        B[0], B[1], B[2], B[3], B[4], B[5], J, scale,
-    )  # fmt: skip
-    P[0] += p0
-    P[1] += p1
-    P[2] += p2
-    P[3] += p3
-    P[4] += p4
-    P[5] += p5
-    P[6] += p6
-    P[7] += p7
-    P[8] += p8
-    return 0.5 * scale * contraction
-
-
-@njit(cache=True, error_model="numpy")
-def add_tangent(F, B, mu, Finv, FB, A):
-    """Add what the past does to the tangent ``A`` (9, 9) kPa, symmetric.
-
-    F (9,); B (7,) from ``predict``; ``mu`` kPa; Finv, FB (9,) are scratch.
-    """
-    J = inverse_and_jacobian(F, Finv)
-    contraction = 0.0
-    for i in range(3):
-        f, g, h = F[3 * i], F[3 * i + 1], F[3 * i + 2]
-        FB[3 * i] = f * B[0] + g * B[5] + h * B[4]
-        FB[3 * i + 1] = f * B[5] + g * B[1] + h * B[3]
-        FB[3 * i + 2] = f * B[4] + g * B[3] + h * B[2]
-        contraction += f * FB[3 * i] + g * FB[3 * i + 1] + h * FB[3 * i + 2]
-    scale = mu * J ** (-2.0 / 3.0)
-    third = contraction / 3.0
-    for i in range(3):
-        for j in range(3):
-            a = 3 * i + j
-            for k in range(3):
-                for n in range(3):
-                    b = 3 * k + n
-                    Ta, Tb = Finv[3 * j + i], Finv[3 * n + k]
-                    A[a, b] += scale * (
-                        third * (2.0 / 3.0 * Ta * Tb + Finv[3 * j + k] * Finv[3 * n + i])
-                        - 2.0 / 3.0 * (FB[a] * Tb + Ta * FB[b])
-                    )
-            for n in range(3):
-                A[a, 3 * i + n] += scale * B[_component(j, n)]
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def _component(i, j):
-    """Where a symmetric tensor keeps row ``i`` and column ``j``."""
-    return i if i == j else 6 - i - j
-
-
-@njit(cache=True, error_model="numpy")
-def dissipation(F, history, weights, tau, mu):
-    """Dissipated power (kPa/s) at the last time of a history, whose deformation gradient is F."""
-    J = F[0] * (F[4] * F[8] - F[5] * F[7])
-    J += F[1] * (F[5] * F[6] - F[3] * F[8]) + F[2] * (F[3] * F[7] - F[4] * F[6])
-    trace = 0.0
-    for i in range(9):
-        trace += F[i] * F[i]
-    power = 0.0
-    for a in range(len(tau)):
-        h = history[a]
-        contraction = trace
-        for i in range(3):
-            for j in range(3):
-                product = F[i] * F[j] + F[3 + i] * F[3 + j] + F[6 + i] * F[6 + j]
-                contraction += product * h[_component(i, j)]
-        excess = J ** (-2.0 / 3.0) * contraction - 3.0 * (1.0 + h[6])
-        power += 0.5 * mu * weights.share[a] * excess / tau[a]
-    return power
+    return contraction, scale(modulus, subtract(N, scale(s, cofactor(F))))
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def von_mises(f0, f1, f2, f3, f4, f5, f6, f7, f8, b0, b1, b2, b3, b4, b5, mu, lam):
+def linearise(F, B, modulus):
+    """What ``increment`` needs of a state: ``G = F^-T``, and ``F B``, ``B``, ``C:B/3`` (kPa)."""
+    C = cofactor(F)
+    B = scale(modulus, B)
+    FB = dot(F, B)
+    return scale(1.0 / det(F, C), C), FB, B, ddot(F, FB) / 3.0
+
+
+@inline
+def increment(G, FB, B, third, H):
+    """What the past adds to ``A : H`` (kPa), of the state that ``linearise`` has described.
+
+    ``H B - 2/3 (G:H) F B - 2/3 (FB:H) G + C:B/3 (2/3 (G:H) G + G H^T G)``
+    """
+    share = constant(2.0 / 3.0, third)
+    wider = share * ddot(G, H)
+    D = subtract(dot(H, B), scale(wider, FB))
+    D = add(D, scale(third * wider - share * ddot(FB, H), G))
+    return add(D, scale(third, dot(G, dot(transposed(H), G))))
+
+
+@njit(cache=True, error_model="numpy")
+def add_tangent(F, B, mu, A):
+    """Add what the past does to the tangent ``A`` (9, 9) kPa, which stays symmetric."""
+    modulus = mu * det(F, cofactor(F)) ** (-2.0 / 3.0)
+    G, FB, B, third = linearise(F, B, modulus)
+    for k in range(9):
+        row = A[k]
+        store(add(load(row, 0, 1), increment(G, FB, B, third, unit(k))), row, 0, 1)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def von_mises(F, B, mu, lam):
     """Von Mises equivalent (kPa) of the Cauchy stress with its past; see ``overstress``."""
-    J, _, p0, p1, p2, p3, p4, p5, p6, p7, p8 = first_piola(
-        f0, f1, f2, f3, f4, f5, f6, f7, f8, mu, lam
-    )
-    _, q0, q1, q2, q3, q4, q5, q6, q7, q8 = overstress(
-        f0, f1, f2, f3, f4, f5, f6, f7, f8, b0, b1, b2, b3, b4, b5, J, mu * abs(J) ** (-2.0 / 3.0)
-    )
-    return equivalent(
-        f0, f1, f2, f3, f4, f5, f6, f7, f8,
-        p0 + q0, p1 + q1, p2 + q2, p3 + q3, p4 + q4, p5 + q5, p6 + q6, p7 + q7, p8 + q8, J,
-    )  # fmt: skip
+    J, _, P = first_piola(F, mu, lam)
+    _, Q = overstress(F, B, J, mu * abs(J) ** (-2.0 / 3.0))
+    return equivalent(F, add(P, Q), J)

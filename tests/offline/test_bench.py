@@ -37,6 +37,6 @@ def test_a_walk_stays_on_the_surface_and_in_range(artifact, rng):
         assert (steps <= STEP * (1 + 1e-9)).all()
         assert (steps >= 0.9 * STEP).all()
         for load in loads[::20]:
-            solution = atlas.solve(load.position, load.pressure, load.direction)
+            solution = atlas.press(load.position, load.pressure, load.direction)
             assert solution.distance < 1e-9
             assert solution.in_range

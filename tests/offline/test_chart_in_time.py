@@ -4,7 +4,8 @@ import csv
 
 import pytest
 
-from palpate.offline.studies.chart_in_time import FULL, SHIPPED, TWIN, chart_in_time
+from palpate.offline.studies.chart import PLAN_IN_TIME, chart_in_time
+from palpate.offline.studies.chart_points import FULL, SHIPPED, TWIN
 from palpate.shared.errors import QueryError
 
 SIZES = (5, 40)
@@ -12,7 +13,8 @@ SIZES = (5, 40)
 
 @pytest.fixture(scope="module")
 def report(visco_artifact):
-    return chart_in_time(visco_artifact, 2, 1, 1, SIZES)
+    plan = {name: sizes if sizes == (1,) else SIZES for name, sizes in PLAN_IN_TIME.items()}
+    return chart_in_time(visco_artifact, 2, 1, 1, plan)
 
 
 def test_every_method_has_a_point(report):
@@ -50,6 +52,8 @@ def test_table_and_picture(report, visco_artifact):
     with (folder / "chart_in_time.csv").open() as file:
         assert [row["key"] for row in csv.DictReader(file)] == list(report["points"])
     assert (folder / "chart_in_time.png").stat().st_size > 20_000
+    assert "the same without memory" in (folder / "chart_in_time.html").read_text(encoding="utf-8")
+    assert not list(visco_artifact.parent.glob(".*chart*"))
 
 
 def test_elastic_scenes_have_no_such_chart(artifact):

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 from palpate.offline.fem.mesh import local_thickness
 from palpate.offline.run.workshop import Workshop
 from palpate.offline.scenes import find_scene
-from palpate.offline.studies import paper, paper_pictures
+from palpate.offline.studies import paper, paper_claims, paper_pictures
 from palpate.shared.cli import main
 from palpate.shared.errors import PalpateError
 
@@ -99,10 +99,10 @@ def test_polished_equilibrium_is_one_of_the_bases(pressed):
 
 def test_tenths_are_by_value():
     value = np.arange(1.0, 101.0)
-    found = paper._tenths(value, 1 / value)
+    found = paper_claims._tenths(value, 1 / value)
     assert found["holds"]
     assert found["rank_correlation"] == pytest.approx(-1)
-    assert not paper._tenths(value, value)["holds"]
+    assert not paper_claims._tenths(value, value)["holds"]
 
 
 def test_contours(tmp_path, pressed):
@@ -117,5 +117,5 @@ def test_contours(tmp_path, pressed):
 def test_missing_pyvista_is_named_before_any_work(tmp_path, monkeypatch):
     monkeypatch.setattr(paper_pictures, "find_spec", lambda name: None)
     with pytest.raises(PalpateError, match=r"\.\[pictures\]"):
-        paper.turbinate(tmp_path)
+        paper.turbinate("turbinate", tmp_path)
     assert not list(tmp_path.iterdir())

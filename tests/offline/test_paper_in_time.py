@@ -9,7 +9,8 @@ from click.testing import CliRunner
 
 from palpate.offline.run.workshop import Workshop
 from palpate.offline.scenes import find_scene
-from palpate.offline.studies import paper_in_time
+from palpate.offline.studies import paper
+from palpate.offline.studies.relaxation import load_steps
 from palpate.shared.cli import main
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -23,10 +24,9 @@ def coarse(scene):
 
 @pytest.fixture
 def report(tmp_path, monkeypatch):
-    monkeypatch.setattr(paper_in_time, "Workshop", coarse)
-    monkeypatch.setattr(paper_in_time, "ROUNDS", 1)
-    compare = paper_in_time.compare
-    monkeypatch.setattr(paper_in_time, "compare", lambda *to: compare(*to, SIZES))
+    monkeypatch.setattr(paper, "Workshop", coarse)
+    monkeypatch.setattr(paper, "ROUNDS", 1)
+    monkeypatch.setattr(paper, "SIZES", SIZES)
     folder = tmp_path / "new"
     arguments = ["study", "cube", "cube-visco", "--report", str(folder), "--json"]
     result = CliRunner().invoke(main, arguments)
@@ -51,19 +51,19 @@ def test_the_cube_pressed_held_and_let_go(report):
 
 
 def test_pod_is_asked_another_history_than_it_learns_from():
-    learnt, asked = (np.array(paper_in_time.course(phases)) for phases in
-                     (paper_in_time.LEARNT, paper_in_time.ASKED))  # fmt: skip
+    learnt, asked = (np.array(load_steps(phases)) for phases in
+                     (paper.TRAINING, paper.QUERY))  # fmt: skip
     assert learnt.shape == asked.shape
     loaded = asked[:, 1] > 0
     assert (learnt[loaded] != asked[loaded]).all()
-    held = paper_in_time.HELD
+    held = paper.HELD
     assert asked[held, 1] == asked[:, 1].max() > asked[held + 1, 1]
 
 
 def test_the_cube_bears_its_pressure_for_ever(monkeypatch):
-    monkeypatch.setattr(paper_in_time, "Workshop", coarse)
-    monkeypatch.setattr(paper_in_time, "compare", lambda example, report: example)
-    example = paper_in_time.cube(None)
+    monkeypatch.setattr(paper, "Workshop", coarse)
+    monkeypatch.setattr(paper, "compare", lambda example, report: example)
+    example = paper.cube("cube-visco", None)
     assert find_scene("cube-visco").tissue.prony
     relaxed = example.workshop.model.relaxed.solve(example.load).displacement
     assert 0.5 < -relaxed[example.point, 2] < 2.0

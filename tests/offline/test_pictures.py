@@ -39,7 +39,7 @@ def test_missing_pyvista_is_named(artifact, tmp_path, monkeypatch):
 
 def test_the_tip_touches_the_surface_and_no_more(artifact):
     atlas = ReducedModel.load(artifact)
-    solution = atlas.solve([4, 5.5, 8], 1.5, [0.3, 0, -1])
+    solution = atlas.press([4, 5.5, 8], 1.5, [0.3, 0, -1])
     surface = (atlas.nodes + atlas.displacement(solution))[atlas.surface_nodes]
     distance = np.linalg.norm(surface - _tip_centre(surface, solution), axis=1)
     assert distance.min() == pytest.approx(solution.radius)

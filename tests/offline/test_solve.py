@@ -8,8 +8,10 @@ from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.run.workshop import Workshop
 from palpate.offline.scenes import find_scene
 from palpate.offline.solve import solve
+from palpate.shared import model
 from palpate.shared.artifact import read_artifact
-from palpate.shared.model import ReducedModel
+from palpate.shared.errors import QueryError
+from palpate.shared.model import ABSURD, ReducedModel
 
 POSITION = (4.0, 5.5, find_scene("quick").geometry.size[2] + 0.2)
 DIRECTION = (0.2, 0.1, -1.0)
@@ -35,7 +37,7 @@ def solved(artifact, pressure, tmp_path_factory):
 
 def test_the_report_is_that_of_the_atlas(artifact, pressure):
     report = solve(artifact, POSITION, pressure, DIRECTION)
-    solution = ReducedModel.load(artifact).solve(POSITION, pressure, DIRECTION)
+    solution = ReducedModel.load(artifact).press(POSITION, pressure, DIRECTION)
     assert report["scene"] == "quick"
     assert report["contact"]["distance"] == pytest.approx(0.2)
     assert report["force"] == pytest.approx(solution.force.tolist())
@@ -63,7 +65,8 @@ def test_the_full_model_is_in_equilibrium_on_the_written_mesh(workshop, solved):
 
 def test_load_and_force_agree(solved):
     report, mesh = solved
-    np.testing.assert_allclose(mesh.point_data["load"].sum(axis=0), report["force"], rtol=1e-9)
+    pushed = mesh.point_data["load"].sum(axis=0)
+    np.testing.assert_allclose(report["force"], -pushed, rtol=1e-9)  # on the tool
 
 
 def test_the_errors_are_those_of_the_written_fields(workshop, solved):
@@ -80,7 +83,7 @@ def test_the_errors_are_those_of_the_written_fields(workshop, solved):
 def test_without_the_full_model_the_fields_are_the_atlas_s(artifact, pressure, tmp_path):
     solve(artifact, POSITION, pressure, vtu=tmp_path / "out.vtu")
     atlas, fields = ReducedModel.load(artifact), meshio.read(tmp_path / "out.vtu").point_data
-    solution = atlas.solve(POSITION, pressure)
+    solution = atlas.press(POSITION, pressure)
     assert list(fields) == ["displacement", "von_mises", "load", "clamped"]
     np.testing.assert_allclose(fields["displacement"], atlas.displacement(solution), atol=1e-6)
     np.testing.assert_allclose(fields["von_mises"], atlas.von_mises(solution), atol=1e-5)
@@ -91,16 +94,25 @@ def test_no_load_has_no_error(artifact):
     assert report["full_model"]["error"] == {"displacement": 0.0, "von_mises": 0.0}
 
 
-def test_a_load_without_equilibrium_is_told(artifact):
+def test_a_load_without_equilibrium_is_told(artifact, monkeypatch):
+    monkeypatch.setattr(model, "ABSURD", np.inf)
     with pytest.raises(NoEquilibrium, match=r"^pressure: no equilibrium .* up to [0-9.]+ kPa"):
         solve(artifact, POSITION, 1e4)
 
 
-@pytest.mark.parametrize("factor", [2.0, 5.0, 20.0, 100.0, 1000.0])
+def test_a_pressure_far_beyond_all_training_is_refused(artifact):
+    largest = ReducedModel.load(artifact).pressure_max
+    with pytest.raises(QueryError, match=r"^pressure: must be at most 10 times the .* kPa"):
+        solve(artifact, POSITION, 1.001 * ABSURD * largest)
+
+
+@pytest.mark.parametrize("factor", [2.0, 5.0, 20.0])
 def test_far_beyond_the_range_there_is_a_sound_answer_or_none(artifact, pressure, factor):
     try:
         report = solve(artifact, POSITION, factor * pressure)
     except NoEquilibrium:
         return
     assert report["trust"]["min_jacobian"] > 0
+    known = report["trust"]["error_estimate"]["displacement"] is not None
+    assert known == report["trust"]["in_range"]
     json.dumps(report, allow_nan=False)

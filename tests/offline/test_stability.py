@@ -17,37 +17,36 @@ from palpate.offline.studies.hard_cases import (
     LOWERED,
     SEVERAL,
     TELEPORT,
-    Trial,
-    Truth,
-    press,
+    Equilibria,
+    HardCase,
+    equilibria,
+    several,
 )
-from palpate.offline.studies.stability import (
+from palpate.offline.studies.outcomes import (
     ANOTHER,
     ANOTHER_FLAGGED,
-    ARTIFACT,
-    FULL,
     OUTCOMES,
     RIGHT,
     RIGHT_FLAGGED,
     SILENT,
     SILENT_OUTCOMES,
-    WARM,
     WRONG_FLAGGED,
-    stability,
+    classify,
 )
+from palpate.offline.studies.stability import ARTIFACT, FULL, WARM, stability
 
 CASES, SNAPSHOTS, SEED = 3, 50, 1
 
-METHODS = (ARTIFACT, WARM, FULL, "derivatives 19", "pod 40", "pod 40, no line search", "linear 40")
+METHODS = (ARTIFACT, WARM, FULL, "derivatives 19", "pod 40", "pod, no line search 40", "linear 40")
 
-COLUMNS = (
+KINDS = (
     CONTROL, "load x 4", "tilt 60°", "off surface, out of reach", "half the radius",
     "1.5 x the radius", "two contacts", "Poisson 0.49", "tool moves 0.5 mm", TELEPORT, LOWERED,
 )  # fmt: skip
 
 
 def run(artifact):
-    return stability(artifact, CASES, SEED, METHODS, COLUMNS, SNAPSHOTS)
+    return stability(artifact, CASES, SEED, METHODS, KINDS, SNAPSHOTS)
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +74,7 @@ def test_it_answers_in_range_and_refuses_or_flags_what_it_was_not_made_for(rows)
 
 def test_methods_that_cannot_tell_fail_silently(report):
     for name in ("pod 40", "linear 40"):
-        assert sum(report["methods"][name].get(outcome, 0) for outcome in SILENT_OUTCOMES) > 0
+        assert sum(report[name]["outcomes"].get(outcome, 0) for outcome in SILENT_OUTCOMES) > 0
 
 
 def test_the_full_model_is_right_where_it_says_what_is_true(rows):
@@ -100,10 +99,10 @@ def test_the_map_is_drawn_and_nothing_else_is_left(report, artifact):
 
 def test_a_killed_run_goes_on_where_it_stopped(report, artifact, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(study, "_publish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(study, "publish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             run(artifact)
-    monkeypatch.setattr(study, "_ask", lambda *_: pytest.fail("asked again"))
+    monkeypatch.setattr(study, "_answers", lambda *_: pytest.fail("asked again"))
     assert run(artifact) == report
 
 
@@ -129,10 +128,10 @@ class Buckled:
 
 
 def buckled(*forces):
-    """A trial that leads through forces on that node, and what the full model makes of it."""
-    cases = [Case((), np.array([0]), np.array([[0.0, 0.0, force]])) for force in forces]
-    trial = Trial(cases[-1], 0.45, tuple(cases[:-1]), follow=True)
-    return trial, press(Buckled(), trial)
+    """A case that leads through forces on that node, and its equilibria."""
+    steps = [(Case((), np.array([0]), np.array([[0.0, 0.0, force]])), 0.0) for force in forces]
+    case = HardCase(tuple(steps), 0.45, follow=True)
+    return case, equilibria(Buckled(), case)
 
 
 def test_a_load_that_snapped_and_was_lowered_stays_on_its_branch():
@@ -142,9 +141,7 @@ def test_a_load_that_snapped_and_was_lowered_stays_on_its_branch():
     assert lowered[1].path[2] == pytest.approx(2.0 + 3**0.5)
     assert lowered[1].other[2] == pytest.approx(2.0 - 3**0.5)
     assert not buckled(3.0, 6.0, 0.5)[1].several  # lowered so far that it snaps back
-    trials = {LOWERED: [raised[0], lowered[0]]}
-    found = {LOWERED: [raised[1], lowered[1]]}
-    assert study._several(trials, found, 9) == {SEVERAL: [], HYSTERESIS: [lowered]}
+    assert several({LOWERED: [raised, lowered]}, 9) == {SEVERAL: [], HYSTERESIS: [lowered]}
 
 
 @pytest.fixture(scope="module")
@@ -155,18 +152,22 @@ def workshop():
 def test_an_answer_on_another_branch_is_told_apart_and_counts_as_silent(workshop):
     x, normal, _ = workshop.surface.project(np.array([4.0, 5.5, 8.0]))
     path, jump = (workshop.sample(Load(x, -normal, p)).ravel().astype(float) for p in (1.5, 1.0))
-    truth = Truth(path, jump)
+
+    def outcome(u, trusted, truth):
+        question = study._question(workshop, None, truth)
+        found = study._question(workshop, None, Equilibria(u, u)).exact
+        return classify(workshop, found, trusted, question.exact, question.other).outcome
+
+    truth = Equilibria(path, jump)
     outcomes = {
-        trusted: [
-            study._judge(workshop, u, trusted, truth).outcome for u in (path, jump, 0.5 * jump)
-        ]
+        trusted: [outcome(u, trusted, truth) for u in (path, jump, 0.5 * jump)]
         for trusted in (True, False)
     }
     assert outcomes[True] == [RIGHT, ANOTHER, SILENT]
     assert outcomes[False] == [RIGHT_FLAGGED, ANOTHER_FLAGGED, WRONG_FLAGGED]
     assert ANOTHER in SILENT_OUTCOMES
-    assert study._judge(workshop, jump, True, Truth(None, jump)).outcome == ANOTHER
-    assert study._judge(workshop, jump, True, Truth(path, path)).outcome == SILENT
+    assert outcome(jump, True, Equilibria(None, jump)) == ANOTHER
+    assert outcome(jump, True, Equilibria(path, path)) == SILENT
 
 
 def test_the_full_model_is_followed_up_and_down_beside_the_warm_artifact(rows):

@@ -5,25 +5,27 @@ import csv
 import numpy as np
 import pytest
 
-from palpate.offline.studies import courses
-from palpate.offline.studies.courses import CONTROL, trials
-from palpate.offline.studies.stability import OUTCOMES, REFUSED, RIGHT, RIGHT_FLAGGED
-from palpate.offline.studies.stability_in_time import ARTIFACT, STEPS, TIP, stability_in_time
+from palpate.offline.run.workshop import Workshop
+from palpate.offline.studies import trajectories
+from palpate.offline.studies.outcomes import OUTCOMES, REFUSED, RIGHT, RIGHT_FLAGGED
+from palpate.offline.studies.stability import LOADS, STEPS, TIP, stability_in_time
+from palpate.offline.studies.trajectories import CONTROL, histories
+from palpate.shared.artifact import read_artifact
 from palpate.shared.errors import QueryError
 from palpate.shared.model import ReducedModel
 
 CASES, MANY, SEED = 1, 100, 1
-LONGEST = "held for 100 s, 100 steps"
-COLUMNS = (
-    CONTROL, "steps of 0.01 ms", "steps of no time", "direction flipped at once", LONGEST,
-    "1.5 x the limit", "time runs back",
+LONGEST, PERIODIC = "held for 100 s, 100 steps", "moves periodically, 100 steps"
+KINDS = (
+    CONTROL, "steps of 0.01 ms", "steps of no time", "direction flipped at once", LONGEST, PERIODIC,
+    "steps of a day", "taps at 20 Hz", "1.5 x the limit", "time runs back",
 )  # fmt: skip
-METHODS = (ARTIFACT, TIP, "modal 40", STEPS)
+METHODS = (LOADS, TIP, "modal 40", STEPS)
 
 
 @pytest.fixture(scope="module")
 def report(visco_artifact):
-    return stability_in_time(visco_artifact, CASES, SEED, MANY, METHODS, COLUMNS, lessons=1)
+    return stability_in_time(visco_artifact, CASES, SEED, MANY, METHODS, KINDS, snapshots=1)
 
 
 @pytest.fixture(scope="module")
@@ -35,20 +37,20 @@ def rows(report, visco_artifact):
 
 
 def test_the_artifact_never_fails_silently(report):
-    for name in (ARTIFACT, TIP):
+    for name in (LOADS, TIP):
         assert report[name]["silently_wrong"] == report[name]["nan"] == report[name]["crashes"] == 0
 
 
 def test_it_has_an_answer_to_every_length_of_steps(rows):
-    for method in (ARTIFACT, TIP):
-        for stressor in COLUMNS[:5]:
+    for method in (LOADS, TIP):
+        for stressor in KINDS[:8]:
             if (method, stressor) in rows:
                 row = rows[method, stressor]
                 assert int(row[RIGHT]) + int(row[RIGHT_FLAGGED]) == int(row["cases"]), stressor
 
 
 def test_loads_out_of_range_are_flagged(rows):
-    assert int(rows[ARTIFACT, "1.5 x the limit"][RIGHT]) == 0
+    assert int(rows[LOADS, "1.5 x the limit"][RIGHT]) == 0
 
 
 def test_time_that_makes_no_sense_is_refused_by_all(rows):
@@ -59,6 +61,11 @@ def test_time_that_makes_no_sense_is_refused_by_all(rows):
 def test_a_long_hold_does_not_drift(report):
     for name in METHODS:
         assert report[name]["drift"][LONGEST] < 5e-3
+
+
+def test_a_periodic_movement_repeats(report):
+    for name in (LOADS, TIP, "modal 40"):
+        assert report[name]["drift"][PERIODIC] < 1e-3
 
 
 def test_stiff_modes_and_large_steps_fail_silently(report, rows):
@@ -77,17 +84,24 @@ def test_every_cell_counts_its_cases(rows):
 
 def test_brief_histories_end_when_and_where_the_long_ones_do(visco_artifact):
     atlas = ReducedModel.load(visco_artifact)
+    workshop = Workshop.of_artifact(read_artifact(visco_artifact))
+
+    def seconds(steps):
+        return sum(dt for _, dt in steps)
+
     for tip in (False, True):
-        found = trials(atlas, tip, CASES, SEED, MANY)
-        long = [trial for own in found.values() for trial in own if trial.brief]
-        assert len(long) == 2
-        for trial in long:
-            seconds = [sum(press.dt for press in own) for own in (trial.presses, trial.brief)]
-            assert seconds[0] == pytest.approx(seconds[1])
-            np.testing.assert_array_equal(trial.presses[-1].position, trial.brief[-1].position)
-            assert trial.presses[-1].pressure == trial.brief[-1].pressure
-        held = sum(press.dt for press in found["held for 10 000 s"][0].presses)
-        assert held == pytest.approx(courses.LONG, rel=1e-3)
+        found = histories(atlas, workshop, tip, CASES, SEED, MANY)
+        long = {name: own[0] for name, own in found.items() if own[0].brief}
+        assert len(long) == 3
+        for name, case in long.items():
+            assert case.end_only
+            one, other = case.steps[-1][0].contacts[0], case.brief[-1][0].contacts[0]
+            np.testing.assert_array_equal(one.position, other.position)
+            assert one.pressure == other.pressure
+            if name != PERIODIC:
+                assert seconds(case.steps) == pytest.approx(seconds(case.brief))
+        held = seconds(found["held for 10 000 s"][0].steps)
+        assert held == pytest.approx(trajectories.LONG, rel=1e-3)
 
 
 def test_elastic_scenes_have_none(artifact):

@@ -6,18 +6,18 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
-from palpate.offline import scenes
+from palpate.offline.run.checkpoint import content_key
 from palpate.offline.run.workshop import Workshop
-from palpate.offline.train import train
+from palpate.offline.scenes import filled, find_scene
+from palpate.offline.train import is_of, train
 from palpate.shared.artifact import read_artifact
 from palpate.shared.model import ReducedModel
-from palpate.shared.reduced.press import query
+from palpate.shared.reduced import press, touch
 from palpate.shared.scene import SceneError
 
 STAGES = ("load range", "Ritz vectors", "local models", "full solutions")
@@ -86,10 +86,37 @@ def test_a_resumed_run_makes_the_artifact_of_an_undisturbed_one(resumed, artifac
     # the sparse solver's last digit depends on where its memory lies, and picks other points
     found, expected = ReducedModel.load(resumed[0]), ReducedModel.load(artifact)
     for x in expected.models.centres[:5]:
-        pressure = 0.8 * expected.solve(x, 0.0).pressure_limit
-        u = expected.displacement(expected.solve(x, pressure))
-        difference = found.displacement(found.solve(x, pressure)) - u
+        pressure = 0.8 * expected.press(x, 0.0).pressure_limit
+        u = expected.displacement(expected.press(x, pressure))
+        difference = found.displacement(found.press(x, pressure)) - u
         assert np.linalg.norm(difference) <= 0.01 * np.linalg.norm(u)
+
+
+def test_the_log_says_beforehand_what_will_be_made(resumed):
+    path, _, log = resumed
+    made = ReducedModel.load(path).info["training"]["layout"]
+    said = rf"quick: 4 x 4 x 3 elements hex20, {made['dofs']} DOFs; about {made['patches']} local"
+    assert re.search(said, log)
+
+
+def test_what_is_there_is_not_trained_again(resumed, capsys):
+    path, before = resumed[0], resumed[0].stat().st_mtime_ns
+    assert train("quick", path) == path
+    assert "up to date" in capsys.readouterr().err
+    assert path.stat().st_mtime_ns == before
+
+
+def test_a_changed_scene_is_trained_again(resumed, tmp_path):
+    path, scene = resumed[0], tmp_path / "quick.toml"
+    scene.write_text(find_scene("quick").text.replace("samples = 120", "samples = 60"))
+    assert not is_of(path, content_key(find_scene(scene)))
+    assert is_of(path, content_key(find_scene("quick")))
+    assert not is_of(tmp_path / "none.h5", content_key(find_scene("quick")))
+
+
+def test_the_time_of_a_training_is_that_on_the_wall(resumed):
+    info = ReducedModel.load(resumed[0]).info
+    assert info["provenance"]["wall_seconds"] > sum(info["training"]["seconds"].values())
 
 
 def test_nothing_is_left_beside_the_artifact(resumed):
@@ -101,14 +128,16 @@ def test_one_compilation_serves_training_and_queries(artifact):
     atlas = ReducedModel.load(artifact)
     workshop = Workshop.of_artifact(read_artifact(artifact))
     workshop.compile_query()
-    atlas.solve(atlas.surface.vertices[0], 0.1)
+    atlas.press(atlas.surface.vertices[0], 0.1)
+    queries = press.place, press.press, touch.place, touch.touch
+    known = [len(query.signatures) for query in queries]
     by_columns = np.asfortranarray(atlas.limits)
     other = ReducedModel(
         atlas.name, atlas.scene, {}, atlas.body, atlas.surface, by_columns, atlas.models,
         atlas.estimators,
     )  # fmt: skip
-    other.solve(atlas.surface.vertices[0], 0.1)
-    assert len(query.signatures) == 1
+    other.press(atlas.surface.vertices[0], 0.1)
+    assert [len(query.signatures) for query in queries] == known
 
 
 def test_the_mesh_error_is_that_of_other_meshes(artifact):
@@ -122,9 +151,8 @@ def test_the_mesh_error_is_that_of_other_meshes(artifact):
 
 
 def test_an_element_that_cannot_be_reduced_is_refused_at_once(tmp_path):
-    text = (Path(scenes.__file__).parent / "quick.toml").read_text()
     scene = tmp_path / "locked.toml"
-    scene.write_text(re.sub('"hex(8|20)"', '"hex8-mean-dilatation"', text))
+    scene.write_text(filled(find_scene("quick")).replace('"hex20"', '"hex8-mean-dilatation"'))
     with pytest.raises(SceneError, match=r"geometry\.element.*train with hex8 or hex20"):
         train(scene, tmp_path / "locked.h5")
     assert list(tmp_path.iterdir()) == [scene]

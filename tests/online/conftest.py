@@ -7,8 +7,9 @@ import pytest
 import uvicorn
 from starlette.testclient import TestClient
 
+from palpate.online.client.session import ServiceError, Session
 from palpate.online.serve.app import create_app
-from palpate.online.serve.process import Protocol
+from palpate.online.serve.process import HttpProtocol
 from palpate.online.serve.settings import Settings
 from palpate.online.serve.store import Store
 from palpate.online.session.websocket import OPTIONS
@@ -19,20 +20,20 @@ from .fake_model import FakeModel
 
 @pytest.fixture
 def fake_store(tmp_path):
-    """Return a function that makes a store of fake atlases, one per name.
+    """Return a function that makes a store of fake models, one per name.
 
-    An exception in place of an atlas is raised when that file is loaded.
+    An exception in place of an model is raised when that file is loaded.
     """
 
-    def make(**atlases):
-        for name in atlases:
+    def make(**models):
+        for name in models:
             (tmp_path / f"{name}.h5").touch()
 
         def load(path):
-            atlas = atlases[path.stem]
-            if isinstance(atlas, Exception):
-                raise atlas
-            return atlas
+            model = models[path.stem]
+            if isinstance(model, Exception):
+                raise model
+            return model
 
         return Store(tmp_path, load)
 
@@ -41,11 +42,11 @@ def fake_store(tmp_path):
 
 @pytest.fixture
 def serve(fake_store, tmp_path):
-    """Return a context manager that serves fake atlases to an in-process client, once warm."""
+    """Return a context manager that serves fake models to an in-process client, once warm."""
 
     @contextmanager
-    def serving(settings=None, **atlases):
-        store = fake_store(**atlases)
+    def serving(settings=None, **models):
+        store = fake_store(**models)
         app = create_app(settings or Settings(tmp_path), store)
         with TestClient(app, raise_server_exceptions=False) as client:
             _wait_for(store)
@@ -63,14 +64,14 @@ def client(serve):
 
 @pytest.fixture
 def serving(fake_store, tmp_path):
-    """Return a context manager that serves fake atlases on a real socket and gives the address."""
+    """Return a context manager that serves fake models on a real socket and gives the address."""
 
     @contextmanager
-    def serving(settings=None, **atlases):
-        store = fake_store(**atlases)
+    def serving(settings=None, **models):
+        store = fake_store(**models)
         app = create_app(settings or Settings(tmp_path), store)
         config = uvicorn.Config(
-            app, http=Protocol, access_log=False, log_level="warning", **OPTIONS
+            app, http=HttpProtocol, access_log=False, log_level="warning", **OPTIONS
         )
         server = uvicorn.Server(config)
         with socket.create_server(("127.0.0.1", 0)) as bound:
@@ -91,6 +92,16 @@ def url(serving):
     """Return the address of a toy service on a real socket."""
     with serving(toy=FakeModel()) as url:
         yield url
+
+
+def place_comes_free(url):
+    """Open a session as soon as there is a place."""
+    for _ in range(500):
+        try:
+            return Session(url, "toy")
+        except ServiceError:
+            time.sleep(0.01)
+    raise AssertionError("no place came free")
 
 
 def _wait_for(store):

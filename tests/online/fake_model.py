@@ -1,33 +1,35 @@
-"""A toy that answers like an `ReducedModel`: a block whose top dents linearly under the load."""
+"""A toy that answers like a `ReducedModel`: a block whose top dents linearly under the load."""
 
-import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
+from palpate.shared.answer import Answer
 from palpate.shared.errors import QueryError
 from palpate.shared.geometry.surface import Surface
-from palpate.shared.model import Solution
-from palpate.shared.reduced.touch import Touch
-from palpate.shared.scene import Scene, load_scene
+from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH
+from palpate.shared.model import ABSURD
+from palpate.shared.reduced.transfer import Past
+from palpate.shared.scene import load_scene
 
 QUICK = Path(__file__).parents[2] / "offline" / "scenes" / "quick.toml"
+UP = np.array([0.0, 0.0, 1.0])
+DEEPEST_TRAINED = 1.0
 
 
 class Memory:
-    """Where the tip was."""
+    """Where the tip was, and how often a search has gone on."""
 
     def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
         self.last: np.ndarray | None = None
         self.gone_on = 0
 
-    def forget(self) -> None:
-        self.last = None
-        self.gone_on = 0
-
-    def go_on(self) -> None:
+    def resume(self) -> None:
         self.gone_on += 1
 
 
@@ -38,26 +40,27 @@ class FakeModel:
 
     A tip meets a bed of springs of `stiffness` (mN/mm). Deeper than `deepest` (mm) there is no
     equilibrium, but for a search that has gone on `snap` times; none is found more than `stride`
-    (mm) from the last contact. Without `tips` there is no answer to a tip at all.
+    (mm) from the last contact. Without `has_tip` there is no answer to a tip at all. With `in_time`
+    the force grows with the time since rest, and `steps` are those that were taken.
     """
 
     pressure_max = 8.0
+    collapse = 40.0
+    poison = False
     stiffness = 20.0
     deepest = 1.5
     stride = np.inf
     snap = 0
-    tips: object | None = "a bed of springs"
+    has_tip = True
     models = SimpleNamespace(viscous=None)
 
-    def __init__(
-        self, name: str = "toy", divisions: int = 10, collapse: float = 40.0, poison: bool = False
-    ) -> None:
+    def __init__(self, name: str = "toy", divisions: int = 10, in_time: bool = False) -> None:
         scene = load_scene(QUICK)
+        tissue = scene.tissue.model_copy(update={"prony": ((0.5, 0.1),) if in_time else ()})
         self.name = name
-        self.scene: Scene = scene.model_copy(update={"name": name})
+        self.scene = scene.model_copy(update={"name": name, "tissue": tissue})
         self.info: dict[str, Any] = {"modes": 1, "validation": {"queries": 0}}
-        self.collapse = collapse
-        self.poison = poison
+        self.steps: list[float] = []
         axis = np.linspace(0.0, 10.0, divisions + 1)
         grid = np.stack(np.meshgrid(axis, axis, axis / 2, indexing="ij"), axis=-1)
         self.nodes = grid.reshape(-1, 3)
@@ -69,129 +72,113 @@ class FakeModel:
         second = np.stack([corner, corner + n + 1, corner + 1], axis=1)
         self.surface_triangles = np.concatenate([first, second]).astype(np.int32)
         top = self.nodes[self.surface_nodes]
-        self.surface = Surface(top, self.surface_triangles, np.tile([0.0, 0.0, 1.0], (len(top), 1)))
-        self.limits = np.full((len(top), 1), self.pressure_max)
+        self.surface = Surface(top, self.surface_triangles, np.tile(UP, (len(top), 1)))
+        self.limits = np.full((len(top), LIMIT_FIELDS), self.pressure_max)
+        self.limits[:, TIP_DEPTH] = DEEPEST_TRAINED
 
-    def solve(
-        self,
-        position: Any,
-        pressure: float,
-        direction: Any = None,
-        radius: float | None = None,
-        state: Any = None,
-    ) -> Solution:
-        start = time.perf_counter()
-        position = np.asarray(position, float)
+    def press(
+        self, position: Any, pressure: float, direction: Any = None, radius: float | None = None,
+        *, past: Past | None = None, dt: float = 0.0, warm: Memory | None = None,
+    ) -> Answer:  # fmt: skip
+        if position is None:
+            position, pressure = (5.0, 5.0, 5.0), 0.0
+        if pressure > ABSURD * self.pressure_max:
+            raise QueryError("pressure", f"must be at most {ABSURD * self.pressure_max} kPa")
         contact = np.clip(position, [0, 0, 5], [10, 10, 5])
         distance = float(np.linalg.norm(position - contact))
-        reach = self.scene.endoscope.reach
+        reach, usual = self.scene.endoscope.reach, self.scene.endoscope.radius
         if distance > reach:
             raise QueryError("position", f"{distance:.3g} mm from the surface; limit {reach} mm")
-        normal = np.array([0.0, 0.0, 1.0])
-        push = -normal if direction is None else np.asarray(direction, float)
+        push = -UP if direction is None else np.asarray(direction, float)
         push = push / np.linalg.norm(push)
-        if push @ normal >= 0:
+        if push @ UP >= 0:
             raise QueryError("direction", "90 degrees or more from the inward normal")
-        usual = self.scene.endoscope.radius
         radius = usual if radius is None else radius
         out_of_range = ("pressure",) * (pressure > self.pressure_max)
         out_of_range += ("radius",) * (radius != usual)
-        moved = 0.1 * pressure * push * (np.nan if self.poison else 1.0)
-        return Solution(
+        return Answer(
             contact_point=contact,
-            normal=normal,
+            normal=UP,
             distance=distance,
             direction=push,
-            tilt=float(np.degrees(np.arccos(-push @ normal))),
-            departure=0.0,
-            residual=0.0,
             pressure=pressure,
             radius=radius,
             pressure_limit=self.pressure_max,
-            force=pressure * radius**2 * push,
-            contact_displacement=moved,
+            force=-pressure * radius**2 * push,
+            contact_displacement=0.1 * pressure * push * (np.nan if self.poison else 1.0),
             converged=pressure <= self.collapse,
             iterations=1,
             in_range=not out_of_range,
             out_of_range=out_of_range,
-            error_displacement=0.001,
-            error_von_mises=0.002,
+            error_displacement=np.inf if out_of_range else 0.001,
+            error_von_mises=np.inf if out_of_range else 0.002,
             min_jacobian=1.0 - 0.01 * pressure,
-            features=np.ones(1),
-            patches=(),
-            solve_seconds=time.perf_counter() - start,
+            past=None if past is None else past._replace(time=past.time + dt),
+            time=0.0 if past is None else past.time + dt,
         )
 
-    def new_state(self) -> "Memory":
+    def new_warm(self) -> Memory:
         return Memory()
 
-    def touch(self, position: Any, state: Any = None, most: int = 40) -> Touch:
-        start = time.perf_counter()
-        if self.tips is None:
+    def touch(
+        self, position: Any, *, past: Past | None = None, dt: float = 0.0,
+        warm: Memory | None = None, most: int = 40,
+    ) -> Answer:  # fmt: skip
+        if not self.has_tip:
             raise QueryError("position", "no tip")
-        state = self.new_state() if state is None else state
+        if past is not None:
+            self.steps.append(dt)
+        state = self.new_warm() if warm is None else warm
         position = np.array(position, float)
         radius = self.scene.endoscope.radius
         depth = float(5.0 + radius - position[2])
         if depth > radius:
             raise QueryError("position", "the tip's centre lies below the surface")
-        last = state.last
-        leap = last is not None and float(np.linalg.norm(position - last)) > self.stride
+        leap = state.last is not None and np.linalg.norm(position - state.last) > self.stride
         snapped = 0 < self.snap <= state.gone_on
         converged = (depth <= self.deepest or snapped) and not leap
         if converged:
             state.last = position
         contact = depth > 0.0
-        force = np.array([0.0, 0.0, self.stiffness * max(depth, 0.0)])
-        tangent = np.diag([0.0, 0.0, -self.stiffness * contact])
-        return Touch(
+        pressed = max(depth, 0.0)
+        time = 0.0 if past is None else past.time + dt
+        after = None if past is None else past._replace(time=time, position=position)
+        return Answer(
+            tip=True,
             position=position,
             contact=contact,
-            force=force * (np.nan if self.poison else 1.0),
-            tangent=tangent,
-            contact_point=position - [0.0, 0.0, radius],
-            normal=np.array([0.0, 0.0, 1.0]),
+            force=(1.0 + time) * self.stiffness * pressed * UP * (np.nan if self.poison else 1.0),
+            tangent=np.diag(-self.stiffness * contact * UP),
+            contact_point=position - radius * UP,
+            normal=UP,
             depth=depth,
-            depth_limit=1.0,
-            penetration=0.01 * max(depth, 0.0),
-            energy=0.5 * self.stiffness * max(depth, 0.0) ** 2,
+            depth_limit=DEEPEST_TRAINED,
+            penetration=0.01 * pressed,
+            energy=0.5 * self.stiffness * pressed**2,
             converged=converged,
             iterations=1,
-            in_range=depth <= 1.0,
-            out_of_range=("depth",) * (depth > 1.0),
+            in_range=depth <= DEEPEST_TRAINED,
             error_displacement=0.001,
             error_von_mises=0.002,
             error_force=0.003,
-            min_jacobian=1.0 - 0.1 * max(depth, 0.0),
-            features=np.ones(1),
-            patches=((3, 1.0, np.array([depth, 0.5])),) * contact,
-            solve_seconds=time.perf_counter() - start,
+            min_jacobian=1.0 - 0.1 * pressed,
+            parts=((3, 1.0, np.array([depth, 0.5])),) * contact,
+            time=time,
+            past=after if converged else past,
         )
 
-    def _nodes(self, region: str) -> np.ndarray:
-        return self.nodes[self.surface_nodes] if region == "surface" else self.nodes
+    def _shape(self, answer: Answer, region: str) -> np.ndarray:
+        nodes = self.nodes[self.surface_nodes] if region == "surface" else self.nodes
+        squared = ((nodes - answer.contact_point) ** 2).sum(axis=1)
+        return nodes[:, 2] / 5 * np.exp(-squared / (2 * self.scene.endoscope.radius**2))
 
-    def _shape(self, solution: Solution | Touch, region: str) -> np.ndarray:
-        nodes = self._nodes(region)
-        squared = ((nodes - solution.contact_point) ** 2).sum(axis=1)
-        width = self.scene.endoscope.radius
-        return nodes[:, 2] / 5 * np.exp(-squared / (2 * width**2))
-
-    def displacement(self, solution: Solution | Touch, region: str = "all") -> np.ndarray:
-        if isinstance(solution, Touch):
-            moved = np.array([0.0, 0.0, -max(solution.depth, 0.0)])
-        else:
-            moved = solution.contact_displacement
-        return np.outer(self._shape(solution, region), moved).astype(np.float32)
+    def displacement(self, answer: Answer, region: str = "all") -> np.ndarray:
+        touched = answer.tip
+        moved = -max(answer.depth, 0.0) * UP if touched else answer.contact_displacement
+        return np.outer(self._shape(answer, region), moved).astype(np.float32)
 
     def von_mises(
-        self,
-        solution: Solution | Touch,
-        region: str = "all",
-        displacement: np.ndarray | None = None,
+        self, answer: Answer, region: str = "all", displacement: Any = None
     ) -> np.ndarray:
-        if isinstance(solution, Touch):
-            pressure = float(np.linalg.norm(solution.force))
-        else:
-            pressure = solution.pressure
-        return (pressure * self._shape(solution, region)).astype(np.float32)
+        pressure = np.linalg.norm(answer.force)
+        return (pressure * self._shape(answer, region)).astype(np.float32)

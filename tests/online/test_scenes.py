@@ -17,6 +17,7 @@ def test_a_scene_tells_what_may_be_asked(client):
     scene = client.get("/scenes/toy").json()
     assert scene["ranges"] == {
         "pressure": [0.0, 8.0],
+        "depth": [0.0, 1.0],
         "tilt": [0.0, 30.0],
         "radius": 2.0,
         "reach": 3.0,
@@ -31,18 +32,36 @@ def test_a_scene_gives_an_example_that_it_can_answer(client):
     assert client.post("/scenes/toy/solve", json=example).status_code == 200
 
 
+def test_the_accessible_surface_has_its_limits(serve):
+    no_tip = FakeModel("other")
+    no_tip.has_tip = False
+    with serve(toy=FakeModel(), other=no_tip) as client:
+        _, arrays = wire.decode(
+            client.get("/scenes/toy/accessible", headers={"accept": BINARY}).content
+        )
+        other = client.get("/scenes/other/accessible").json()["fields"]
+        assert client.get("/scenes/other").json()["ranges"]["depth"] is None
+    assert {name: set(arrays[name].ravel()) for name in ("pressure_limit", "depth_limit")} == {
+        "pressure_limit": {8.0},
+        "depth_limit": {1.0},
+    }
+    assert arrays["vertices"].shape == arrays["normals"].shape == (121, 3)
+    assert len(other["pressure_limit"]) == 121
+    assert "depth_limit" not in other
+
+
 @pytest.mark.parametrize("region", ["surface", "all"])
 def test_the_mesh_of_a_region(client, region):
     path = f"/scenes/toy/mesh?region={region}"
     _, arrays = wire.decode(client.get(path, headers={"accept": BINARY}).content)
-    atlas = FakeModel()
-    ids = atlas.surface_nodes if region == "surface" else np.arange(len(atlas.nodes))
-    np.testing.assert_allclose(arrays["nodes"], atlas.nodes[ids], atol=1e-6)
-    np.testing.assert_array_equal(arrays["clamped"], atlas.clamped[ids])
+    model = FakeModel()
+    ids = model.surface_nodes if region == "surface" else np.arange(len(model.nodes))
+    np.testing.assert_allclose(arrays["nodes"], model.nodes[ids], atol=1e-6)
+    np.testing.assert_array_equal(arrays["clamped"], model.clamped[ids])
     np.testing.assert_array_equal(
-        ids[arrays["triangles"]], atlas.surface_nodes[atlas.surface_triangles]
+        ids[arrays["triangles"]], model.surface_nodes[model.surface_triangles]
     )
-    np.testing.assert_array_equal(arrays["surface_nodes"], atlas.surface_nodes)
+    np.testing.assert_array_equal(arrays["surface_nodes"], model.surface_nodes)
     document = client.get(path).json()
     assert document["region"] == region
     for name, array in arrays.items():

@@ -5,7 +5,6 @@ import math
 import socket
 import struct
 import threading
-import time
 from contextlib import ExitStack, contextmanager
 from itertools import repeat
 from urllib.parse import urlsplit
@@ -13,12 +12,13 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from palpate.online.client.session import ServiceError, Session, SessionClosed
+from palpate.online.client.session import Session, SessionClosed
 from palpate.online.serve.settings import Settings
 from palpate.online.session import frames, websocket
 from palpate.online.session import session as server_session
 from palpate.online.session.frames import Flag, Output, Request
 
+from .conftest import place_comes_free
 from .fake_model import FakeModel
 
 PRESSED = (5.0, 5.0, 6.5)
@@ -60,7 +60,7 @@ def fuzzed(rng):
     if kind == 0:
         return rng.bytes(rng.integers(0, 200))
     if kind == 1:
-        return b"\x01\x00" + rng.bytes(38)
+        return b"\x02\x00" + rng.bytes(38)
     position = rng.uniform([-5, -5, -5], [15, 15, 15]) * rng.choice([1.0, 1e3, 1e300, np.nan])
     outputs = int(rng.integers(40)) if kind == 2 else 0
     frame = bytearray(frames.encode_request(Request(1, 0.0, tuple(position), outputs)))
@@ -76,8 +76,9 @@ def check(message):
         return
     reply = frames.decode_reply(message)
     numbers = np.concatenate([np.ravel(value) for value in reply if value is not None])
-    assert np.isfinite(numbers).all()
-    assert reply.flags & (Flag.CONVERGED | Flag.FALLBACK)
+    assert not np.isnan(numbers).any()
+    assert np.isinf(numbers).sum() == (0 if reply.flags & Flag.IN_RANGE else 3)
+    assert bool(reply.flags & Flag.CONVERGED) != bool(reply.flags & Flag.FALLBACK)
 
 
 def test_ten_thousand_fuzzed_frames(url, rng):
@@ -114,16 +115,12 @@ def test_fuzzed_text(url, rng):
             assert set(json.loads(message)) & {"error", "force"}
 
 
-def test_bytes_that_are_no_frames_of_a_websocket(url, rng):
-    with witness(url):
+def test_what_is_no_websocket_and_handshakes_that_never_end(url, rng):
+    parts = urlsplit(url)
+    with witness(url), ExitStack() as stack:
         for _ in range(50):
             with Session(url, "toy") as session:
                 session._socket.sendall(rng.bytes(rng.integers(1, 500)))
-
-
-def test_handshakes_that_never_end(url):
-    parts = urlsplit(url)
-    with witness(url), ExitStack() as stack:
         request = b"GET /scenes/toy/session HTTP/1.1\r\nupgrade: websocket\r\n"
         for length in range(0, len(request), 2):
             connection = socket.create_connection((parts.hostname, parts.port))
@@ -145,40 +142,28 @@ def test_clients_that_vanish(serving, tmp_path):
         with witness(url):
             silent = [Session(url, "toy") for _ in range(3)]
             for _ in range(20):
-                places_come_free(url).close()
+                place_comes_free(url).close()
             for session in silent:
                 session._socket.close()
         with witness(url):
             for _ in range(20):
-                session = places_come_free(url)
+                session = place_comes_free(url)
                 session.send(PRESSED)
                 linger = struct.pack("ii", 1, 0)
                 session._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
                 session._socket.close()
 
 
-def places_come_free(url):
-    """Open a session as soon as there is a place."""
-    for _ in range(500):
-        try:
-            with Session(url, "toy") as session:
-                assert session.step(PRESSED).good
-            return Session(url, "toy")
-        except ServiceError:
-            time.sleep(0.01)
-    raise AssertionError("no place came free")
-
-
 def test_a_client_that_does_not_read_is_cut(serving, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(server_session, "PATIENCE", 0.2)
-    atlas = FakeModel(divisions=40)  # replies of 27 KB
-    with serving(Settings(tmp_path, max_sessions=2), toy=atlas) as url, witness(url):
+    model = FakeModel(divisions=40)  # replies of 27 KB
+    with serving(Settings(tmp_path, max_sessions=2), toy=model) as url, witness(url):
         with Session(url, "toy") as slow:
             slow._socket.settimeout(10.0)
             frame = frames.encode_request(Request(1, 0.0, PRESSED, EVERYTHING))
             with pytest.raises(ConnectionError):
                 pour(slow, repeat(frame))
-        places_come_free(url).close()
+        place_comes_free(url).close()
     assert "leaves replies unread" in caplog.text
 
 
@@ -206,7 +191,7 @@ def test_floods_that_no_session_sees_are_cut(url, monkeypatch, caplog, frame, mo
                 session._socket.sendall(control(0x02))  # begins a message
             with pytest.raises(ConnectionError):
                 flood(session._socket, 1000 * frame)
-        places_come_free(url).close()
+        place_comes_free(url).close()
     assert reason in caplog.text
 
 

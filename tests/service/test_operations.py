@@ -119,7 +119,7 @@ def test_a_killed_worker_is_replaced_while_the_others_sessions_go_on(serve, arti
             time.sleep(0.05)
         client = stack.enter_context(Client(server.url))
         sessions = [stack.enter_context(session_on(w, server.url, client)) for w in (0, 1)]
-        position = sessions[0].hello["example"]["position"]
+        position = sessions[0].greeting["example"]["position"]
         replies = [session.step(position) for session in sessions]
         assert all(reply.contact for reply in replies), replies
 

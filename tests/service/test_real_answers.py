@@ -1,12 +1,13 @@
 """The service over a really trained artifact."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from palpate.online.client.http import Client, ServiceError
-from palpate.online.loadtest.latency import measure
+from palpate.online.loadtest.run import Plan, run
 from palpate.shared.model import ReducedModel
 
 pytestmark = pytest.mark.service
@@ -19,7 +20,7 @@ def client(server):
 
 
 @pytest.fixture(scope="module")
-def atlas(artifact):
+def model(artifact):
     return ReducedModel.load(artifact)
 
 
@@ -29,13 +30,13 @@ def contact(client):
 
 
 @pytest.mark.parametrize("region", ["surface", "all"])
-def test_the_wire_adds_and_takes_nothing(client, atlas, contact, region):
+def test_the_wire_adds_and_takes_nothing(client, model, contact, region):
     answer = client.solve("quick", **contact, region=region)
-    solution = atlas.solve(**contact)
+    solution = model.press(**contact)
     np.testing.assert_allclose(answer.force, solution.force, rtol=1e-12)
-    displacement = atlas.displacement(solution, region)
+    displacement = model.displacement(solution, region)
     np.testing.assert_allclose(answer.displacement, displacement, atol=1e-6)
-    np.testing.assert_allclose(answer.von_mises, atlas.von_mises(solution, region), atol=1e-5)
+    np.testing.assert_allclose(answer.von_mises, model.von_mises(solution, region), atol=1e-5)
     assert len(client.mesh("quick", region).nodes) == len(displacement)
     assert np.abs(answer.displacement).max() > 0.1
 
@@ -60,9 +61,9 @@ def test_no_pressure_moves_nothing(client, contact):
     np.testing.assert_allclose(answer.force, 0.0, atol=1e-9)
 
 
-def test_a_position_within_reach_is_projected(client, atlas, contact):
+def test_a_position_within_reach_is_projected(client, model, contact):
     x, y, z = contact["position"]
-    reach = atlas.scene.endoscope.reach
+    reach = model.scene.endoscope.reach
     answer = client.solve("quick", (x, y, z + 0.5 * reach), contact["pressure"])
     assert answer.contact["distance"] == pytest.approx(0.5 * reach, rel=1e-6)
     np.testing.assert_allclose(answer.contact["position"], contact["position"], atol=1e-6)
@@ -71,20 +72,15 @@ def test_a_position_within_reach_is_projected(client, atlas, contact):
 @pytest.mark.parametrize(
     ("changes", "field"),
     [
-        ({"position": (5.0, 5.0, 500.0)}, "position"),
         ({"position": (1e4, -1e4, 1e4)}, "position"),
         ({"pressure": 1e3}, "pressure"),
-        ({"pressure": -1e-9}, "pressure"),
-        ({"direction": (0.0, 0.0, 1.0)}, "direction"),
         ({"direction": (1.0, 0.0, 0.0)}, "direction"),
-        ({"direction": (0.0, 0.0, 0.0)}, "direction"),
     ],
 )
 def test_unanswerable_queries_are_refused(client, contact, changes, field):
     with pytest.raises(ServiceError) as refused:
         client.solve("quick", **{**contact, **changes})
-    assert refused.value.status == 422
-    assert refused.value.field == f"contacts.0.{field}"
+    assert (refused.value.status, refused.value.field) == (422, f"contacts.0.{field}")
 
 
 def solve_or_refusal(client, **contact):
@@ -108,13 +104,14 @@ def test_beyond_the_trained_range_an_answer_is_flagged_or_refused(client, contac
         assert np.isfinite(answer.von_mises).all()
 
 
-@pytest.mark.parametrize("radius", [0.01, 0.5, 10.0, 1000.0])
+@pytest.mark.parametrize("radius", [0.01, 0.5, 1.5, 1000.0])
 def test_odd_radii_are_flagged_or_refused(client, contact, radius):
     answer = solve_or_refusal(client, **contact, radius=radius)
     if isinstance(answer, ServiceError):
         assert answer.status == 422
     else:
         assert "radius" in answer.trust["out_of_range"]
+        assert answer.trust["error_estimate"] == {"displacement": None, "von_mises": None}
         assert np.isfinite(answer.displacement).all()
 
 
@@ -123,6 +120,6 @@ def test_the_summary_is_json_without_nan(client):
 
 
 def test_the_service_adds_little_to_a_solve(server):
-    report = measure(server.url, "quick", rounds=1000)
-    assert report["solve_ratio"] <= 1.4
-    assert report["fields_ratio"] <= 2.0
+    plan = Plan(server.url, "quick", sessions=0, queries=100.0, duration=5.0, echo=True)
+    for region, most in (("none", 1.4), ("all", 2.0)):
+        assert run(replace(plan, region=region)).summary["added"]["queries"]["ratio"] <= most

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.service
 
 def test_a_session_feels_the_tissue(server):
     with Session(server.url, "quick") as session:
-        start = np.array(session.hello["example"]["position"])
+        start = np.array(session.greeting["example"]["position"])
         for depth in np.linspace(0.0, 0.3, 10):
             reply = session.step(start - [0, 0, depth])
             assert reply.good
@@ -31,7 +31,7 @@ def test_a_recorded_session_is_replayed_to_the_bit(server, artifact, tmp_path, r
     """In another process; with steps small and large, out of contact and too deep."""
     path = tmp_path / "session.h5"
     with Client(server.url) as client, client.session("quick", record=path) as session:
-        position = np.array(session.hello["example"]["position"])
+        position = np.array(session.greeting["example"]["position"])
         for i in range(300):
             if i % 20 == 0:
                 at = position + rng.uniform([-3, -3, -1.5], [3, 3, 1])
@@ -47,7 +47,7 @@ def test_stopping_under_load_tells_the_sessions(serve, artifact):
 
     def step():
         with Session(server.url, "quick") as session:
-            position = session.hello["example"]["position"]
+            position = session.greeting["example"]["position"]
             session.step(position)
             started.wait()
             try:
@@ -72,7 +72,7 @@ def test_stopping_under_load_tells_the_sessions(serve, artifact):
 def test_stopping_does_not_wait_for_a_client_that_does_not_read(serve, artifact):
     with serve(artifact.parent) as server, Session(server.url, "quick") as session:
         session._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        position = session.hello["example"]["position"]
+        position = session.greeting["example"]["position"]
         for _ in range(600):  # more replies with fields than fit into the buffers on the way
             session.send(position, outputs=Output.DISPLACEMENT | Output.VON_MISES)
             time.sleep(0.001)

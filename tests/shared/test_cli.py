@@ -10,7 +10,7 @@ from click.testing import CliRunner
 from palpate.shared import cli
 from palpate.shared.errors import PalpateError, QueryError
 
-COMMANDS = ["bench", "info", "serve", "solve", "study", "train", "validate"]
+COMMANDS = ["bench", "info", "scene", "serve", "solve", "study", "train", "validate"]
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def test_help_lists_every_command_and_an_example(run):
     assert result.exit_code == 0
     for command in COMMANDS:
         assert f"\n  {command} " in result.output
-    assert "palpate solve artifacts/quick.h5 --at" in result.output
+    assert "palpate solve quick --at" in result.output
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from palpate.shared.answer import describe
 from palpate.shared.errors import QueryError
-from palpate.shared.model import ReducedModel
+from palpate.shared.model import ABSURD, ReducedModel
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -20,7 +21,7 @@ def atlas(artifact):
 def contact(atlas):
     """Return a contact point and half the pressure allowed there."""
     x = atlas.models.centres[0]
-    return x, 0.5 * atlas.solve(x, 0.0).pressure_limit
+    return x, 0.5 * atlas.press(x, 0.0).pressure_limit
 
 
 def tilted(atlas, degrees):
@@ -30,7 +31,7 @@ def tilted(atlas, degrees):
 
 
 def test_an_answer_within_the_range_says_so(atlas, contact):
-    solution = atlas.solve(*contact)
+    solution = atlas.press(*contact)
     assert solution.converged
     assert solution.in_range
     assert solution.out_of_range == ()
@@ -42,13 +43,13 @@ def test_an_answer_within_the_range_says_so(atlas, contact):
     assert solution.contact_displacement @ solution.normal < 0
 
 
-def test_force_is_pressure_times_the_projected_footprint(atlas):
+def test_force_on_the_tool_is_pressure_times_the_projected_footprint(atlas):
     middle = atlas.nodes.max(axis=0) * [0.5, 0.5, 1.0]
-    solution = atlas.solve(middle, 2.0)
+    solution = atlas.press(middle, 2.0)
     radius = atlas.scene.endoscope.radius
     # the integral of (1 - rho^4)^2 over the disc, all of which lies on the top
     area = math.pi * radius**2 * 8 / 15
-    np.testing.assert_allclose(solution.force, 2.0 * area * solution.direction, rtol=1e-2)
+    np.testing.assert_allclose(solution.force, -2.0 * area * solution.direction, rtol=1e-2)
 
 
 @pytest.mark.parametrize(
@@ -57,7 +58,7 @@ def test_force_is_pressure_times_the_projected_footprint(atlas):
 )
 def test_a_position_beside_the_surface_is_out_of_range_one_above_it_is_not(atlas, offset, flags):
     edge = atlas.nodes.max(axis=0) * [0.0, 0.5, 1.0]
-    solution = atlas.solve(edge + offset, 0.1)
+    solution = atlas.press(edge + offset, 0.1)
     np.testing.assert_allclose(solution.contact_point, edge, atol=1e-9)
     assert solution.out_of_range == flags
 
@@ -77,11 +78,22 @@ def test_what_is_outside_the_range_is_flagged(atlas, contact, changes, flags):
     endoscope = atlas.scene.endoscope
     x, _ = contact
     direction = tilted(atlas, changes.get("tilt", 0.0) * endoscope.max_tilt)
-    limit = atlas.solve(x, 0.0, direction).pressure_limit
+    limit = atlas.press(x, 0.0, direction).pressure_limit
     radius = changes.get("radius", 1.0) * endoscope.radius
-    solution = atlas.solve(x, changes.get("pressure", 0.3) * limit, direction, radius)
+    solution = atlas.press(x, changes.get("pressure", 0.3) * limit, direction, radius)
     assert solution.out_of_range == flags
     assert solution.in_range == (not flags)
+    # nothing is known of the error there
+    assert math.isinf(solution.error_displacement) == bool(flags)
+    assert math.isinf(solution.error_von_mises) == bool(flags)
+    estimate = describe(solution)["trust"]["error_estimate"]
+    assert (estimate["von_mises"] is None) == bool(flags)
+
+
+def test_pressures_are_refused_from_ten_times_the_largest_on(atlas, contact):
+    assert atlas.press(contact[0], ABSURD * atlas.pressure_max).out_of_range == ("pressure",)
+    with pytest.raises(QueryError, match="must be at most 10 times"):
+        atlas.press(contact[0], 1.001 * ABSURD * atlas.pressure_max)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +121,7 @@ def test_what_is_outside_the_range_is_flagged(atlas, contact, changes, flags):
 def test_what_makes_no_sense_is_refused_by_name(atlas, contact, field, value):
     query = {"position": contact[0], "pressure": contact[1], field: value}
     with pytest.raises(QueryError) as refused:
-        atlas.solve(**query)
+        atlas.press(**query)
     assert refused.value.field == field
     assert str(refused.value)
 
@@ -117,28 +129,28 @@ def test_what_makes_no_sense_is_refused_by_name(atlas, contact, field, value):
 def test_a_position_off_the_surface_is_moved_to_it_within_reach(atlas, contact):
     x, pressure = contact
     reach = atlas.scene.endoscope.reach
-    solution = atlas.solve(x + 0.99 * reach * UP, pressure)
+    solution = atlas.press(x + 0.99 * reach * UP, pressure)
     assert solution.distance == pytest.approx(0.99 * reach)
     np.testing.assert_allclose(solution.contact_point, x, atol=1e-9)
     with pytest.raises(QueryError, match=f"at most {reach} mm"):
-        atlas.solve(x + 1.01 * reach * UP, pressure)
+        atlas.press(x + 1.01 * reach * UP, pressure)
 
 
 def test_the_length_of_a_direction_means_nothing(atlas, contact):
-    short, long = (atlas.solve(*contact, scale * np.array([0.2, 0.1, -1.0])) for scale in (1e-3, 7))
+    short, long = (atlas.press(*contact, scale * np.array([0.2, 0.1, -1.0])) for scale in (1e-3, 7))
     assert np.linalg.norm(long.direction) == pytest.approx(1)
     np.testing.assert_allclose(short.force, long.force, rtol=1e-12)
 
 
 def test_no_pressure_moves_nothing(atlas, contact):
-    solution = atlas.solve(contact[0], 0.0)
+    solution = atlas.press(contact[0], 0.0)
     assert solution.converged
     assert np.abs(atlas.displacement(solution)).max() <= 1e-9
     assert np.abs(atlas.von_mises(solution)).max() <= 1e-6
 
 
 def test_the_surface_is_part_of_the_whole(atlas, contact):
-    solution = atlas.solve(*contact)
+    solution = atlas.press(*contact)
     whole = atlas.displacement(solution, "all")
     assert (whole[atlas.clamped] == 0).all()
     np.testing.assert_allclose(
@@ -148,12 +160,12 @@ def test_the_surface_is_part_of_the_whole(atlas, contact):
     np.testing.assert_array_equal(atlas.von_mises(solution, "surface"), stress[atlas.surface_nodes])
 
 
-def test_a_refused_query_leaves_the_state_as_it_was(atlas, contact):
+def test_a_refused_query_leaves_the_last_answers_as_they_were(atlas, contact):
     x, pressure = contact
-    touched, untouched = atlas.new_state(), atlas.new_state()
-    for state in (touched, untouched):
-        atlas.solve(x, pressure, state=state)
+    touched, untouched = atlas.new_warm(), atlas.new_warm()
+    for warm in (touched, untouched):
+        atlas.press(x, pressure, warm=warm)
     with pytest.raises(QueryError):
-        atlas.solve(x, pressure, [0.0, 0.0, 1.0], state=touched)
-    answers = [atlas.solve(x, 0.9 * pressure, state=state) for state in (touched, untouched)]
+        atlas.press(x, pressure, [0.0, 0.0, 1.0], warm=touched)
+    answers = [atlas.press(x, 0.9 * pressure, warm=warm) for warm in (touched, untouched)]
     np.testing.assert_array_equal(*[atlas.displacement(answer) for answer in answers])

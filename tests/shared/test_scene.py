@@ -112,11 +112,12 @@ def test_load_scene_knows_its_folder(tmp_path) -> None:
     ("old", "new", "message"),
     [
         ("seed = 1", "seed = = 1", r"not TOML.*line 4"),
-        ("young", "yuong", r"tissue: unknown key 'yuong'; did you mean 'young'\?"),
-        ("[budget]", "[bugdet]", r"unknown key 'bugdet'; did you mean 'budget'\?"),
-        ("radius", "xyzzy", r"endoscope: unknown key 'xyzzy'; valid are radius, max_tilt, reach"),
-        ("size", "sise", r"geometry: unknown key 'sise'; did you mean 'size'\?"),
-        ("young = 15.0\n", "", r"tissue.young: Field required"),
+        ("young", "yuong", r"tissue.yuong: unknown key; did you mean 'young'\?"),
+        ("[budget]", "[bugdet]", r"bugdet: unknown key; did you mean 'budget'\?"),
+        ("radius", "xyzzy", r"endoscope.xyzzy: unknown key$"),
+        ("size", "sise", r"geometry.sise: unknown key; did you mean 'size'\?"),
+        ("young = 15.0\n", "", r"tissue.young: missing \(Young's modulus at rest, kPa\)"),
+        ('kind = "block"\n', "", r"geometry.kind: missing \(one of extrusion, block\)"),
         ("0.45", "0.5", r"tissue.poisson = 0.5: .*less than 0.5"),
         ("0.45", "-0.1", r"tissue.poisson = -0.1: .*greater than or equal to 0"),
         ("young = 15.0", "young = nan", r"tissue.young = nan: .*finite"),
@@ -137,7 +138,7 @@ def test_load_scene_knows_its_folder(tmp_path) -> None:
         ("[4, 4, 2]", "[4, 4.5, 2]", r"geometry.divisions.1 = 4.5: .*integer"),
         ("hex8", "tet4", r"geometry.element = 'tet4': .*'hex20'"),
         ("block", "sphere", r"geometry: .*'extrusion', 'block'"),
-        ('"top"', '"lip"', r"surface.side is 'lip', but the sides .* are left, right"),
+        ('"top"', '"lip"', r"surface: side is 'lip', but the sides .* are left, right"),
         ("[1.0, 9.0]", "[9.0, 1.0]", r"surface: x must be \[from, to\]"),
         ('"slab"', '"../slab"', r"name = '../slab'"),
         ("max_tilt = 30.0", "max_tilt = 90.0", r"endoscope.max_tilt = 90.0: .*less than 90"),
@@ -152,9 +153,39 @@ def test_what_is_wrong_is_named(old: str, new: str, message: str) -> None:
 
 
 def test_every_wrong_field_is_reported_at_once() -> None:
-    text = SLAB.replace("young = 15.0", "young = -1.0").replace("seed = 1", "seed = -1")
-    with pytest.raises(SceneError, match=r"seed = -1.*tissue.young = -1.0"):
-        parse_scene(text)
+    text = SLAB
+    for old, new in (("young", "yuong"), ("seed = 1", "seed = -1"), ('"top"', '"lid"')):
+        text = text.replace(old, new)
+    with pytest.raises(SceneError) as error:
+        parse_scene(text.replace("radius = 2.0", "radius = -2.0"), source="slab.toml")
+    head, *faults = str(error.value).split("\n  ")
+    assert head == "slab.toml:"
+    starts = (
+        "seed = -1:", "tissue.young: missing", "tissue.yuong: unknown key",
+        "surface: side is 'lid'", "endoscope.radius = -2.0:",
+    )  # fmt: skip
+    assert len(faults) == len(starts)
+    for fault, start in zip(faults, starts, strict=True):
+        assert fault.startswith(start)
+
+
+def test_an_empty_scene_is_told_all_that_it_lacks() -> None:
+    with pytest.raises(SceneError) as error:
+        parse_scene("")
+    missing = [line.split(":")[0].strip() for line in str(error.value).splitlines()[1:]]
+    assert missing == [
+        "name", "geometry.kind", "tissue.law", "tissue.young", "tissue.poisson", "support.side",
+        "surface.side", "endoscope.radius", "endoscope.max_tilt", "load.max_indentation",
+    ]  # fmt: skip
+
+
+def test_lengths_that_are_absent_are_multiples_of_the_radius() -> None:
+    text = SLAB.replace("reach = 3.0", "").replace("radius = 2.0", "radius = 3.0")
+    scene = parse_scene(re.sub(r"^(limit_spacing|region_spacing).*\n", "", text, flags=re.M))
+    assert scene.endoscope.reach == 4.5
+    assert scene.training.limit_spacing == 6.0
+    assert scene.training.region_spacing == 11.25
+    assert scene.training.blend == 0.2
 
 
 def test_an_unreadable_file_is_refused(tmp_path) -> None:

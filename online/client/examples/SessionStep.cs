@@ -1,11 +1,11 @@
 // One step of a session for .NET 8 or newer (and Unity from 2021 on): where the tip is, what it
 // feels. In a console project:
 //
-//   dotnet run -- ws://127.0.0.1:8000/scenes/turbinate/session 11.9 20 11
+//   dotnet run -- ws://127.0.0.1:8000/scenes/turbinate-tip/session 11.9 20 11
 //
-// The structs are the frames of version 1, little-endian like every machine that .NET runs on.
-// Units: mm, mN, kPa, s. What the members mean is said in the README and in the hello that a
-// session starts with.
+// The structs are the frames of version 2, little-endian like every machine that .NET runs on.
+// Units: mm, mN, kPa, s. What the members mean is said in online/PROTOCOL.md and in the greeting
+// that a session starts with.
 using System;
 using System.Globalization;
 using System.IO;
@@ -40,6 +40,13 @@ namespace Palpate
         Stalled = 32,
     }
 
+    public enum Reason : uint
+    {
+        None = 0,
+        NoEquilibrium = 1,
+        BelowSurface = 2,
+    }
+
     [StructLayout(LayoutKind.Explicit, Size = 40)]
     public struct Request
     {
@@ -50,7 +57,7 @@ namespace Palpate
         [FieldOffset(16)] public Vector Position;
     }
 
-    [StructLayout(LayoutKind.Explicit, Size = 272)]
+    [StructLayout(LayoutKind.Explicit, Size = 280)]
     public struct Reply
     {
         [FieldOffset(0)] public ushort Version;
@@ -83,6 +90,8 @@ namespace Palpate
         [FieldOffset(266)] public ushort Steps;
         [FieldOffset(268)] public ushort Coordinates;
         [FieldOffset(270)] public Output Outputs;
+        [FieldOffset(272)] public float DepthLimit;
+        [FieldOffset(276)] public Reason Reason;
     }
 
     [StructLayout(LayoutKind.Sequential)]
@@ -121,19 +130,19 @@ namespace Palpate
 
     public sealed class Session : IDisposable
     {
-        private const ushort Version = 1;
+        private const ushort Version = 2;
 
         private readonly ClientWebSocket socket = new ClientWebSocket();
         private readonly byte[] request = new byte[Marshal.SizeOf<Request>()];
         private uint seq;
 
         // What the service said of the scene and of its frames, JSON.
-        public string Hello { get; private set; } = "";
+        public string Greeting { get; private set; } = "";
 
         public async Task Open(Uri address, CancellationToken cancel = default)
         {
             await socket.ConnectAsync(address, cancel);
-            Hello = Encoding.UTF8.GetString((await Receive(cancel)).Bytes);
+            Greeting = Encoding.UTF8.GetString((await Receive(cancel)).Bytes);
         }
 
         // Sends a position of the tip and waits for what it feels there.

@@ -1,8 +1,8 @@
 // A session of Palpate for C++17 on POSIX systems: one header, no dependencies.
 //
-// The structs below are the frames of version 1: little-endian, every member at a multiple of its
+// The structs below are the frames of version 2: little-endian, every member at a multiple of its
 // size, so that a little-endian machine copies them as they are. Units: mm, mN, kPa, s. What the
-// members mean is said in the README and in the hello that a session starts with.
+// members mean is said in online/PROTOCOL.md and in the greeting that a session starts with.
 #pragma once
 
 #include <netdb.h>
@@ -22,7 +22,7 @@
 
 namespace palpate {
 
-constexpr std::uint16_t version = 1;
+constexpr std::uint16_t version = 2;
 
 enum Output : std::uint16_t {
     coordinates = 1,
@@ -39,6 +39,12 @@ enum Flag : std::uint16_t {
     clamped = 8,
     fallback = 16,
     stalled = 32,
+};
+
+enum Reason : std::uint32_t {
+    none = 0,
+    no_equilibrium = 1,
+    below_surface = 2,
 };
 
 struct Request {
@@ -80,13 +86,15 @@ struct Reply {
     std::uint16_t steps;
     std::uint16_t coordinates;
     std::uint16_t outputs;
+    float depth_limit;
+    std::uint32_t reason;
 };
 
 static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "frames are little-endian");
 static_assert(sizeof(Request) == 40 && offsetof(Request, position) == 16);
-static_assert(sizeof(Reply) == 272 && offsetof(Reply, force) == 56);
+static_assert(sizeof(Reply) == 280 && offsetof(Reply, force) == 56);
 static_assert(offsetof(Reply, tangent) == 80 && offsetof(Reply, solve_time) == 160);
-static_assert(offsetof(Reply, model) == 224 && offsetof(Reply, outputs) == 270);
+static_assert(offsetof(Reply, model) == 224 && offsetof(Reply, reason) == 276);
 
 // Thrown for whatever ends a session or refuses a frame; says why.
 struct Error : std::runtime_error {
@@ -100,7 +108,7 @@ public:
         connect_to(host, port);
         try {
             shake_hands(host + ":" + port, scene);
-            hello_ = as_text(receive_message());
+            greeting_ = as_text(receive_message());
         } catch (...) {
             ::close(socket_);
             throw;
@@ -121,7 +129,7 @@ public:
     Session& operator=(const Session&) = delete;
 
     // What the service said of the scene and of its frames, JSON.
-    const std::string& hello() const { return hello_; }
+    const std::string& greeting() const { return greeting_; }
 
     // Sends a position of the tip (mm) and waits for what it feels there.
     Reply step(const std::array<double, 3>& position, double client_time) {
@@ -253,7 +261,7 @@ private:
 
     int socket_ = -1;
     std::uint32_t seq_ = 0;
-    std::string hello_;
+    std::string greeting_;
     std::mt19937 random_{std::random_device{}()};
 };
 

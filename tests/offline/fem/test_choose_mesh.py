@@ -10,11 +10,12 @@ from palpate.offline.scenes import find_scene
 from palpate.shared.scene import SceneError, parse_scene
 
 
-def unmeshed(tolerance, text=None):
-    """The quick scene without divisions."""
-    text = find_scene("quick").text if text is None else text
-    text = re.sub(r"^divisions.*\n", "", text, flags=re.M)
-    return parse_scene(text.replace("displacement = 0.01", f"displacement = {tolerance}"))
+def unmeshed(tolerance, geometry=None):
+    """The quick scene without divisions, its geometry written in another way if wanted."""
+    text = re.sub(r"^geometry.divisions.*\n", "", find_scene("quick").text, flags=re.M)
+    if geometry is not None:
+        text = re.sub(r"^geometry.*\n", "", text, flags=re.M) + geometry
+    return parse_scene(f"tolerance.displacement = {tolerance}\n{text}")
 
 
 def test_a_scene_that_fixes_its_mesh_keeps_it():
@@ -35,20 +36,14 @@ def test_a_tighter_tolerance_takes_a_finer_mesh():
     assert strained["tried"][-1]["error"] <= SHARE * 0.004 < strained["tried"][-2]["error"]
 
 
-def test_the_choice_is_in_the_scenes_text():
-    chosen, document = with_mesh(unmeshed(0.05))
+@pytest.mark.parametrize("geometry", [None, '[geometry]\nkind = "block"\nsize = [10, 10, 8]\n'])
+def test_the_choice_is_in_the_scenes_text(geometry):
+    chosen, document = with_mesh(unmeshed(0.05, geometry))
     assert parse_scene(chosen.text).geometry.divisions == document["tried"][-1]["divisions"]
     assert with_mesh(chosen)[1] is None
 
 
-def test_where_there_is_no_table_it_says_so():
-    scene = unmeshed(0.05)
-    inline = re.sub(
-        r"\[geometry\]\n(.*?)\n\n",
-        lambda m: "",
-        scene.text,
-        flags=re.S,
-    )
-    text = 'geometry = {kind = "block", size = [10.0, 10.0, 8.0], element = "hex20"}\n' + inline
-    with pytest.raises(SceneError, match=r"geometry.divisions: needed"):
-        with_mesh(parse_scene(text))
+def test_where_it_cannot_be_written_it_says_so():
+    scene = unmeshed(0.05, 'geometry = { kind = "block", size = [10, 10, 8] }\n')
+    with pytest.raises(SceneError, match=r"geometry.divisions: needed where"):
+        with_mesh(scene)

@@ -9,7 +9,7 @@ import pytest
 
 from palpate.offline.fem.mesh import Mesh, build_mesh, jacobians, local_thickness, mesh_quality
 from palpate.offline.fem.section import map_section, polygon_area, read_outline
-from palpate.offline.scenes import FOLDER, find_scene, shipped_scenes
+from palpate.offline.scenes import FOLDER, filled, find_scene, shipped_scenes
 from palpate.shared.scene import Scene, SceneError, parse_scene
 
 OUTLINE = FOLDER / "inferior_turbinate_section.csv"
@@ -26,9 +26,9 @@ def mesh(request) -> Mesh:
 
 
 def variant(name: str, *changes: tuple[str, str]) -> Scene:
-    """A shipped scene with some of its text replaced."""
+    """A shipped scene with some of its text, all defaults included, replaced."""
     scene = find_scene(name)
-    text = scene.text
+    text = filled(scene)
     for old, new in changes:
         assert old in text
         text = text.replace(old, new)

@@ -12,6 +12,7 @@ from palpate.offline.fem.model import FullModel, NoEquilibrium
 from palpate.offline.scenes import find_scene
 from palpate.shared.geometry.elements import HEX_EDGES
 from palpate.shared.geometry.quadrature import surface_quadrature
+from palpate.shared.mechanics import tissue
 from palpate.shared.mechanics.footprint import footprint
 
 YOUNG, POISSON = 15.0, 0.45
@@ -75,6 +76,13 @@ def pressed(mesh, pressure, at=None, radius=2.0):
         surface_quadrature(mesh.nodes, mesh.faces), top, np.array([0.0, 0.0, 1.0]), radius, nodal
     )
     return np.outer(pressure * nodal, [0.0, 0.0, -1.0])
+
+
+@pytest.mark.parametrize("shrunk", [1.0, 1.5, np.nan])
+def test_inverted_tissue_has_infinite_energy(element, shrunk):
+    """At det F = 0, det F < 0, and where that is not a number."""
+    mesh = block(element)
+    assert internal_force(full_model(mesh, element), -shrunk * mesh.nodes)[0] == tissue.INVERTED
 
 
 def solve_prescribed(model, dofs, values, increments=4):

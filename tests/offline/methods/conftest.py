@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from palpate.offline.methods.catalogue import Snapshots, Training
+from palpate.offline.methods.catalogue import Training
+from palpate.offline.methods.method import Snapshots
 from palpate.offline.run.workshop import Workshop
 from palpate.offline.validate.loads import random_loads, unseen_loads
 from palpate.shared.artifact import read_artifact

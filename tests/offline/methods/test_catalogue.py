@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.offline.methods.catalogue import BUILDERS, build
+from palpate.offline.methods.catalogue import BUILDERS, MESHED, build
 from palpate.offline.methods.method import Case
 from palpate.offline.run.workshop import Load
 from palpate.offline.validate.loads import relative
@@ -19,7 +19,9 @@ ERRORS = {
     "krylov": 0.5,
     "pod": 0.5,
     "pod-euclidean": 0.5,
+    "pod, no line search": 0.5,
     "pod-ecm": 0.5,
+    "pod-ecm, 1 point a mode": 0.9,
     "pod-ecsw": 0.5,
     "pod-deim": 0.5,
     "pod-gappy": 0.5,
@@ -28,33 +30,37 @@ ERRORS = {
     "linear": 0.4,
     "regression": 0.6,
     "full": 1e-6,
+    "mass-spring": 0.5,
+    "tensor-mass linear": 0.5,
+    "tensor-mass nonlinear": 0.5,
     "artifact": 0.01,
+    "artifact, warm": 0.01,
 }
 """Median error that a method of this size does not exceed."""
 
-SINGLE = {"regression", "artifact"}
+SINGLE = {"regression", "artifact", "artifact, warm"}
 """Methods that know of one contact only."""
 
-BLIND = {"linear", "regression"}
+BLIND = {"linear", "regression", *(MESHED.keys() - {"full"})}
 """Methods that answer anything."""
 
 
 @pytest.fixture(scope="module")
 def methods(training):
-    return {name: build(name, SIZE, training) for name in BUILDERS}
+    return {name: build(name, 1 if name in MESHED else SIZE, training) for name in ERRORS}
 
 
 def test_the_list_here_is_whole():
-    assert ERRORS.keys() == BUILDERS.keys()
+    # the tip needs tissue that knows time
+    assert ERRORS.keys() | {"artifact, tip"} == BUILDERS.keys() | MESHED.keys()
 
 
 @pytest.mark.parametrize("name", ERRORS)
 def test_a_method_answers_unseen_loads(methods, workshop, queries, name):
     method, errors = methods[name], []
-    assert method.family == name
     for load, exact in queries:
         answer = method.solve(Case.of(workshop, load))
-        found = method.displacement(answer)
+        found = method.displacement(answer.state)
         assert answer.converged
         assert found.shape == exact.shape
         assert found.dtype == float
@@ -62,7 +68,7 @@ def test_a_method_answers_unseen_loads(methods, workshop, queries, name):
     assert np.median(errors) <= ERRORS[name]
 
 
-@pytest.mark.parametrize("name", ERRORS.keys() - {"full", "artifact"})
+@pytest.mark.parametrize("name", ERRORS.keys() - MESHED.keys() - {"artifact", "artifact, warm"})
 def test_a_method_has_the_size_asked_for(methods, name):
     assert methods[name].unknowns == SIZE
 
@@ -73,7 +79,7 @@ def test_two_contacts_are_answered_or_refused(methods, workshop, queries, name):
     case, method = Case.of(workshop, *loads), methods[name]
     exact = workshop.model.solve(sum(workshop.load_vector(load) for load in loads)).displacement
     answer = method.solve(case)
-    found = method.displacement(answer)
+    found = method.displacement(answer.state)
     assert answer.converged == answer.trusted == (name not in SINGLE)
     if answer.converged:
         assert relative(found, exact) <= ERRORS[name]
@@ -86,13 +92,13 @@ def test_no_load_is_too_much_to_say_so(methods, workshop, queries, name):
     load = queries[0][0]
     case = Case.of(workshop, Load(load.position, load.direction, 1e6 * load.pressure))
     answer = methods[name].solve(case)
-    assert methods[name].displacement(answer).shape == (len(workshop.mesh.nodes), 3)
+    assert methods[name].displacement(answer.state).shape == (len(workshop.mesh.nodes), 3)
     assert answer.converged == (name in BLIND)
 
 
 def test_the_artifact_does_not_vouch_for_a_load_beyond_its_range(methods, workshop, atlas, queries):
     load = queries[0][0]
-    limit = atlas.solve(load.position, load.pressure, load.direction).pressure_limit
+    limit = atlas.press(load.position, load.pressure, load.direction).pressure_limit
     beyond = Load(load.position, load.direction, 1.2 * limit)
     answer = methods["artifact"].solve(Case.of(workshop, beyond))
     assert answer.converged
@@ -108,3 +114,8 @@ def test_a_method_is_the_same_whatever_was_built_before(training, methods, works
 def test_without_an_artifact_there_is_no_such_method(training):
     with pytest.raises(PalpateError, match="artifact"):
         build("artifact", SIZE, replace(training, atlas=None))
+
+
+def test_without_the_scene_s_files_there_are_no_other_meshes(training):
+    with pytest.raises(PalpateError, match="files"):
+        build("full", 2, training)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from palpate.offline.methods.galerkin import Cubature, Galerkin
+from palpate.offline.methods.galerkin import Galerkin
 from palpate.offline.methods.method import Case
 
 MODES = 12
@@ -21,9 +21,7 @@ def forces(training, basis):
 
 def worst(workshop, basis, queries, cubature):
     """Largest relative difference from the model with every point, in the energy norm."""
-    model = workshop.model
-    few = Galerkin("", "", model, basis, cubature)
-    every = Galerkin("", "", model, basis, Cubature.full(model))
+    few, every = Galerkin(workshop, basis, cubature), Galerkin(workshop, basis)
     errors = []
     for load, _ in queries:
         case = Case.of(workshop, load)

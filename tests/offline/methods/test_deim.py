@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from palpate.offline.methods.deim import Deim, Samples, force_modes, sample
-from palpate.offline.methods.galerkin import Cubature, Galerkin
+from palpate.offline.methods.galerkin import Galerkin
 from palpate.offline.methods.method import Case
 from palpate.offline.run.workshop import Load
 from palpate.offline.validate.loads import unseen_loads
@@ -25,7 +25,7 @@ def modes(training):
 
 @pytest.fixture(scope="module")
 def galerkin(training, basis):
-    return Galerkin("", "", training.model, basis, Cubature.full(training.model))
+    return Galerkin(training.workshop, basis)
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def complete(training, basis):
     """Return the method with every dof sampled: Galerkin's, with plain Newton."""
     every = np.eye(len(training.model.free))
     samples = Samples(np.arange(len(every)), every)
-    return Deim("", "", training.model, basis, every, samples)
+    return Deim(training.workshop, basis, every, samples)
 
 
 def test_with_every_dof_sampled_it_is_galerkin_s_method(training, complete, galerkin, queries):
@@ -75,12 +75,12 @@ def test_displacements_that_invert_an_element_are_left_out(training, modes):
 def test_beyond_its_range_it_fails_where_galerkin_does_not_and_fits_fail_less(
     training, basis, modes, complete, galerkin
 ):
-    model, cases = training.model, []
+    cases = []
     for load in unseen_loads(training.atlas, 40, 1):
         beyond = Load(load.position, load.direction, 4 * load.pressure)
         cases.append(Case.of(training.workshop, beyond))
     interpolated, fitted = (
-        Deim("", "", model, basis, modes, sample(modes, per_mode)) for per_mode in (1, 3)
+        Deim(training.workshop, basis, modes, sample(modes, per_mode)) for per_mode in (1, 3)
     )
     found = [
         sum(method.solve(case).converged for case in cases)

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from palpate.offline.methods.galerkin_in_time import GalerkinInTime
-from palpate.offline.methods.in_time import FullInTime
+from palpate.offline.methods.full import Full
+from palpate.offline.methods.galerkin import GalerkinInTime
 from palpate.offline.methods.method import Case
 from palpate.offline.methods.spaces import modal, pod
 from palpate.offline.run.workshop import Load, Workshop
 from palpate.offline.scenes import find_scene
 
-COURSE = ((0.5, 0.02), (1.0, 0.05), (1.0, 0.3), (1.0, 2.0), (0.2, 0.01), (0.0, 0.0), (0.0, 0.5))
+STEPS = ((0.5, 0.02), (1.0, 0.05), (1.0, 0.3), (1.0, 2.0), (0.2, 0.01), (0.0, 0.0), (0.0, 0.5))
 """Shares of a pressure at the ends of time steps (s)."""
 
 
@@ -25,32 +25,33 @@ def workshop():
 def cases(workshop):
     down = np.array([0.3, 0.0, -1.0]) / np.hypot(0.3, 1.0)
     at = np.array([4.0, 5.5, 8.0])
-    return [Case.of(workshop, Load(at, down, 1.5 * share)) for share, _ in COURSE]
+    return [Case.of(workshop, Load(at, down, 1.5 * share)) for share, _ in STEPS]
 
 
-def pasts(method, cases):
-    found, past = [], method.at_rest()
-    for case, (_, dt) in zip(cases, COURSE, strict=True):
-        converged, past = method.step(past, case, dt)
-        assert converged
-        found.append(past)
+def states(method, cases):
+    found, state = [], method.at_rest()
+    for case, (_, dt) in zip(cases, STEPS, strict=True):
+        answer = method.step(state, case, dt)
+        assert answer.converged
+        state = answer.state
+        found.append(state)
     return found
 
 
 @pytest.fixture(scope="module")
 def exact(workshop, cases):
-    return pasts(FullInTime(workshop), cases)
+    return states(Full(workshop), cases)
 
 
 @pytest.fixture(scope="module")
 def in_its_own_modes(workshop, exact):
-    known = np.array([past.displacement.ravel() for past in exact])
-    return GalerkinInTime("pod", "", workshop, pod(workshop.model, known, 8), accurate=1e-6)
+    known = np.array([state.displacement.ravel() for state in exact])
+    return GalerkinInTime(workshop, pod(workshop.model, known, 8), accurate=1e-6)
 
 
 def test_a_basis_that_holds_the_history_finds_it(workshop, cases, exact, in_its_own_modes):
-    full = FullInTime(workshop)
-    for found, true in zip(pasts(in_its_own_modes, cases), exact, strict=True):
+    full = Full(workshop)
+    for found, true in zip(states(in_its_own_modes, cases), exact, strict=True):
         largest = np.abs(exact[3].displacement).max()
         u = in_its_own_modes.displacement(found)
         np.testing.assert_allclose(u, true.displacement, atol=1e-4 * largest)
@@ -60,24 +61,24 @@ def test_a_basis_that_holds_the_history_finds_it(workshop, cases, exact, in_its_
 
 
 def test_it_remembers_at_the_points_what_the_full_model_does(cases, exact, in_its_own_modes):
-    found = in_its_own_modes.history(pasts(in_its_own_modes, cases)[4]).points[..., :6]
+    found = in_its_own_modes.history(states(in_its_own_modes, cases)[4]).points[..., :6]
     true = exact[4].points[..., :6]
     np.testing.assert_allclose(found, true, atol=1e-3 * np.abs(true).max())
 
 
-def test_few_modes_are_stiffer_and_a_step_changes_no_past(workshop, cases, exact):
-    method = GalerkinInTime("modal", "", workshop, modal(workshop.model, 6))
+def test_few_modes_are_stiffer_and_a_step_changes_no_state(workshop, cases, exact):
+    method = GalerkinInTime(workshop, modal(workshop.model, 6))
     first = method.at_rest()
-    _, second = method.step(first, cases[0], 0.02)
-    assert not method.opened(first).wide.any()
-    assert method.opened(second).wide.any()
-    held, true = pasts(method, cases)[3], exact[3]
+    second = method.step(first, cases[0], 0.02).state
+    assert not method.opened(first).q.any()
+    assert method.opened(second).q.any()
+    held, true = states(method, cases)[3], exact[3]
     work = [np.vdot(u[cases[3].nodes], cases[3].forces) for u in
             (method.displacement(held), true.displacement)]  # fmt: skip
     assert 0.0 < work[0] < work[1]
 
 
 def test_time_does_not_go_back(workshop, cases, in_its_own_modes):
-    for method in (FullInTime(workshop), in_its_own_modes):
+    for method in (Full(workshop), in_its_own_modes):
         with pytest.raises(ValueError, match="dt"):
             method.step(method.at_rest(), cases[0], -0.1)

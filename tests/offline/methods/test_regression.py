@@ -6,9 +6,8 @@ from scipy.interpolate import RBFInterpolator
 
 from palpate.offline.methods.catalogue import build
 from palpate.offline.methods.method import Case
-from palpate.offline.methods.regression import Interpolant
+from palpate.offline.methods.regression import KERNELS, Interpolant
 from palpate.offline.run.workshop import Load
-from palpate.offline.studies.baselines import KERNELS
 from palpate.offline.validate.loads import relative
 
 ALL = 10_000
@@ -27,7 +26,7 @@ def test_the_linear_answer_is_exact_in_the_limit_of_small_loads(workshop, linear
     load, errors = queries[0][0], []
     for fraction in (0.02, 0.01):
         small = scaled(load, fraction)
-        found = linear.displacement(linear.solve(Case.of(workshop, small)))
+        found = linear.displacement(linear.solve(Case.of(workshop, small)).state)
         errors.append(relative(found, workshop.solve(small).displacement))
     assert errors[0] < 0.02
     assert errors[0] / errors[1] == pytest.approx(2, rel=0.1)
@@ -35,11 +34,11 @@ def test_the_linear_answer_is_exact_in_the_limit_of_small_loads(workshop, linear
 
 def test_more_modes_lose_less_of_it(workshop, training, linear, queries):
     case, lost = Case.of(workshop, queries[0][0]), []
-    every = linear.displacement(linear.solve(case))
+    every = linear.displacement(linear.solve(case).state)
     for size in (40, 80, 160):
         few = build("linear", size, training)
         assert few.unknowns == size < linear.unknowns
-        lost.append(relative(few.displacement(few.solve(case)), every))
+        lost.append(relative(few.displacement(few.solve(case).state), every))
     assert lost == sorted(lost, reverse=True)
 
 
@@ -67,4 +66,4 @@ def test_regression_repeats_what_it_has_learned(workshop, training):
         training.snapshots.loads[:5], training.snapshots.displacements, strict=False
     ):
         answer = method.solve(Case.of(workshop, load))
-        assert relative(method.displacement(answer).ravel(), u) <= 1e-4
+        assert relative(method.displacement(answer.state).ravel(), u) <= 1e-4

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from palpate.offline.fem.mesh import jacobians
+from palpate.offline.methods.lattice import lattice, scaled
 from palpate.offline.methods.method import Case
-from palpate.offline.methods.tetrahedra import Tetrahedra, gradients, lattice, scaled, volumes
+from palpate.offline.methods.tetrahedra import Tetrahedra, gradients, volumes
 from palpate.offline.run.workshop import Load, Workshop
 from palpate.offline.scenes import find_scene
 from palpate.shared.errors import PalpateError

@@ -14,7 +14,7 @@ from palpate.offline.reduce.cubature import (
     point_forces,
 )
 from palpate.offline.scenes import find_scene
-from palpate.shared.reduced.press import LANES
+from palpate.shared.reduced.points import LANES
 
 POINTS, EQUATIONS = 300, 20
 

@@ -47,17 +47,34 @@ class Plate:
         self.scene = SimpleNamespace(endoscope=SimpleNamespace(max_tilt=30.0))
         self.snap = snap
 
-    def solve(self, position, pressure, direction):
+    def press(self, position, pressure, direction):
         moved = pressure**1.8
         if pressure > self.snap and np.hypot(*position[:2]) < 2.0:
             moved *= 1.2
-        return SimpleNamespace(converged=True, patches=((0, 1.0, np.array([moved])),))
+        return SimpleNamespace(converged=True, parts=((0, 1.0, np.array([moved])),))
+
+
+def limits_of(atlas, rng):
+    """Limits of a plate or an atlas lowered where it gives way."""
+    return lowered_limits(
+        atlas.surface, atlas.limits, atlas.scene, len(atlas.models.centres), asking(atlas), rng
+    )
+
+
+def depths_of(atlas, rng):
+    """The same of depths."""
+    count = len(atlas.models.centres)
+    return lowered_depths(atlas.surface, atlas.limits, count, asking(atlas), rng)
+
+
+def asking(atlas):
+    return lambda _, function, rows: [function(atlas, *row) for row in rows]
 
 
 @pytest.mark.parametrize("snap", [0.78, 0.98, 1.03])
 def test_the_range_ends_before_the_tissue_gives_way_and_only_there(snap, rng):
     plate = Plate(snap * LIMIT)
-    limits = lowered_limits(plate, rng)
+    limits = limits_of(plate, rng)
     lowered = limits[:, 0] < LIMIT
     away = np.linalg.norm(plate.surface.vertices, axis=1)
     assert lowered[away < 2.0].all()
@@ -69,26 +86,26 @@ def test_the_range_ends_before_the_tissue_gives_way_and_only_there(snap, rng):
 
 def test_softening_tissue_keeps_its_range(rng):
     plate = Plate(np.inf)
-    np.testing.assert_array_equal(lowered_limits(plate, rng), plate.limits)
+    np.testing.assert_array_equal(limits_of(plate, rng), plate.limits)
 
 
 def test_an_unconverged_answer_is_no_jump():
     plate = Plate(np.inf)
-    sound = plate.solve
+    sound = plate.press
 
-    def solve(position, pressure, direction):
+    def press(position, pressure, direction):
         answer = sound(position, pressure, direction)
         if 0.9 * LIMIT < pressure < 0.97 * LIMIT:
-            answer = SimpleNamespace(converged=False, patches=((0, 1.0, np.full(1, np.inf)),))
+            answer = SimpleNamespace(converged=False, parts=((0, 1.0, np.full(1, np.inf)),))
         return answer
 
-    plate.solve = solve
+    plate.press = press
     assert limit_load_share(plate, np.zeros(3), np.array([0.0, 0.0, -1.0]), LIMIT) == 1.0
 
 
 def test_a_trained_scene_does_not_give_way_in_its_range(artifact, rng):
     atlas = ReducedModel.load(artifact)
-    assert (lowered_limits(atlas, rng)[:, 0] >= 0.7 * atlas.limits[:, 0]).all()
+    assert (limits_of(atlas, rng)[:, 0] >= 0.7 * atlas.limits[:, 0]).all()
 
 
 class Side:
@@ -110,21 +127,21 @@ class Edge(Plate):
         self.scene = SimpleNamespace(endoscope=SimpleNamespace(radius=RADIUS))
         self.slip = slip
 
-    def new_state(self):
+    def new_warm(self):
         return Side()
 
-    def touch(self, position, state=None):
+    def touch(self, position, warm=None):
         depth, beyond = RADIUS - position[2], position[0] - EDGE
         side = np.sign(beyond) or 1.0
-        if state is not None:
-            carried = state.side is not None and depth > self.slip and abs(beyond) < 1.0
-            side = state.side = state.side if carried else side
-        return SimpleNamespace(converged=True, patches=((3, 1.0, np.array([depth, side])),))
+        if warm is not None:
+            carried = warm.side is not None and depth > self.slip and abs(beyond) < 1.0
+            side = warm.side = warm.side if carried else side
+        return SimpleNamespace(converged=True, parts=((3, 1.0, np.array([depth, side])),))
 
 
 def test_the_depth_ends_where_the_way_to_a_contact_matters_and_only_there(rng):
     plate = Edge(slip=0.5)
-    limits = lowered_depths(plate, rng)
+    limits = depths_of(plate, rng)
     lowered = limits[:, TIP_DEPTH] < 1.0
     away = np.abs(plate.surface.vertices[:, 0] - EDGE)
     assert lowered[away < 0.5].mean() > 0.9
@@ -137,17 +154,17 @@ def test_the_depth_ends_where_the_way_to_a_contact_matters_and_only_there(rng):
 
 def test_tissue_that_slips_off_nowhere_keeps_its_depth(rng):
     plate = Edge(slip=np.inf)
-    np.testing.assert_array_equal(lowered_depths(plate, rng), plate.limits)
+    np.testing.assert_array_equal(depths_of(plate, rng), plate.limits)
 
 
 def test_a_way_with_no_answer_tells_nothing():
     plate = Edge(slip=0.5)
     sound = plate.touch
 
-    def touch(position, state=None):
-        if state is not None and position[0] < EDGE:
+    def touch(position, warm=None):
+        if warm is not None and position[0] < EDGE:
             raise QueryError("position", "below the surface")
-        return sound(position, state)
+        return sound(position, warm)
 
     plate.touch = touch
     assert path_independent_share(plate, np.array([EDGE + 0.1, 5.0, 0.0])) == 1.0
@@ -155,4 +172,4 @@ def test_a_way_with_no_answer_tells_nothing():
 
 def test_nothing_slips_off_a_trained_slab(artifact, rng):
     atlas = ReducedModel.load(artifact)
-    np.testing.assert_array_equal(lowered_depths(atlas, rng), atlas.limits)
+    np.testing.assert_array_equal(depths_of(atlas, rng), atlas.limits)

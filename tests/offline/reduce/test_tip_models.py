@@ -4,14 +4,14 @@ import numpy as np
 
 from palpate.offline.reduce.cubature import linear_forces
 from palpate.shared.model import ReducedModel
-from palpate.shared.reduced.press import LANES
+from palpate.shared.reduced.points import LANES
 
 STIFFEST = 5.0
 """Largest stiffness of the points over that of the tissue."""
 
 
 def test_points_are_not_much_stiffer_than_the_tissue_in_any_direction(artifact):
-    points = ReducedModel.load(artifact).tips.points
+    points = ReducedModel.load(artifact).touch_models.points
     for rows, *law in zip(points.gradients, points.weights, points.mu, points.lam, strict=True):
         modes = len(rows)
         tiles = rows.reshape(modes, -1, 9, LANES)

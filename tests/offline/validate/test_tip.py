@@ -3,13 +3,13 @@ import json
 import numpy as np
 import pytest
 
+from palpate.offline.reduce.tip_models import residuals_left
 from palpate.offline.run.workshop import Workshop
 from palpate.offline.validate.tip import (
     QUANTITIES,
     TouchComparison,
     calibrate_touches,
     random_positions,
-    residual_left,
     validate_touches,
 )
 from palpate.shared.artifact import read_artifact
@@ -41,7 +41,8 @@ def test_patches_know_what_their_answers_leave_in_the_full_model(artifact):
     rng = np.random.default_rng(5)
     positions = random_positions(atlas.surface, atlas.limits, atlas.scene, 40, rng)
     answers = [atlas.touch(position) for position in positions]
-    left = np.log([residual_left(workshop, atlas, answer) for answer in answers])
+    moved = np.array([atlas.displacement(answer).ravel() for answer in answers], float)
+    left = np.log(residuals_left(workshop.model, workshop.body, moved, positions))
     foretold = np.array([answer.features[-1] for answer in answers])
     assert np.median(np.abs(left - foretold)) < 0.4
     assert np.corrcoef(left, foretold)[0, 1] > 0.5

@@ -8,7 +8,6 @@ import pytest
 from click.testing import CliRunner
 
 from palpate.offline.run.workshop import Workshop
-from palpate.offline.studies import steps
 from palpate.offline.validate.moments import errors_so_far
 from palpate.offline.validate.tip_histories import (
     compare_course,
@@ -80,26 +79,3 @@ def test_histories_of_the_tip_want_time(artifact):
     result = CliRunner().invoke(main, ["validate", str(artifact), "--tip", "--histories", "2"])
     assert result.exit_code != 0
     assert "no tip that knows of time" in result.stderr
-
-
-def test_study_of_time_steps(visco_artifact, monkeypatch):
-    cases = [case for case in steps._cases() if case.name in ("steps of a day", "taps at 20 Hz")]
-    short = [case._replace(**{k: getattr(case, k)[:6] for k in case._fields[1:]}) for case in cases]
-    monkeypatch.setattr(steps, "_cases", lambda: iter(short))
-    monkeypatch.setattr(steps, "PERIOD", 5)
-    monkeypatch.setattr(steps, "PERIODS", 4)
-    found = steps.steps(visco_artifact, many=20)
-    for case in short:
-        row = found[case.name]
-        assert (row["steps"], row["unconverged"], row["flagged"], row["finite"]) == (
-            6,
-            0,
-            0.0,
-            True,
-        )
-        assert row["displacement"] <= 0.03
-        assert row["force"] <= 0.01
-    assert found["drift"] <= 0.01
-    report = visco_artifact.parent / visco_artifact.stem / "report"
-    assert len((report / "steps.csv").read_text().splitlines()) == 3
-    assert (report / "steps.png").stat().st_size > 5000

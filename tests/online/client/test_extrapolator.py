@@ -12,8 +12,8 @@ from palpate.online.client.extrapolator import (
     fade,
     linear_force,
 )
-from palpate.online.session.follower import Follower
 from palpate.online.session.frames import Flag, Request, decode_reply, encode_reply
+from palpate.online.session.tracker import ToolTracker
 
 from ..fake_model import FakeModel
 
@@ -25,7 +25,7 @@ SURFACE = 5.0 + RADIUS
 
 def reply_at(*position):
     """Return what a service of the toy replies to a position."""
-    step = Follower(TOY).follow(position, budget=0.0)
+    step = ToolTracker(TOY).follow(position, budget=0.0)
     return decode_reply(encode_reply(Request(0, 0.0, position), step))
 
 
@@ -111,11 +111,11 @@ def test_when_replies_stop_the_force_fades():
 
 def test_answers_that_are_only_repeated_fade_too():
     """The tip is where there is no equilibrium: replies go on, but none is of where it is."""
-    device, follower = Extrapolator(MOST), Follower(TOY)
+    device, tracker = Extrapolator(MOST), ToolTracker(TOY)
     at, too_deep = (5.0, 5.0, SURFACE - 0.5), (5.0, 5.0, SURFACE - 1.8)
 
     def tick(position, now):
-        step = follower.follow(position, budget=0.0)
+        step = tracker.follow(position, budget=0.0)
         reply = decode_reply(encode_reply(Request(0, 0.0, position), step))
         device.update(reply, now)
         return reply, device.force(at, now)

@@ -12,9 +12,7 @@ TIP = Tip(radius=2.0, depth=0.8)
 @pytest.fixture(scope="module")
 def surface():
     surface = FakeModel().surface
-    return Accessible(
-        surface.vertices.astype(np.float32), surface.normals.astype(np.float32), surface.triangles
-    )
+    return Accessible(surface.vertices, surface.normals, None, surface.triangles)
 
 
 @pytest.fixture

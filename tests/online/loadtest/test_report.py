@@ -6,9 +6,9 @@ from palpate.online.loadtest.report import (
     clean_windows,
     gather,
     quantiles,
+    summarize,
+    summarize_added,
     summarize_overload,
-    summarize_queries,
-    summarize_sessions,
 )
 from palpate.online.session.frames import Flag
 
@@ -68,26 +68,27 @@ def test_a_window_is_clean_if_host_and_generator_were_on_time():
     assert clean_windows(machine(5), messages).tolist() == [True, True, False, False, True]
 
 
-class Quiet:
-    complaint = ""
-
-
-def test_superseded_frames_are_not_lost_ones():
-    outcome = [ANSWERED, LOST, SUPERSEDED, SUPERSEDED, ANSWERED]
-    messages = gather([log(np.arange(5.0), outcome=outcome)])
-    clean = np.array([True, True, True, True, False])
-    found = summarize_sessions([Quiet()], messages, clean)
-    assert (found["lost"], found["superseded"], found["answered"]) == (1, 2, 2)
+def test_what_became_of_messages_is_told_apart():
+    outcome = [ANSWERED, LOST, SUPERSEDED, SUPERSEDED, ANSWERED, 429, 503, DROPPED]
+    messages = gather([log(np.arange(8.0), outcome=outcome)])
+    found = summarize(messages, np.arange(8) < 4, ["", "stop", "stop"])
+    counts = [found[name] for name in ("due", "answered", "lost", "superseded", "dropped")]
+    assert counts == [8, 2, 1, 2, 1]
+    assert found["refused"] == {"429": 1, "503": 1}
     assert found["flags"]["CONTACT"] == 2
     assert found["flags"]["FALLBACK"] == 0
     assert found["clean"]["p50_us"] == pytest.approx(200.0, rel=1e-3)
+    assert found["complaints"] == ["stop"]
 
 
-def test_what_became_of_queries_is_told_apart():
-    messages = gather([log(np.arange(5.0), outcome=[ANSWERED, 429, 503, DROPPED, LOST])])
-    found = summarize_queries(Quiet(), messages, np.ones(5, bool))
-    assert (found["answered"], found["dropped"], found["lost"]) == (1, 1, 1)
-    assert found["refused"] == {"429": 1, "503": 1}
+def test_what_the_service_adds_is_the_round_trip_less_its_work():
+    """Both counted from when the message was sent."""
+    due = np.arange(5.0)
+    messages, empty = gather([log(due, 0.5, late_ms=0.1)]), gather([log(due, 0.3, late_ms=0.1)])
+    messages.recover[:] = 70.0
+    messages.latency[0] = np.nan
+    found = summarize_added(messages, empty)
+    assert found == pytest.approx({"added_us": 280.0, "empty_us": 200.0, "ratio": 1.4})
 
 
 @pytest.mark.parametrize(("slow_until", "recovered"), [(4.0, 0.0), (5.5, 2.0), (9.0, None)])

@@ -7,9 +7,12 @@ import pytest
 from click.testing import CliRunner
 
 from palpate.online.commands import loadtest
+from palpate.online.loadtest.report import table
 from palpate.online.loadtest.run import Plan, run
 from palpate.online.serve.settings import Settings
 from palpate.shared.errors import PalpateError
+
+from ..fake_model import FakeModel
 
 
 @pytest.mark.parametrize("region", ["none", "all"])
@@ -30,8 +33,8 @@ def test_no_frame_of_a_session_is_lost(url):
     assert 0 < summary["flags"]["CONTACT"] < summary["answered"]
     assert summary["solve_us"]["p50_us"] < summary["all"]["p50_us"]
     assert summary["queries"]["answered"] == 10
-    assert len(outcome.sessions.due) == 200
-    assert len(outcome.queries.due) == 10
+    assert len(outcome.messages["frames"].due) == 200
+    assert len(outcome.messages["queries"].due) == 10
 
 
 def test_superseded_frames_are_told_from_lost_ones(url):
@@ -59,6 +62,24 @@ def test_too_much_is_refused_and_told_apart(url):
     assert set(summary["overload"]) == {"before", "during", "after", "recovered_s"}
 
 
+def test_what_the_service_adds_is_measured(serving, tmp_path):
+    with serving(Settings(tmp_path, echo=True, token="secret"), toy=FakeModel()) as url:
+        plan = Plan(url, "toy", rate=100.0, queries=50.0, duration=0.5, echo=True, token="secret")
+        outcome = run(plan)
+    assert {name: len(m.due) for name, m in outcome.messages.items()} == {
+        "frames": 50, "echoes": 50, "queries": 25, "checks": 25
+    }  # fmt: skip
+    assert set(outcome.summary["added"]) == {"frames", "queries"}
+    for added in outcome.summary["added"].values():
+        assert 0 < added["added_us"] < 10 * added["empty_us"]
+    assert "times an empty round trip" in table(outcome.summary)
+
+
+def test_without_an_echo_it_cannot_be_measured(url):
+    with pytest.raises(PalpateError, match="palpate serve --echo"):
+        run(Plan(url, "toy", duration=0.5, echo=True))
+
+
 def test_the_command_prints_json_and_draws(url, tmp_path):
     picture = tmp_path / "load.png"
     arguments = [url, "toy", "--sessions", "0", "--queries-per-second", "50", "--duration", "0.5"]
@@ -75,8 +96,8 @@ def test_the_command_prints_a_table(url):
     outputs = ["--output", "displacement", "--output", "half"]
     result = CliRunner().invoke(loadtest, [*arguments, *outputs])
     for kind in ("frames", "queries"):
-        row = re.search(rf"\| {kind}, all windows \| (\d+) \| (\d+) \| (\d+) \|", result.output)
+        row = re.search(rf"\| {kind}, all windows" + 4 * r" \| (\d+)", result.output)
         assert row, result.output
-        answered, lost, superseded = map(int, row.groups())
-        assert lost == 0
+        answered, lost, superseded, refused = map(int, row.groups())
+        assert (lost, refused) == (0, 0)
         assert answered + superseded == 25  # a busy machine may send some late, in a bunch

@@ -7,7 +7,8 @@ import pytest
 
 from palpate.online.loadtest import sessions
 from palpate.online.loadtest.generator import ANSWERED, LOST, SUPERSEDED
-from palpate.online.loadtest.sessions import Session, _frame
+from palpate.online.loadtest.sessions import FrameStream, _frame
+from palpate.online.loadtest.target import Target
 from palpate.online.session.frames import REPLY, REQUEST, Flag, decode_request
 
 POSITIONS = np.arange(15.0).reshape(5, 3)
@@ -17,8 +18,8 @@ POSITIONS = np.arange(15.0).reshape(5, 3)
 def session(monkeypatch):
     """Return a session whose service is the socket `far`."""
     near, far = socket.socketpair()
-    monkeypatch.setattr(sessions, "_open", lambda target: (near, b""))
-    session = Session(None, np.arange(5) / 10, POSITIONS, outputs=2)
+    monkeypatch.setattr(sessions, "_open", lambda target, path: (near, b""))
+    session = FrameStream(Target("http://x", "toy"), np.arange(5) / 10, POSITIONS, outputs=2)
     session.far = far
     yield session
     session.close()
@@ -27,7 +28,7 @@ def session(monkeypatch):
 
 def reply(number, superseded=0, payload=b""):
     record = np.zeros(1, REPLY)
-    record["version"], record["seq"], record["superseded"] = 1, number, superseded
+    record["version"], record["seq"], record["superseded"] = 2, number, superseded
     record["flags"], record["solve_time"] = Flag.CONTACT | Flag.CONVERGED, 5e-5
     body = record.tobytes() + payload
     if len(body) < 2**16:
@@ -81,7 +82,7 @@ def test_pings_are_answered(session):
     assert session.far.recv(100) == b"\x8a\x82\0\0\0\0hi"
 
 
-def test_a_farewell_ends_it_with_its_reason(session):
+def test_a_close_message_ends_it_with_its_reason(session):
     session.far.sendall(b"\x88\x06\x03\xe9stop")
     assert not session.receive(session.sockets[0], now=0)
     assert session.complaint == "stop"

@@ -1,4 +1,4 @@
-"""Histories over HTTP: the atlas's own answers, step by step, or refusals that name the field."""
+"""Histories over HTTP: the model's own answers, step by step, or refusals that name the field."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from palpate.online.serve import wire
 from palpate.online.serve.negotiation import BINARY
 from palpate.online.serve.schemas import MOST_STEPS
 from palpate.shared.model import ReducedModel
-from palpate.shared.reduced.history import History
+from palpate.shared.reduced.transfer import REST
 
 CONTACT = {"position": [5.0, 5.0, 8.0], "pressure": 2.0}
 STEPS = [
@@ -19,18 +19,18 @@ STEPS = [
 
 
 @pytest.fixture(scope="module")
-def atlas(visco_artifact):
+def model(visco_artifact):
     return ReducedModel.load(visco_artifact)
 
 
 @pytest.fixture
-def ask(serve, atlas):
+def ask(serve, model):
     """Return a function that posts a history to the visco-elastic scene."""
-    with serve(visco=atlas) as client:
+    with serve(visco=model) as client:
 
         def ask(steps=STEPS, accept="application/json", **options):
             return client.post(
-                f"/scenes/{atlas.name}/history",
+                f"/scenes/{model.name}/history",
                 json={"steps": steps, **options},
                 headers={"accept": accept},
             )
@@ -38,14 +38,15 @@ def ask(serve, atlas):
         yield ask
 
 
-def test_steps_are_those_of_the_atlas(ask, atlas):
+def test_steps_are_those_of_the_atlas(ask, model):
     answered = ask().json()
-    history = History()
-    assert answered["scene"] == atlas.name
+    past, warm = REST, model.new_warm()
+    assert answered["scene"] == model.name
     for step, pressure, dt in zip(
         answered["steps"], (2.0, 2.0, 0.0, 0.0), (0.05, 0.45, 0.0, 0.3), strict=True
     ):
-        moment, history = atlas.step(history, dt, CONTACT["position"], pressure)
+        moment = model.press(CONTACT["position"], pressure, past=past, dt=dt, warm=warm)
+        past = moment.past
         np.testing.assert_allclose(
             step["contact_displacement"], moment.contact_displacement, rtol=1e-6, atol=1e-9
         )
@@ -58,12 +59,12 @@ def test_steps_are_those_of_the_atlas(ask, atlas):
     assert held < pressed < released < rested < 0.0
 
 
-def test_fields_are_those_of_the_end(ask, atlas):
+def test_fields_are_those_of_the_end(ask, model):
     response = ask(accept=BINARY, region="all")
     head, fields = wire.decode(response.content)
     assert len(head["steps"]) == len(STEPS)
-    assert fields["displacement"].shape == atlas.nodes.shape
-    assert fields["von_mises"].shape == (len(atlas.nodes),)
+    assert fields["displacement"].shape == model.nodes.shape
+    assert fields["von_mises"].shape == (len(model.nodes),)
     assert 0 < np.abs(fields["displacement"]).max() < 0.5
 
 

@@ -70,21 +70,14 @@ def test_a_duration_is_counted_where_prometheus_expects_it():
     assert found[f"{name}_sum", kind] == pytest.approx(sum(durations))
 
 
-def test_sessions_come_and_go():
-    metrics = Metrics()
-    for opened in (True, True, False):
-        metrics.count_session(opened)
-    found = samples(metrics.text())
-    assert found[("palpate_sessions",)] == 1
-    assert found[("palpate_sessions_opened_total",)] == 2
-
-
-def test_a_frame_is_counted_by_phase_flag_and_wait():
+def test_frames_are_counted_by_phase_flag_and_wait_and_sessions_as_they_come_and_go():
     metrics = Metrics()
     good = Flag.CONTACT | Flag.CONVERGED | Flag.IN_RANGE
     for flags in (good, Flag.CONVERGED | Flag.CLAMPED, Flag.FALLBACK):
         metrics.count_frame(0.5e-3, (0.0, 1e-6, 4e-6, 4e-6, 9e-6), int(flags), 2)
     metrics.count_refused_frame()
+    for opened in (True, True, False):
+        metrics.count_session(opened)
     found = samples(metrics.text())
     session = ("kind", "session")
     for phase, took in (("decode", 1e-6), ("solve", 3e-6), ("recover", 0.0), ("encode", 5e-6)):
@@ -97,6 +90,8 @@ def test_a_frame_is_counted_by_phase_flag_and_wait():
         assert found["palpate_flags_total", ("flag", flag), session] == number
     for outcome, number in (("answered", 3), ("superseded", 6), ("refused", 1)):
         assert found["palpate_frames_total", ("outcome", outcome)] == number
+    assert found[("palpate_sessions",)] == 1
+    assert found[("palpate_sessions_opened_total",)] == 2
 
 
 HOLD = """
@@ -122,6 +117,7 @@ def worker(table):
 def test_a_new_worker_counts_on_where_a_killed_one_was(tmp_path):
     table = tmp_path / "metrics"
     make_table(table, 2)
+    assert table.stat().st_size == 2 * 8 * WIDTH
     (first, a), (second, b) = worker(table), worker(table)
     assert {a, b} == {0, 1}
     descriptors = len(os.listdir("/dev/fd"))
@@ -141,8 +137,3 @@ def test_a_new_worker_counts_on_where_a_killed_one_was(tmp_path):
     assert f'palpate_worker_pid{{worker="{b}"}} {float(second.pid)}' in text
     second.communicate(timeout=10)
     first.communicate(timeout=10)
-
-
-def test_a_table_has_a_row_per_worker(tmp_path):
-    make_table(tmp_path / "metrics", 3)
-    assert (tmp_path / "metrics").stat().st_size == 3 * 8 * WIDTH

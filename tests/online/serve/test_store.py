@@ -14,12 +14,12 @@ def ignore(model):
 
 def test_what_fails_is_named_and_the_others_are_served(fake_store, caplog):
     caplog.set_level(logging.INFO)
-    atlases = {
+    models = {
         "bug": KeyError("basis"),
         "foreign": PalpateError("foreign.h5: not an artifact"),
         "toy": FakeModel(),
     }
-    store = fake_store(**atlases)
+    store = fake_store(**models)
     store.open(ignore)
     assert list(store.models) == ["toy"]
     reasons = {refused.file: refused.reason for refused in store.refused}
@@ -51,4 +51,4 @@ def test_nothing_is_given_out_before_all_are_ready(fake_store):
     with pytest.raises(Refusal, match="being loaded"):
         store.model("toy")
     store.ready = True
-    assert store.model("toy").atlas.name == "toy"
+    assert store.model("toy").model.name == "toy"

@@ -1,4 +1,3 @@
-import asyncio
 import json
 
 import h5py
@@ -7,9 +6,8 @@ import pytest
 from click.testing import CliRunner
 
 from palpate.online import commands
-from palpate.online.client.http import AsyncClient, Client
-from palpate.online.client.session import Session
-from palpate.online.session.follower import Follower
+from palpate.online.client.http import Client
+from palpate.online.client.session import ServiceError, Session
 from palpate.online.session.frames import (
     REPLY_FIELDS,
     Flag,
@@ -20,6 +18,7 @@ from palpate.online.session.frames import (
 )
 from palpate.online.session.recording import ASKED, Recorder, RecordingError, read_recording
 from palpate.online.session.replay import replay
+from palpate.online.session.tracker import LONGEST, ToolTracker
 from palpate.shared.model import ReducedModel
 
 from ..fake_model import FakeModel
@@ -28,9 +27,9 @@ from ..fake_model import FakeModel
 @pytest.fixture
 def stiff():
     """Return a toy that needs many strides, so that the number of steps matters."""
-    atlas = FakeModel()
-    atlas.stride = 0.3
-    return atlas
+    model = FakeModel()
+    model.stride = 0.3
+    return model
 
 
 @pytest.fixture
@@ -77,6 +76,39 @@ def test_a_replay_gives_the_same_answers(recorded, stiff):
     assert report == (len(replies), 0, None, 0.0)
 
 
+def test_snapshots_are_recorded_and_replayed(serving, tmp_path, rng):
+    model = FakeModel(in_time=True)
+    model.stride = 0.3
+    path = tmp_path / "session.h5"
+    places = rng.uniform([0, 0, 4.5], [10, 10, 8], (60, 3))
+    with (
+        serving(toy=model) as url,
+        Client(url) as client,
+        client.session("toy", record=path) as session,
+    ):
+        assert session.greeting["longest_step"] == LONGEST
+        assert session.greeting["snapshots"] > 0
+        for number, place in enumerate(places):
+            if number in (7, 20):
+                session.snapshot(number % 2)
+            if number in (15, 30, 31):
+                session.restore(1 - number % 2 if number != 15 else 1)
+            session.step(place)
+        session.snapshot(3)
+        for depth in np.linspace(0.0, 0.5, 20):  # without waiting, so that some are superseded
+            session.send((5.0, 5.0, 6.9 - depth))
+        session.restore(3)
+        with pytest.raises(ServiceError) as refused:
+            session.restore(5)
+        assert (refused.value.code, refused.value.field) == ("unknown_snapshot", "restore")
+        assert refused.value.allowed == [0, 1, 3]
+        session.step((5.0, 5.0, 6.5))
+    recording = read_recording(path)
+    assert len(recording.commands) == 7
+    report = replay(recording, model)
+    assert (report.different, report.force_difference) == (0, 0.0)
+
+
 def test_a_replay_tells_what_differs(recorded, stiff):
     path, _ = recorded
     recording = read_recording(path)
@@ -101,47 +133,23 @@ def test_long_sessions_are_written_piece_by_piece(serving, tmp_path, monkeypatch
     assert [request.seq for request in read_recording(path).requests] == list(range(1, 26))
 
 
-def test_asyncio_sessions_are_recorded_too(url, tmp_path):
-    path = tmp_path / "session.h5"
-
-    async def run():
-        async with AsyncClient(url) as client, client.session("toy", record=path) as session:
-            return await session.step((5.0, 5.0, 6.5))
-
-    reply = asyncio.run(run())
-    np.testing.assert_array_equal(read_recording(path).replies["force"], [reply.force])
-
-
-def test_numbers_may_start_again(tmp_path):
-    follower = Follower(FakeModel())
-    with Recorder(tmp_path / "session.h5", {"scene": "toy"}) as recorder:
-        requests = [
-            Request(seq % 2**32, 0.0, (5.0, 5.0, 6.5)) for seq in range(2**32 - 2, 2**32 + 2)
-        ]
-        for request in requests:
-            recorder.sent(request)
-        last = requests[-1]
-        step = follower.follow(last.position, 0.0)
-        recorder.received(encode_reply(last, step, superseded=3), 1.0)
-        assert not recorder._requests
-    assert read_recording(tmp_path / "session.h5").requests == [last]
-
-
 @pytest.fixture
 def recorder(tmp_path):
     with Recorder(tmp_path / "session.h5", {"scene": "toy"}) as recorder:
         yield recorder
 
 
-def test_requests_that_were_refused_are_not_kept(recorder):
-    """The service complains of them without a number."""
-    follower = Follower(FakeModel())
-    for seq in range(1, 31):
-        request = Request(seq, 0.0, (5.0, 5.0, 6.5))
-        recorder.sent(request)
-        if seq % 10 == 0:
-            recorder.received(encode_reply(request, follower.follow(request.position, 0.0)), 1.0)
-            assert not recorder._requests
+def test_requests_that_were_dropped_or_refused_are_not_kept(recorder, tmp_path):
+    """The service complains of the latter without a number; numbers start again at 2^32."""
+    answer = ToolTracker(FakeModel()).follow((5.0, 5.0, 6.5), 0.0)
+    for first in (1, 2**32 - 4):
+        requests = [Request((first + i) % 2**32, 0.0, (5.0, 5.0, 6.5)) for i in range(10)]
+        for request in requests:
+            recorder.sent(request)
+        recorder.received(encode_reply(requests[-1], answer), 1.0)
+        assert not recorder._requests
+    recorder.close()
+    assert [r.seq for r in read_recording(tmp_path / "session.h5").requests] == [10, 5]
 
 
 def test_requests_without_any_reply_do_not_fill_the_memory(recorder, monkeypatch):

@@ -11,15 +11,16 @@ from palpate.online.client.http import Client
 from palpate.online.client.session import ServiceError, Session, SessionClosed
 from palpate.online.serve.metrics import Metrics
 from palpate.online.serve.settings import Settings
-from palpate.online.serve.store import Model
-from palpate.online.session import frames
+from palpate.online.serve.store import ServedModel
+from palpate.online.session import frames, protocol
 from palpate.online.session import session as server_session
-from palpate.online.session.follower import Follower
-from palpate.online.session.frames import Flag, Output, Request
-from palpate.online.session.realtime import BusyWait
-from palpate.online.session.websocket import PENDING, READ_AT
+from palpate.online.session.frames import Flag, Output, Reason, Request
+from palpate.online.session.session import Sessions, State
+from palpate.online.session.tracker import ToolTracker
+from palpate.online.session.websocket import PENDING, READ_AT, STOPPING
 from palpate.shared.errors import PalpateError
 
+from ..conftest import place_comes_free
 from ..fake_model import FakeModel
 
 PRESSED = (5.0, 5.0, 6.5)  # half a millimetre deep
@@ -33,10 +34,10 @@ def session(url):
 
 
 def test_a_session_says_how_to_speak_with_it(session):
-    assert session.hello["scene"] == "toy"
-    assert session.hello["layout"] == json.loads(json.dumps(frames.layout()))
-    assert session.hello["nodes"] == len(FakeModel().surface_nodes)
-    reply = session.step(session.hello["example"]["position"])
+    assert session.greeting["scene"] == "toy"
+    assert session.greeting["layout"] == json.loads(json.dumps(protocol.layout()))
+    assert session.greeting["nodes"] == len(FakeModel().surface_nodes)
+    reply = session.step(session.greeting["example"]["position"])
     assert reply.good
     assert reply.contact
 
@@ -62,18 +63,41 @@ def test_away_from_the_tissue_force_is_zero_up_to_contact(session):
     assert reply.valid_radius == pytest.approx(1.0)
 
 
+def test_a_position_without_an_answer_repeats_the_last_good_one_and_claims_nothing(session):
+    before = session.step(PRESSED)
+    after = session.step((5.0, 5.0, 4.0))
+    assert after.flags == Flag.CONTACT | Flag.FALLBACK
+    assert after.reason == Reason.BELOW_SURFACE
+    assert not after.good
+    np.testing.assert_array_equal(after.force, before.force)
+    np.testing.assert_array_equal(after.position, PRESSED)
+    errors = after.error_displacement, after.error_von_mises, after.error_force
+    assert errors == (np.inf, np.inf, np.inf)
+    text = ask(session, json.dumps({"position": (5.0, 5.0, 4.0)}))
+    assert text["reason"] == "the tip's centre lies below the surface of the tissue"
+    assert text["error_force"] is None
+    assert session.step(FREE).good
+
+
+def test_outside_the_trained_range_no_error_is_known(session):
+    reply = session.step((5.0, 5.0, 5.8))
+    assert reply.depth > reply.depth_limit == 1.0
+    assert reply.flags == Flag.CONTACT | Flag.CONVERGED
+    assert reply.error_displacement == reply.error_von_mises == reply.error_force == np.inf
+
+
 @pytest.mark.parametrize("half", [0, Output.HALF])
 def test_fields_come_when_asked_for(session, half):
-    atlas = FakeModel()
-    touch = atlas.touch(PRESSED)
+    model = FakeModel()
+    touch = model.touch(PRESSED)
     wanted = Output.COORDINATES | Output.DISPLACEMENT | Output.VON_MISES | Output.STRESS | half
     reply = session.step(PRESSED, wanted)
     kind = np.float16 if half else np.float32
     np.testing.assert_array_equal(
-        reply.displacement, atlas.displacement(touch, "surface").astype(kind)
+        reply.displacement, model.displacement(touch, "surface").astype(kind)
     )
-    stress = atlas.von_mises(touch, "all")
-    np.testing.assert_array_equal(reply.von_mises, stress[atlas.surface_nodes].astype(kind))
+    stress = model.von_mises(touch, "all")
+    np.testing.assert_array_equal(reply.von_mises, stress[model.surface_nodes].astype(kind))
     assert reply.max_von_mises == stress.max()
     assert reply.p99_von_mises == np.float32(np.percentile(stress, 99))
     np.testing.assert_allclose(reply.coordinates[0], [0.5, 0.5])
@@ -91,7 +115,7 @@ def test_json_says_the_same(session):
     assert reply["reason"] == ""
     np.testing.assert_array_equal(reply["force"], binary.force)
     np.testing.assert_array_equal(np.float32(reply["von_mises"]), binary.von_mises)
-    assert set(reply) - {"reason"} <= set(binary._fields)
+    assert set(reply) <= set(binary._fields)
 
 
 @pytest.mark.parametrize(
@@ -128,55 +152,31 @@ def test_json_has_a_limit(serving, tmp_path):
         (Request(1, 0.0, (float("nan"), 0.0, 0.0)), "position"),
         (Request(1, 0.0, (0.0, float("-inf"), 0.0)), "position"),
         (Request(1, 0.0, PRESSED, 1 << 15), "outputs"),
+        (None, "frame"),
     ],
 )
 def test_a_frame_of_nonsense_names_the_field_and_the_session_goes_on(session, request_, field):
-    session.send_bytes(frames.encode_request(request_))
+    whole = b"\x02\x00" + bytes(39)  # a byte too long
+    session.send_bytes(whole if request_ is None else frames.encode_request(request_))
     with pytest.raises(ServiceError) as error:
         session.receive()
     assert (error.value.code, error.value.field) == ("invalid_frame", field)
     assert session.step(PRESSED).good
 
 
-def test_a_frame_of_the_wrong_size_is_told(session):
-    session.send_bytes(b"\x01\x00" + bytes(39))
-    with pytest.raises(ServiceError, match="must have 40 bytes, not 41"):
-        session.receive()
-    assert session.step(PRESSED).good
-
-
 def test_another_version_is_told_and_ends_the_session(session):
-    session.send_bytes(b"\x02\x00" + bytes(38))
-    with pytest.raises(ServiceError, match="is 2; this is version 1"):
+    session.send_bytes(b"\x01\x00" + bytes(38))
+    with pytest.raises(ServiceError, match="is 1; this service speaks version 2"):
         session.receive()
     with pytest.raises(SessionClosed) as closed:
         session.receive()
     assert closed.value.code == 4001
 
 
-def test_a_position_without_an_answer_gets_the_last_good_one(session):
-    before = session.step(PRESSED)
-    after = session.step((5.0, 5.0, 4.0))
-    assert after.flags == before.flags | Flag.FALLBACK
-    assert not after.good
-    np.testing.assert_array_equal(after.force, before.force)
-    np.testing.assert_array_equal(after.position, PRESSED)
-    reason = ask(session, json.dumps({"position": (5.0, 5.0, 4.0)}))["reason"]
-    assert "below the surface" in reason
-    assert session.step(FREE).good
-
-
-def test_without_any_good_answer_there_is_no_force(session):
-    reply = session.step((5.0, 5.0, 4.0))
-    assert reply.flags == Flag.FALLBACK
-    assert not reply.force.any()
-    assert not reply.tangent.any()
-
-
 def test_an_answer_that_is_not_finite_stays_inside(serving):
-    atlas = FakeModel()
-    with serving(toy=atlas) as url, Session(url, "toy") as session:
-        atlas.poison = True
+    model = FakeModel()
+    with serving(toy=model) as url, Session(url, "toy") as session:
+        model.poison = True
         reply = session.step(PRESSED)
         assert reply.flags == Flag.FALLBACK
         assert not reply.force.any()
@@ -200,26 +200,15 @@ def test_the_newest_position_counts(session):
     np.testing.assert_array_equal(answered[-1].position, [5.0, 5.0, 6.5 + 0.01 * (count - 1)])
 
 
-def test_sessions_do_not_share_their_history(serving):
-    """Where one tool is makes no difference to another one's steps."""
-    atlas = FakeModel()
-    atlas.stride = 0.2
-    with (
-        serving(toy=atlas) as url,
-        Session(url, "toy") as one,
-        Session(url, "toy") as other,
-    ):
-        assert one.step((5.0, 5.0, 6.5)).good
-        assert other.step((1.0, 1.0, 6.5)).good
-        assert one.step((5.0, 5.0, 6.4)).good
-        assert other.step((1.1, 1.0, 6.4)).good
-
-
-def test_a_session_does_not_inherit_the_history_of_another(serving):
-    """More sessions than are kept at hand, one after the other; each starts anew."""
-    atlas = FakeModel()
-    atlas.stride = 0.2
-    with serving(toy=atlas) as url:
+def test_a_session_has_a_history_of_its_own(serving):
+    """Not that of one beside it; nor of one before it, of more than are kept at hand."""
+    model = FakeModel()
+    model.stride = 0.2
+    with serving(toy=model) as url:
+        with Session(url, "toy") as one, Session(url, "toy") as other:
+            for step in (0.0, 0.1):
+                assert one.step((5.0 + step, 5.0, 6.5)).good
+                assert other.step((1.0, 1.0 + step, 6.5)).good
         for i in range(10):
             with Session(url, "toy") as session:
                 assert session.step((float(i), 1.0, 6.5)).good
@@ -232,14 +221,7 @@ def test_too_many_sessions_are_refused(serving, tmp_path):
                 Session(url, "toy")
             assert (refused.value.status, refused.value.code) == (503, "too_many_sessions")
             assert refused.value.allowed == {"max_sessions": 1}
-        for _ in range(100):
-            try:
-                Session(url, "toy").close()
-                break
-            except ServiceError:
-                time.sleep(0.02)
-        else:
-            pytest.fail("the place was not given back")
+        place_comes_free(url).close()
 
 
 def test_a_silent_session_is_closed(serving, tmp_path):
@@ -252,40 +234,6 @@ def test_a_silent_session_is_closed(serving, tmp_path):
         assert closed.value.code == 4000
 
 
-def test_a_session_that_says_goodbye_is_watched_no_more(tmp_path):
-    """What interrupts a session must not interrupt its last word."""
-    messages = iter(
-        [{"type": "websocket.connect"}, {"type": "websocket.receive", "bytes": b"\2\0"}]
-    )
-    tasks = []
-
-    async def receive():
-        return next(messages)
-
-    async def send(message):
-        await asyncio.sleep(0)
-        if message["type"] == "websocket.close":
-            tasks.extend(asyncio.all_tasks())
-
-    async def run():
-        extensions = {PENDING: lambda: False, READ_AT: time.perf_counter}
-        atlas = FakeModel()
-        session = server_session.Session(
-            Model(atlas, {}, list(PRESSED)),
-            Follower(atlas),
-            Settings(tmp_path),
-            Metrics(),
-            BusyWait(0),
-            {"extensions": extensions},
-            receive,
-            send,
-        )
-        await session.run()
-
-    asyncio.run(run())
-    assert len(tasks) == 1
-
-
 def test_an_unknown_scene_has_no_session(url, caplog):
     with pytest.raises(ServiceError, match="No such scene") as refused:
         Session(url, "other")
@@ -296,9 +244,9 @@ def test_an_unknown_scene_has_no_session(url, caplog):
 
 
 def test_a_scene_without_a_tip_has_no_session(serving):
-    atlas = FakeModel()
-    atlas.tips = None
-    with serving(toy=atlas, other=FakeModel("other")) as url:
+    model = FakeModel()
+    model.has_tip = False
+    with serving(toy=model, other=FakeModel("other")) as url:
         with pytest.raises(ServiceError, match="trained without a tip") as refused:
             Session(url, "toy")
         assert (refused.value.status, refused.value.code) == (404, "no_tip")
@@ -318,7 +266,90 @@ def test_without_a_handshake_there_is_no_session(client):
 def test_the_layout_is_in_the_description_of_the_service(client):
     document = client.get("/openapi.json").json()
     responses = document["paths"]["/scenes/{name}/session"]["get"]["responses"]
-    assert frames.tables() in responses["101"]["description"]
+    assert protocol.tables() in responses["101"]["description"]
+
+
+def test_a_session_closed_by_its_client_says_so(session):
+    session.close()
+    with pytest.raises(SessionClosed, match="this client closed it"):
+        session.step(PRESSED)
+
+
+@pytest.mark.parametrize(
+    ("text", "field"),
+    [
+        ('{"snapshot": 99}', "snapshot"),
+        ('{"snapshot": 1, "restore": 1}', "snapshot"),
+        ('{"restore": null}', "snapshot"),
+        ('{"snapshot": "a"}', "snapshot"),
+    ],
+)
+def test_a_command_that_makes_no_sense_is_refused(session, text, field):
+    assert ask(session, text)["error"]["field"] == field
+    assert session.step(PRESSED).good
+
+
+class Line:
+    """A client in place of a socket, of which `Sessions` serves one session."""
+
+    def __init__(self, *messages):
+        self.messages = list(messages)
+        self.sent, self.tasks = [], 0
+
+    async def receive(self):
+        if self.messages:
+            return self.messages.pop(0)
+        return await asyncio.Future()  # silence
+
+    async def send(self, message):
+        await asyncio.sleep(0)
+        self.sent.append(message)
+        self.tasks = len(asyncio.all_tasks())
+
+    def run(self, tmp_path, **settings):
+        extensions = {PENDING: lambda: False, READ_AT: time.perf_counter}
+        sessions = Sessions(None, Settings(tmp_path, **settings), Metrics())
+        model = FakeModel()
+        served = ServedModel(model, {}, list(PRESSED))
+        session = server_session.Session(
+            sessions, served, ToolTracker(model), {"extensions": extensions},
+            self.receive, self.send,
+        )  # fmt: skip
+        asyncio.run(session.run())
+        return session
+
+
+CONNECT, OTHER_VERSION = (
+    {"type": "websocket.connect"},
+    {"type": "websocket.receive", "bytes": b"\0\0"},
+)
+
+
+def test_a_session_goes_through_its_states(tmp_path):
+    """And one that ends is not watched any more: what interrupts it must not stop its last word."""
+    line = Line(CONNECT, OTHER_VERSION)
+    session = line.run(tmp_path)
+    assert session._state is State.CLOSED
+    assert [message["type"] for message in line.sent] == [
+        "websocket.accept", "websocket.send", "websocket.send", "websocket.close"
+    ]  # fmt: skip
+    assert line.tasks == 1
+    with pytest.raises(RuntimeError, match=r"cannot go from State\.CLOSED to State\.WAITING"):
+        session._enter(State.WAITING)
+
+
+@pytest.mark.parametrize(
+    ("last", "closed"),
+    [
+        ({"type": "websocket.disconnect", "code": 1000}, None),
+        ({"type": "websocket.disconnect", "code": STOPPING}, 1001),
+        (None, 4000),
+    ],
+)
+def test_how_a_session_ends(tmp_path, last, closed):
+    line = Line(CONNECT, *([] if last is None else [last]))
+    assert line.run(tmp_path, session_idle=0.02)._state is State.CLOSED
+    assert line.sent[-1].get("code") == closed
 
 
 def ask(session, text):

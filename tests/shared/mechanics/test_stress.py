@@ -41,7 +41,7 @@ def reference(request):
 def test_a_uniform_state_is_recovered_exactly(reference, rng):
     nodes, elements = pair(reference, rng)
     F = np.eye(3) + rng.uniform(-0.2, 0.2, (3, 3))
-    expected = tissue.von_mises(*F.ravel(), MU, LAM)
+    expected = tissue.von_mises(tuple(F.ravel()), MU, LAM)
     stress = recovered(nodes, elements, nodes @ (F - np.eye(3)).T)
     np.testing.assert_allclose(stress, expected, rtol=1e-11)
 

@@ -14,15 +14,14 @@ MU, LAM = tissue.lame(15.0, 0.45)
 
 def stress(F):
     """Energy density and stress (3, 3) of a deformation gradient (3, 3)."""
-    P = np.empty(9)
-    W, _ = tissue.stress(F.ravel(), MU, LAM, P)
-    return W, P.reshape(3, 3)
+    J, square, P = tissue.first_piola(tuple(F.ravel()), MU, LAM)
+    return tissue.energy(J, square, MU, LAM), np.reshape(P, (3, 3))
 
 
 def tangent(F):
     """Material tangent (9, 9)."""
     A = np.empty((9, 9))
-    tissue.tangent(F.ravel(), MU, LAM, np.empty(9), A)
+    tissue.tangent(tuple(F.ravel()), MU, LAM, A)
     return A
 
 
@@ -99,25 +98,12 @@ def test_lame_parameters_give_back_the_engineering_ones():
     assert (young, LAM / (2 * (LAM + MU))) == pytest.approx((15.0, 0.45))
 
 
-def test_scalar_tangent_is_that_of_the_arrays(F, rng):
-    H = rng.standard_normal(9)
-    state = tissue.linearise(*F.ravel(), MU, LAM)
-    increment = tissue.increment(*state, MU, *H)
-    np.testing.assert_allclose(increment, tangent(F) @ H, rtol=0, atol=1e-12 * np.abs(H @ H) * LAM)
-
-
 def test_rest_stress_is_the_tangent_at_rest(rng):
     H = rng.standard_normal(9)
-    W, *P = tissue.rest_stress(*H, MU, LAM)
+    W, P = tissue.rest_stress(tuple(H), MU, LAM)
     expected = tangent(np.eye(3)) @ H
     np.testing.assert_allclose(P, expected, rtol=1e-12)
     assert pytest.approx(expected @ H / 2, rel=1e-12) == W
-
-
-@pytest.mark.parametrize("J", [0.0, -1.0, math.nan])
-def test_inverted_tissue_has_infinite_energy(J):
-    F = np.diag([J, 1.0, 1.0])
-    assert stress(F)[0] == tissue.INVERTED
 
 
 def test_von_mises_against_the_textbook(F):
@@ -126,13 +112,12 @@ def test_von_mises_against_the_textbook(F):
     cauchy = P @ F.T / J
     deviator = cauchy - np.trace(cauchy) / 3 * np.eye(3)
     expected = math.sqrt(1.5 * np.sum(deviator**2))
-    assert tissue.von_mises(*F.ravel(), MU, LAM) == pytest.approx(expected, rel=1e-12)
+    assert tissue.von_mises(tuple(F.ravel()), MU, LAM) == pytest.approx(expected, rel=1e-12)
 
 
 def test_von_mises_of_uniaxial_stress_is_that_stress():
     along, across = 1.3, 0.9
-    P = stress(np.diag([across, across, along]))[1]
+    F = np.diag([across, across, along])
+    P = stress(F)[1]
     expected = abs(P[2, 2] / across**2 - P[0, 0] / (across * along))
-    assert tissue.von_mises(across, 0, 0, 0, across, 0, 0, 0, along, MU, LAM) == pytest.approx(
-        expected
-    )
+    assert tissue.von_mises(tuple(F.ravel()), MU, LAM) == pytest.approx(expected)

@@ -9,7 +9,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from palpate.shared.mechanics import tissue, viscosity
+from palpate.shared.mechanics.tensors import unpacked
 
+from ..energies import advance, past_energy_and_power
 from .differences import central_difference
 
 MU, LAM = tissue.lame(15.0, 0.45)
@@ -20,36 +22,37 @@ RELAXED = np.inf
 
 
 def rest(terms=2):
-    return np.zeros((terms + 1, viscosity.COMPONENTS))
+    return np.zeros((terms + 1, 7))
 
 
 def predicted(history, dt, prony=PRONY):
-    B = np.empty(viscosity.COMPONENTS)
-    viscosity.predict(history, viscosity.step_weights(prony, dt), B)
+    """``B``, packed, and the same of the means of ``c``: (7,)."""
+    B = np.empty(7)
+    loss = viscosity.predict(history, viscosity.step_weights(prony, dt), B)
+    B[[0, 1, 2, 6]] -= loss
     return B
 
 
 def answer(F, B):
     """Energy density and stress (3, 3) at a deformation gradient (3, 3)."""
-    P = np.empty(9)
-    W, J = tissue.stress(F.ravel(), MU, LAM, P)
-    W += viscosity.add_stress(F.ravel(), B, MU, J, P) - 1.5 * MU * B[6]
-    return W, P.reshape(3, 3)
+    J, square, P = tissue.first_piola(tuple(F.ravel()), MU, LAM)
+    modulus = MU * J ** (-2 / 3)
+    contraction, Q = viscosity.overstress(tuple(F.ravel()), unpacked(B), J, modulus)
+    W = tissue.energy(J, square, MU, LAM) + (modulus * contraction - 3 * MU * B[6]) / 2
+    return W, np.reshape(np.add(P, Q), (3, 3))
 
 
 def tangent(F, B):
     A = np.empty((9, 9))
-    tissue.tangent(F.ravel(), MU, LAM, np.empty(9), A)
-    viscosity.add_tangent(F.ravel(), B, MU, np.empty(9), np.empty(9), A)
+    tissue.tangent(tuple(F.ravel()), MU, LAM, A)
+    viscosity.add_tangent(tuple(F.ravel()), unpacked(B), MU, A)
     return A
 
 
 def go(history, F, dt, prony=PRONY):
     """Advance a history in place to F; return energy density and stress there."""
     B = predicted(history, dt, prony)
-    m = np.empty(viscosity.COMPONENTS)
-    viscosity.driving(F.ravel(), np.empty(9), m)
-    viscosity.advance(history, m, viscosity.step_weights(prony, dt))
+    advance(F, viscosity.step_weights(prony, dt), history)
     return answer(F, B)
 
 
@@ -60,9 +63,7 @@ def elastic_isochoric(F):
 
 
 def elastic(F):
-    P = np.empty(9)
-    tissue.stress(F.ravel(), MU, LAM, P)
-    return P.reshape(3, 3)
+    return np.reshape(tissue.first_piola(tuple(F.ravel()), MU, LAM)[2], (3, 3))
 
 
 def deformation(rng, size=0.35):
@@ -251,13 +252,10 @@ def test_without_terms_the_law_is_the_elastic_one_to_the_bit(rng):
     for dt in (0.0, 0.01, np.inf):
         F = deformation(rng)
         W, P = go(history, F, dt, prony=())
-        expected = np.empty(9)
-        assert (W, P.ravel().tolist()) == (
-            tissue.stress(F.ravel(), MU, LAM, expected)[0],
-            expected.tolist(),
-        )
+        J, square, expected = tissue.first_piola(tuple(F.ravel()), MU, LAM)
+        assert (W, tuple(P.ravel())) == (tissue.energy(J, square, MU, LAM), expected)
         A = np.empty((9, 9))
-        tissue.tangent(F.ravel(), MU, LAM, np.empty(9), A)
+        tissue.tangent(tuple(F.ravel()), MU, LAM, A)
         np.testing.assert_array_equal(tangent(F, predicted(history, dt, prony=())), A)
 
 
@@ -286,8 +284,7 @@ def test_dissipation_is_never_negative_over_random_histories():
         history = rest()
         for F, dt in random_history(rng):
             go(history, F, dt)
-            weights = viscosity.step_weights(PRONY, dt)
-            power = viscosity.dissipation(F.ravel(), history, weights, TAU, MU)
+            power = past_energy_and_power(F, history, PRONY, MU)[1]
             smallest, largest = min(smallest, power), max(largest, power)
     assert smallest >= -1e-12 * largest
     assert largest > 0.0
@@ -298,12 +295,11 @@ def energy_balance(path, end, steps):
     history, F = rest(), path(0.0)
     work = lost = 0.0
     P, power = elastic(F), 0.0
-    weights = viscosity.step_weights(PRONY, end / steps)
     for t in np.linspace(0, end, steps + 1)[1:]:
         G = path(t)
         W, Q = go(history, G, end / steps)
         work += np.sum((P + Q) / 2 * (G - F))
-        now = viscosity.dissipation(G.ravel(), history, weights, TAU, MU)
+        now = past_energy_and_power(G, history, PRONY, MU)[1]
         lost += (power + now) / 2 * end / steps
         F, P, power = G, Q, now
     return work, W + lost, lost

@@ -1,6 +1,7 @@
 """The rigid tip on the reduced model: what is answered, what is flagged, what is refused."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,12 +10,11 @@ from palpate.offline.run.workshop import Workshop
 from palpate.shared.artifact import read_artifact
 from palpate.shared.errors import QueryError
 from palpate.shared.mechanics import newton
-from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.mechanics.sphere import tip_of
 from palpate.shared.model import ReducedModel
 from palpate.shared.reduced import touch
-from palpate.shared.reduced.touch import TipState
-from palpate.shared.reduced.touch import answer as answer_touch
+from palpate.shared.reduced.terms import Elastic
+from palpate.shared.reduced.workspace import touch_workspace
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def test_a_tip_off_the_surface_feels_nothing(atlas):
     assert answer.converged
     assert not answer.force.any()
     assert not answer.tangent.any()
-    assert answer.patches == ()
+    assert answer.parts == ()
     assert answer.depth == pytest.approx(-0.5)
     assert not atlas.displacement(answer).any()
 
@@ -59,9 +59,9 @@ def test_what_is_no_position_is_refused(atlas, position):
 
 
 def path(atlas, depth, points):
-    """Answers along positions (k, 2), fractions of the top, by one state."""
-    state = atlas.new_state()
-    return [atlas.touch(above(atlas, depth, at), state) for at in points]
+    """Answers along positions (k, 2), fractions of the top, each from the last."""
+    warm = atlas.new_warm()
+    return [atlas.touch(above(atlas, depth, at), warm=warm) for at in points]
 
 
 def test_the_tangent_is_the_derivative_of_the_force(atlas):
@@ -85,8 +85,8 @@ def test_energy_put_in_comes_out_again(atlas):
     back = np.linspace(0.65, 0.35, 60)
     positions = [above(atlas, d, (a, 0.5)) for d, a in zip(deep, aside, strict=True)]
     positions += [above(atlas, -0.1, (a, 0.5)) for a in back]
-    state = atlas.new_state()
-    answers = [atlas.touch(x, state) for x in positions]
+    warm = atlas.new_warm()
+    answers = [atlas.touch(x, warm=warm) for x in positions]
     x, force = np.array(positions), np.array([a.force for a in answers])
     work = -np.sum((force[1:] + force[:-1]) / 2 * np.diff(x, axis=0), axis=1)
     assert abs(work.sum()) <= 0.01 * work[:60].sum()
@@ -111,14 +111,14 @@ def test_the_force_has_no_jumps_on_a_path(atlas, artifact):
     glide = path(atlas, 0.7, [(a, 0.37 + 0.2 * a) for a in across])
     force = np.array([a.force for a in glide])
     largest = np.linalg.norm(force, axis=1).max()
-    assert len({k for a in glide for k, _, _ in a.patches}) >= 3
+    assert len({k for a in glide for k, _, _ in a.parts}) >= 3
     assert jumps(glide).max() <= 0.01 * largest
     steepest = int(np.argmax(np.linalg.norm(np.diff(force, axis=0), axis=1)))
     here, there = (workshop.touch(a.position).force for a in glide[steepest : steepest + 2])
     change = force[steepest + 1] - force[steepest]
     assert np.linalg.norm(change - (there - here)) <= 0.01 * largest
-    state = atlas.new_state()
-    fading = [atlas.touch(above(atlas, d), state) for d in np.arange(0.4, -0.1, -0.02)]
+    warm = atlas.new_warm()
+    fading = [atlas.touch(above(atlas, d), warm=warm) for d in np.arange(0.4, -0.1, -0.02)]
     assert not fading[-1].force.any()
     assert jumps(fading).max() <= 0.01 * largest
 
@@ -126,44 +126,44 @@ def test_the_force_has_no_jumps_on_a_path(atlas, artifact):
 def test_where_it_came_from_does_not_matter(atlas):
     x = above(atlas, 0.6, (0.55, 0.45))
     cold = atlas.touch(x)
-    state = atlas.new_state()
+    warm = atlas.new_warm()
     for depth in (0.1, 0.9, 0.5):
-        atlas.touch(above(atlas, depth, (0.5, 0.5)), state)
-    warm = atlas.touch(x, state)
-    np.testing.assert_allclose(warm.force, cold.force, atol=1e-3 * np.linalg.norm(cold.force))
+        atlas.touch(above(atlas, depth, (0.5, 0.5)), warm=warm)
+    found = atlas.touch(x, warm=warm)
+    np.testing.assert_allclose(found.force, cold.force, atol=1e-3 * np.linalg.norm(cold.force))
 
 
 def test_a_model_that_joins_in_starts_from_its_neighbours_answer(atlas):
-    state, joined, cold, numbers = atlas.new_state(), [], [], set()
+    warm, joined, cold, numbers = atlas.new_warm(), [], [], set()
     for a in np.arange(0.2, 0.8, 0.005):
         x = above(atlas, 0.7, (a, 0.4))
-        answer = atlas.touch(x, state)
-        new = {k for k, _, _ in answer.patches} - numbers
+        answer = atlas.touch(x, warm=warm)
+        new = {k for k, _, _ in answer.parts} - numbers
         if numbers and new:
             joined.append(answer.iterations)
             cold.append(atlas.touch(x).iterations)
-        numbers = {k for k, _, _ in answer.patches}
+        numbers = {k for k, _, _ in answer.parts}
     assert len(joined) >= 3
     assert np.mean(joined) < 0.6 * np.mean(cold)
 
 
 def test_what_is_no_equilibrium_is_not_gone_on_from(atlas):
-    state = atlas.new_state()
-    before = atlas.touch(above(atlas, 0.6), state)
-    assert not atlas.touch(above(atlas, 0.7), state, most=0).converged
-    again = atlas.touch(above(atlas, 0.6), state, most=0)
+    warm = atlas.new_warm()
+    before = atlas.touch(above(atlas, 0.6), warm=warm)
+    assert not atlas.touch(above(atlas, 0.7), warm=warm, most=0).converged
+    again = atlas.touch(above(atlas, 0.6), warm=warm, most=0)
     assert again.converged
     np.testing.assert_allclose(again.force, before.force, rtol=1e-4, atol=1e-3)
 
 
 def test_a_search_can_go_on_at_the_next_position(atlas):
     """Iteration by iteration, while the tip goes on."""
-    state, depths = atlas.new_state(), iter(np.arange(0.7, 0.8, 0.005))
-    answer = atlas.touch(above(atlas, next(depths)), state, most=3)
+    warm, depths = atlas.new_warm(), iter(np.arange(0.7, 0.8, 0.005))
+    answer = atlas.touch(above(atlas, next(depths)), warm=warm, most=3)
     assert not answer.converged
     while not answer.converged:
-        state.go_on()
-        answer = atlas.touch(above(atlas, next(depths)), state, most=3)
+        warm.resume()
+        answer = atlas.touch(above(atlas, next(depths)), warm=warm, most=3)
     cold = atlas.touch(answer.position)
     np.testing.assert_allclose(answer.force, cold.force, atol=1e-3 * np.linalg.norm(cold.force))
 
@@ -176,23 +176,27 @@ def test_what_is_outside_the_range_is_flagged(atlas):
     assert 0 < inside.error_force < 0.3
     deep = atlas.touch(above(atlas, 1.02 * inside.depth_limit))
     assert deep.out_of_range == ("depth",)
+    assert deep.error_displacement == deep.error_von_mises == deep.error_force == np.inf
     beside = np.add(above(atlas, 1.9, (1.0, 0.5)), [0.5, 0, 0])
     assert "position" in atlas.touch(beside).out_of_range
 
 
 def test_contact_begins_where_the_surface_is_cut_short(atlas):
     # triangles cut the curves of a surface: contact can begin a little above them
-    ground = atlas.surface.ground(atlas.limits[:, [TIP_DEPTH]])
+    ground = atlas.surface.ground(atlas.limits)
     lower = ground._replace(vertices=ground.vertices - [0.0, 0.0, 0.01])
+    coefficients = atlas.estimators.touches.coefficients
     radius, low = atlas.scene.endoscope.radius, atlas.nodes[:, 2].max() - 0.01
     for depth in (0.0085, 0.005, 0.002):
-        state = TipState(atlas.tips, lower, atlas.estimators.touches.coefficients)
+        own = touch_workspace(atlas.touch_models, lower, coefficients, Elastic())
         x = above(atlas, 0.0, (0.4, 0.6))
         x[2] = low + radius - (depth - 0.01)
-        answer = answer_touch(state, x, 0.0)
-        assert answer.depth <= 0.0
-        assert answer.contact
-        assert answer.converged
+        touch.place(own.solver, x, x)
+        touch.touch(own.solver, x, touch.MAX_ITERATIONS)
+        answer = own.result()
+        assert -touch.SKIN * radius < answer.depth <= 0.0
+        assert answer.touched > 0
+        assert answer.status == newton.CONVERGED
         assert answer.force[2] > 0.0
 
 
@@ -204,11 +208,11 @@ def test_free_space_beside_the_body_is_free(atlas):
 
 
 def test_an_impatient_caller_gets_an_answer_or_none(atlas):
-    state, deep = atlas.new_state(), above(atlas, 1.0, (0.45, 0.55))
-    answer = atlas.touch(deep, state, 1)
+    warm, deep = atlas.new_warm(), above(atlas, 1.0, (0.45, 0.55))
+    answer = atlas.touch(deep, warm=warm, most=1)
     assert answer.iterations <= 3
     assert answer.converged or not answer.force.any()
-    assert atlas.touch(deep, state).converged
+    assert atlas.touch(deep, warm=warm).converged
 
 
 def test_a_tip_inside_the_body_is_refused(atlas):
@@ -220,15 +224,16 @@ class Ridge:
     """Two valleys at (-1, 3) and (1, 3), and a saddle between them."""
 
     def __init__(self):
-        self.tangent = np.zeros((2, 2))
+        self.load = SimpleNamespace(tip=tip_of(1.0, 1.0))
+        self.correction = SimpleNamespace(whole=np.zeros((2, 2)))
 
     def potential(self, u, residual):
         residual[:] = u[0] * (u[0] ** 2 - 1.0), u[1] - 3.0
         return 0.25 * (u[0] ** 2 - 1.0) ** 2 + 0.5 * (u[1] - 3.0) ** 2, 1.0
 
     def factorise(self, u, shift):
-        self.tangent[:] = np.diag([3.0 * u[0] ** 2 - 1.0, 1.0])
-        self.shifted = self.tangent + shift * np.eye(2)
+        self.correction.whole[:] = np.diag([3.0 * u[0] ** 2 - 1.0, 1.0])
+        self.shifted = self.correction.whole + shift * np.eye(2)
         return np.linalg.eigvalsh(self.shifted)[0] > 0.0
 
     def correct(self, residual, step):
@@ -236,13 +241,12 @@ class Ridge:
 
 
 def test_a_search_does_not_end_in_a_saddle(monkeypatch):
-    for name in ("settle", "_leave_saddle", "_response"):
+    for name in ("solve_contact", "_leave_saddle", "_response"):
         monkeypatch.setattr(touch, name, getattr(touch, name).py_func)
     monkeypatch.setattr(touch, "descend", newton.descend)
-    system, tip, q, work = Ridge(), tip_of(1.0, 1.0), np.array([0.0, 2.0]), np.zeros((4, 2))
-    search = system, tip, q, work, 0.1, 1e-6, 100
-    assert touch.settle(*search)[0] == newton.CONVERGED
+    problem, q, work = Ridge(), np.array([0.0, 2.0]), np.zeros((4, 2))
+    search = problem, q, work, 0.1, 1e-6, 100
+    assert touch.solve_contact(*search)[0] == newton.CONVERGED
     np.testing.assert_allclose(q, [0.0, 3.0], atol=1e-4)  # by symmetry
-    status, *_ = touch.settle_stably.py_func(*search, system.tangent)
-    assert status == newton.CONVERGED
+    assert touch.to_minimum.py_func(*search)[0] == newton.CONVERGED
     np.testing.assert_allclose(np.abs(q), [1.0, 3.0], atol=1e-4)

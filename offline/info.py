@@ -1,0 +1,146 @@
+"""What an artifact holds, read without building the model: for people or, as a whole, for JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate.shared.artifact import ArtifactError, read_artifact
+from palpate.shared.mechanics.footprint import TIP_DEPTH
+from palpate.shared.scene import Patch, Scene, SceneError, parse_scene
+
+LABELS = 14
+"""Column at which the values of ``lines`` stand."""
+
+
+def info(artifact: Path) -> dict[str, Any]:
+    """Everything an artifact tells of itself, JSON-able.
+
+    Returns
+    -------
+    dict
+        ``scene`` (its name), ``description``, ``text`` (the scene's TOML), ``bytes``, ``body`` (box
+        in mm, sizes of the mesh), ``loads`` (limits in kPa, degrees and mm) and the documents of
+        training: ``provenance``, ``training``, ``validation`` and others.
+
+    Raises
+    ------
+    ArtifactError
+    """
+    names = "nodes", "elements", "load_range", "surface_vertices"
+    found = read_artifact(artifact, names)
+    try:
+        scene = parse_scene(found.scene)
+    except SceneError as error:
+        raise ArtifactError(f"{artifact}: incomplete or inconsistent: {error}") from error
+    nodes, elements, limits, vertices = (found.arrays[name] for name in names)
+    middle = int(np.argmin(np.linalg.norm(vertices - vertices.mean(axis=0), axis=1)))
+    return {
+        "scene": scene.name,
+        "description": scene.description,
+        "text": scene.text,
+        "bytes": artifact.stat().st_size,
+        "body": {
+            "box": [nodes.min(axis=0).tolist(), nodes.max(axis=0).tolist()],
+            "dofs": nodes.size,
+            "elements": len(elements),
+        },
+        "loads": {
+            "largest_pressure": float(limits[:, 0].max()),
+            "smallest_pressure_limit": float(limits[:, 0].min()),
+            "largest_tilt": scene.endoscope.max_tilt,
+            "radius": scene.endoscope.radius,
+            "tip_depth_limits": [float(end(limits[:, TIP_DEPTH])) for end in (np.min, np.max)]
+            if scene.endoscope.tip
+            else None,
+            "example": {"at": vertices[middle].tolist(), "pressure": float(limits[middle, 0]) / 2},
+        },
+    } | found.documents
+
+
+def lines(report: Mapping[str, Any]) -> list[str]:
+    """What ``info`` found, one line for each aspect."""
+    scene = parse_scene(report["text"])
+    box = zip("xyz", *report["body"]["box"], strict=True)
+    layout, provenance = report["training"]["layout"], report["provenance"]
+    loads, depths = report["loads"], report["loads"]["tip_depth_limits"]
+    said = {
+        "scene": f"{scene.name}: {scene.description}",
+        "body": ", ".join(f"{axis} {low:.1f} to {high:.1f}" for axis, low, high in box)
+        + f" mm; {report['body']['elements']} elements {scene.geometry.element}, "
+        f"{report['body']['dofs']} DOFs",
+        "tissue": _tissue(scene),
+        "held": _patch(scene.support),
+        "touchable": _patch(scene.surface),
+        "loads": f"pressure up to {loads['smallest_pressure_limit']:.3g} (softest place) to "
+        f"{loads['largest_pressure']:.3g} kPa (stiffest), radius {loads['radius']:g} mm, tilt up "
+        f"to {loads['largest_tilt']:g} degrees",
+        "rigid tip": f"up to {depths[0]:.2g} to {depths[1]:.2g} mm deep, depending on the place"
+        if depths
+        else "not trained, so there are no sessions",
+        "reduced model": f"{layout['patches']} local models of {layout['modes']} modes and "
+        f"{layout['cubature_points_median']:g} points",
+        **accuracy(report),
+        "trained": f"{provenance['started'][:10]} in {duration(provenance['wall_seconds'])}, "
+        f"commit {provenance['git_commit'][:12]}; {report['bytes'] / 1e6:.1f} MB",
+    }
+    return [f"{label:<{LABELS}} {text}" for label, text in said.items()]
+
+
+def accuracy(report: Mapping[str, Any]) -> dict[str, str]:
+    """Errors that training found against the full model, by what presses."""
+    kinds = {"errors": ("validation", "loads"), "tip's errors": ("validation_tip", "positions")}
+    return {
+        label: f"95 of 100 random {noun} at most {_percent(found['displacement']['p95'])} in "
+        f"displacement, {_percent(found['von_mises']['p95'])} in von Mises stress"
+        for label, (kind, noun) in kinds.items()
+        if (found := report.get(kind))
+    }
+
+
+def closing(artifact: Path) -> list[str]:
+    """What to know of an artifact just trained, and what to do next."""
+    report = info(artifact)
+    example, tolerance = report["loads"]["example"], parse_scene(report["text"]).tolerance
+    place = " ".join(f"{x:.4g}" for x in example["at"])
+    errors = [f"{label}: {text}" for label, text in accuracy(report).items()]
+    if any(report["validation"][key]["p95"] > most for key, most in tolerance.model_dump().items()):
+        asked = f"{_percent(tolerance.displacement)} and {_percent(tolerance.von_mises)}"
+        errors.append(f"this is more than the {asked} that the scene asks for")
+    return [
+        f"{artifact}: {report['bytes'] / 1e6:.1f} MB",
+        *errors,
+        f"next: palpate solve {artifact} --at {place} --pressure {example['pressure']:.2g}",
+    ]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %"
+
+
+def duration(seconds: float) -> str:
+    """A time for people."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+
+
+def _tissue(scene: Scene) -> str:
+    tissue = scene.tissue
+    said: list[str] = [tissue.law]
+    for key, field in type(tissue).model_fields.items():
+        if isinstance(value := getattr(tissue, key), float):
+            name, _, unit = (field.description or key).partition(", ")
+            said.append(f"{name} {value:g} {unit}".rstrip())
+    lost = sum(share for share, _ in tissue.prony)
+    return ", ".join([*said, f"{_percent(lost)} relaxes with time" if lost else "elastic"])
+
+
+def _patch(patch: Patch) -> str:
+    ranges = [(axis, getattr(patch, axis)) for axis in "xyz"]
+    return ", ".join(
+        [f"side {patch.side}", *(f"{axis} {r[0]:g} to {r[1]:g} mm" for axis, r in ranges if r)]
+    )

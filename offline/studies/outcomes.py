@@ -1,0 +1,241 @@
+"""What becomes of a method's answers to hard cases, and the map of it.
+
+A method that gives a wrong answer and vouches for it has failed silently, which is the one failure
+a user cannot guard against; most methods have no way to fail otherwise.  One kind of wrong answer
+is told apart and counted with the others: where a load has several equilibria, the one that its
+path does not lead to.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate.offline.run.workshop import Workshop
+from palpate.offline.studies.references import Fields
+from palpate.offline.studies.tables import write_csv
+
+ROUGHLY = 0.1
+"""Displacement error up to which a wrong answer is roughly right; the artifact is nearly the only
+method within the tolerance of a scene."""
+
+RIGHT = "right"
+RIGHT_FLAGGED = "right but flagged"
+WRONG_FLAGGED = "wrong but flagged"
+ANOTHER_FLAGGED = "another equilibrium but flagged"
+REFUSED = "refused, or rightly none"
+DIVERGED = "not converged"
+ANOTHER = "silently another equilibrium"
+ROUGH = "silently wrong, displacement within 10 %"
+SILENT = "silently wrong"
+INVERTED = "silently inverted"
+
+OUTCOMES = {
+    RIGHT: "#0072B2",
+    RIGHT_FLAGGED: "#8CC5E8",
+    WRONG_FLAGGED: "#C8C8C8",
+    ANOTHER_FLAGGED: "#EBC9DB",
+    REFUSED: "#ECECEC",
+    DIVERGED: "#7F7F7F",
+    ANOTHER: "#CC79A7",
+    ROUGH: "#F0E442",
+    SILENT: "#D55E00",
+    INVERTED: "#000000",
+}
+"""What can become of an answer, and its colour: after Okabe & Ito, safe for colour-blind eyes."""
+
+SILENT_OUTCOMES = (ANOTHER, ROUGH, SILENT, INVERTED)
+
+
+@dataclass(frozen=True)
+class Result:
+    """What became of a method's answer to a case.
+
+    Attributes
+    ----------
+    outcome : str
+        A key of ``OUTCOMES``.
+    displacement, von_mises : float
+        Relative errors, NaN without an answer or without an equilibrium.
+    inverted, nan, crashed : bool
+        Whether the answer turns an element inside out, is vouched for but not finite, is missing
+        because the method raised.
+    details : dict
+        What else is known: of a silent error of the artifact what it says of its answer, of a long
+        history how far its end drifts.
+    """
+
+    outcome: str
+    displacement: float = float("nan")
+    von_mises: float = float("nan")
+    inverted: bool = False
+    nan: bool = False
+    crashed: bool = False
+    details: dict[str, Any] = field(default_factory=dict)
+
+
+Table = Mapping[str, Mapping[str, Sequence[Result]]]
+"""Results by method and kind of case."""
+
+
+def classify(
+    workshop: Workshop,
+    found: Fields | None,
+    trusted: bool,
+    exact: Fields | None,
+    other: Fields | None = None,
+) -> Result:
+    """Compare an answer with the full model's.
+
+    Parameters
+    ----------
+    workshop : Workshop
+    found : Fields, optional
+        The answer; None if the method has none.
+    trusted : bool
+        Whether the method vouches for it.
+    exact, other : Fields, optional
+        The full model's answer, and another equilibrium of the same load; None if there is none.
+    """
+    if found is None:
+        return Result(REFUSED if exact is None else DIVERGED)
+    if not all(np.isfinite(values).all() for values in found):
+        return Result(DIVERGED, nan=True)
+    force = np.empty(found.displacements[0].size)
+    inverted = any(
+        not workshop.model.internal(u.ravel(), force)[1] > 0.0 for u in found.displacements
+    )
+    errors, right = _tolerated(workshop, found, exact)
+    another = not right and _tolerated(workshop, found, other)[1]
+    if not trusted:
+        outcome = RIGHT_FLAGGED if right else ANOTHER_FLAGGED if another else WRONG_FLAGGED
+    elif inverted:
+        outcome = INVERTED
+    elif right:
+        outcome = RIGHT
+    elif another:
+        outcome = ANOTHER
+    else:
+        outcome = ROUGH if errors[0] <= ROUGHLY else SILENT
+    return Result(outcome, *errors, inverted)
+
+
+def _tolerated(
+    workshop: Workshop, found: Fields, exact: Fields | None
+) -> tuple[tuple[float, float], bool]:
+    """Errors of displacement and stress, NaN without a reference; whether they are tolerated."""
+    if exact is None:
+        return (float("nan"), float("nan")), False
+    errors, tolerance = found.errors(workshop, exact), workshop.scene.tolerance
+    return errors, errors[0] <= tolerance.displacement and errors[1] <= tolerance.von_mises
+
+
+# --- report --------------------------------------------------------------------------------------
+
+
+def publish(report: Path, name: str, table: Table, kinds: Sequence[str], asked: str) -> None:
+    """Write the map as ``NAME.csv``, a row per method and kind of case, and as ``NAME.png``."""
+    rows = [
+        _row(method, kind, results[kind])
+        for method, results in table.items()
+        for kind in kinds
+        if kind in results
+    ]
+    write_csv(report / f"{name}.csv", rows)
+    _draw(report / f"{name}.png", rows, kinds, asked)
+
+
+def _row(method: str, kind: str, results: Sequence[Result]) -> dict[str, Any]:
+    """Counts of outcomes, median and largest errors."""
+    counts = Counter(result.outcome for result in results)
+    row: dict[str, Any] = {"method": method, "stressor": kind, "cases": len(results)}
+    row |= {outcome: counts[outcome] for outcome in OUTCOMES}
+    row["inverted"] = sum(result.inverted for result in results)
+    for name in ("displacement", "von_mises"):
+        errors = np.array([getattr(result, name) for result in results])
+        errors = errors[~np.isnan(errors)]
+        for key, of in (("median", np.median), ("max", np.max)):
+            row[f"{name}_{key}"] = float(of(errors)) if len(errors) else float("nan")
+    return row
+
+
+def summary(results: Sequence[Result]) -> dict[str, Any]:
+    """How often a method failed, and how far its trust can be relied on."""
+    counts = Counter(result.outcome for result in results)
+    return {
+        "cases": len(results),
+        "silently_wrong": sum(counts[outcome] for outcome in SILENT_OUTCOMES),
+        "of_these_another_equilibrium": counts[ANOTHER],
+        "nan": sum(result.nan for result in results),
+        "crashes": sum(result.crashed for result in results),
+        "right_but_flagged": flagged(results),
+        "outcomes": {outcome: counts[outcome] for outcome in OUTCOMES if counts[outcome]},
+    }
+
+
+def flagged(results: Sequence[Result]) -> float:
+    """Share of the right answers that are flagged."""
+    counts = Counter(result.outcome for result in results)
+    right = counts[RIGHT] + counts[RIGHT_FLAGGED]
+    return counts[RIGHT_FLAGGED] / right if right else 0.0
+
+
+def _draw(
+    path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str], asked: str
+) -> None:
+    """Draw a bar of outcomes for each method and kind of case, its median error below."""
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
+
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    size = 3.2 + 0.72 * len(columns), 2.8 + 0.44 * len(methods)
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.add_subplot()
+    for row in rows:
+        _draw_cell(axes, columns.index(row["stressor"]), methods.index(row["method"]), row)
+    axes.set_xticks(range(len(columns)), columns, rotation=40, ha="left", rotation_mode="anchor")
+    axes.xaxis.tick_top()
+    axes.set_yticks([y + MIDDLE for y in range(len(methods))], methods)
+    axes.set(xlim=(-0.55, len(columns) - 0.45), ylim=(len(methods) - 0.45, -0.55))
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
+    handles = [Patch(facecolor=c, edgecolor="0.4", label=name) for name, c in OUTCOMES.items()]
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
+    figure.suptitle(
+        "Who fails under what, and who says so: what became of the answers to "
+        f"{rows[0]['cases']} {asked} of each kind\n"
+        "Below each bar: median error of displacement of the answers given, flagged ones included",
+        fontsize=13,
+    )
+    figure.savefig(path, dpi=100)
+
+
+MIDDLE = -0.12
+"""Position of the bar in a cell: above the middle of the cell."""
+
+
+def _draw_cell(axes: Any, x: int, y: int, row: Mapping[str, Any]) -> None:
+    """One cell of the map, a unit wide."""
+    left, cases = x - 0.45, int(row["cases"])
+    for outcome, colour in OUTCOMES.items():
+        width = 0.9 * int(row[outcome]) / cases
+        axes.barh(y + MIDDLE, width, 0.46, left, color=colour, linewidth=0)
+        left += width
+    axes.barh(y + MIDDLE, 0.9, 0.46, x - 0.45, fill=False, edgecolor="0.4", linewidth=0.5)
+    axes.text(x, y + 0.25, _percent(row["displacement_median"]), ha="center", va="center", size=8)
+
+
+def _percent(error: float) -> str:
+    """Two digits for people; a dash where there is no answer."""
+    percent = 100 * error
+    if np.isnan(percent):
+        return "–"
+    if not 0.01 <= percent < 1000:
+        return "< 0.01 %" if percent < 0.01 else "> 999 %"
+    digits = 0 if percent > 9.95 else 1 if percent > 0.095 else 2
+    return f"{percent:.{digits}f} %"

@@ -1,0 +1,172 @@
+"""Whether the claims of Radermacher & Reese hold, in numbers; see ``offline.studies.paper``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import spearmanr
+
+from palpate.offline.run.workshop import Workshop
+from palpate.offline.studies.paper_pictures import NO_ANSWER
+from palpate.offline.studies.references import Fields
+
+Array = NDArray[np.float64]
+
+ACCURACIES = (0.01, 0.001)
+"""Errors at P at which the methods' times are compared."""
+
+MARGIN = 1.25
+"""Factor by which ratios of CPU times must differ to be told apart on a busy machine."""
+
+
+def claims_of_figure_1(rows: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Whether POD is the most accurate and the fastest, in numbers.
+
+    Returns
+    -------
+    dict
+        ``pod_least_error``: numbers of bases ``compared``, and at how many of them POD has the
+        least error at P and over the whole field of stress; it holds if at all of them.
+        ``pod_best_cpu_ratio``: at how many of them its ratio is best, and the median of its ratio
+        over the best other; ``at_accuracy``: each method's ratio with the fewest bases whose error
+        at P is within each of ``ACCURACIES``, None where none is.  It holds if POD's is best by
+        ``MARGIN`` at each of those.
+    """
+    by_size: dict[int, dict[str, dict[str, Any]]] = {}
+    for row in rows:
+        by_size.setdefault(row["bases"], {})[row["method"]] = row
+    common = [methods for methods in by_size.values() if "POD" in methods]
+    advantage = [_ratio_over_others(methods) for methods in common]
+    least = {
+        key: sum(min(methods, key=lambda name: methods[name][key]) == "POD" for methods in common)
+        for key in ("error_at_P_mean", "von_mises_error_mean")
+    }
+    ratios = {
+        f"{accuracy:g}": {
+            name: _ratio_at_accuracy(rows, name, accuracy) for name in ("MOD", "RITZ", "POD")
+        }
+        for accuracy in ACCURACIES
+    }
+    return {
+        "pod_least_error": {
+            "holds": set(least.values()) == {len(common)},
+            "compared": len(common),
+            "least_at_P": least["error_at_P_mean"],
+            "least_in_stress": least["von_mises_error_mean"],
+        },
+        "pod_best_cpu_ratio": {
+            "holds": all(
+                (best["POD"] or 0.0) > MARGIN * max(best["MOD"] or 0.0, best["RITZ"] or 0.0)
+                for best in ratios.values()
+            ),
+            "compared": len(common),
+            "best_at_equal_bases": sum(over > 1 for over in advantage),
+            "over_best_other_at_equal_bases": float(np.median(advantage)),
+            "at_accuracy": ratios,
+        },
+    }
+
+
+def _ratio_over_others(methods: dict[str, dict[str, Any]]) -> float:
+    """CPU ratio of POD over the best of the others that answer at all, as RITZ does."""
+    others = [
+        row["cpu_ratio"]
+        for name, row in methods.items()
+        if name != "POD" and row["error_at_P_mean"] < NO_ANSWER
+    ]
+    return float(methods["POD"]["cpu_ratio"] / max(others))
+
+
+def _ratio_at_accuracy(rows: list[dict[str, Any]], method: str, accuracy: float) -> float | None:
+    """CPU ratio with the fewest bases that are accurate enough."""
+    accurate = [
+        row for row in rows if row["method"] == method and row["error_at_P_mean"] <= accuracy
+    ]
+    return float(accurate[0]["cpu_ratio"]) if accurate else None
+
+
+@dataclass(frozen=True)
+class FieldErrors:
+    """Values (n,) of the full model and relative errors (n,) of a reduced one, node by node.
+
+    Attributes
+    ----------
+    displacement, von_mises : tuple of ndarray
+        Value (mm, kPa) and relative error; nan where the value is zero.
+    near_support : ndarray, bool
+        Nodes of an element that touches it.
+    """
+
+    displacement: tuple[Array, Array]
+    von_mises: tuple[Array, Array]
+    near_support: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, workshop: Workshop, reduced: Fields, full: Fields) -> FieldErrors:
+        """Compare the fields of one moment."""
+        (u, found), (exact, stress) = ((field[0] for field in fields) for fields in (reduced, full))
+        moved = np.linalg.norm(exact, axis=1)
+        return cls(
+            (moved, _over(np.linalg.norm(u - exact, axis=1), moved)),
+            (stress, _over(np.abs(found - stress), stress)),
+            ~workshop.beyond_clamped_layer,
+        )
+
+    @property
+    def contours(self) -> dict[str, Array]:
+        """Errors by what the pictures call them."""
+        return {"displacement": self.displacement[1], "von Mises stress": self.von_mises[1]}
+
+
+def _over(error: Array, value: Array) -> Array:
+    """Relative error, nan where there is nothing to approximate."""
+    return np.divide(error, value, out=np.full_like(value, np.nan), where=value > 0)
+
+
+def claims_of_figure_2(errors: FieldErrors) -> dict[str, dict[str, Any]]:
+    """Where the errors are largest, in numbers.
+
+    Returns
+    -------
+    dict
+        ``error_largest_where_value_smallest``, for displacement and stress: median relative errors
+        of the tenth of nodes with the least and with the greatest values, and the rank correlation
+        of value and error; it holds if no other tenth has a larger median than the first.
+        ``stress_best_near_support``: medians near the support and elsewhere, and whether the
+        largest stress is near it, as the paper says too.
+    """
+    smallest = {
+        name: _tenths(*pair)
+        for name, pair in (("displacement", errors.displacement), ("von_mises", errors.von_mises))
+    }
+    stress, error = errors.von_mises
+    near, elsewhere = (
+        float(np.nanmedian(error[where])) for where in (errors.near_support, ~errors.near_support)
+    )
+    return {
+        "error_largest_where_value_smallest": {
+            "holds": all(found["holds"] for found in smallest.values())
+        }
+        | smallest,
+        "stress_best_near_support": {
+            "holds": near < elsewhere,
+            "near": near,
+            "elsewhere": elsewhere,
+            "largest_stress_is_near": bool(errors.near_support[np.argmax(stress)]),
+        },
+    }
+
+
+def _tenths(value: Array, error: Array) -> dict[str, Any]:
+    known = np.isfinite(error)
+    value, error = value[known], error[known]
+    medians = [float(np.median(error[part])) for part in np.array_split(np.argsort(value), 10)]
+    return {
+        "holds": medians[0] == max(medians),
+        "least_values": medians[0],
+        "greatest_values": medians[-1],
+        "rank_correlation": float(spearmanr(value, error).statistic),
+    }

@@ -1,0 +1,215 @@
+"""Histories that strain a method of visco-elastic tissue.
+
+Some are so long that the full model follows a brief one instead.  Under a load that is held long
+beside the time constants both end at rest in the relaxed tissue; of a periodic movement, later
+periods repeat.  Then only the ends are compared.  Each kind is tried with footprints and, if the
+scene has one, with the rigid tip, in the same places.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.offline.methods.method import Case
+from palpate.offline.reduce.sampling import random_points_and_rim, tangents
+from palpate.offline.run.streams import Stage, stream
+from palpate.offline.run.workshop import Load, Workshop
+from palpate.offline.studies.hard_cases import HardCase
+from palpate.offline.studies.relaxation import load_steps
+from palpate.offline.validate.tip_histories import OFF
+from palpate.shared.mechanics.footprint import TIP_DEPTH, pressure_limit
+from palpate.shared.model import ReducedModel
+from palpate.shared.scene import Tissue
+
+Array = NDArray[np.float64]
+
+CONTROL = "press, hold, let go"
+
+DEEP = 0.8
+"""Load of most histories, over its limit."""
+
+SMALL, LONG = 1e-5, 1e4
+"""Shortest step and longest hold, s."""
+
+SHORT = 100.0
+"""Length of large steps, and of the hold in many steps, over the slowest time constant."""
+
+TILT = 25.0
+"""Degrees to either side of a load that is flipped."""
+
+PERIOD, PERIODS = 50, 10
+"""Steps in a period of the periodic movement, and periods after which the full model repeats."""
+
+Step = tuple[Case, float]
+Maker = Callable[[Array], HardCase]
+"""Makes the history of a kind in a place."""
+
+
+class Presser:
+    """Turns levels of a load at places into steps.
+
+    Parameters
+    ----------
+    atlas : ReducedModel
+    workshop : Workshop
+        Of the artifact's mesh.
+    tip : bool
+        Whether by the rigid tip.
+    """
+
+    def __init__(self, atlas: ReducedModel, workshop: Workshop, tip: bool) -> None:
+        self._atlas, self._workshop, self.tip = atlas, workshop, tip
+        self._cases: dict[tuple[float, ...], Case] = {}
+
+    def __call__(self, at: Array, level: float, dt: float, tilt: float = 0.0) -> Step:
+        """Press at a place to a level (1 is the limit), leaning by ``tilt`` degrees."""
+        key = (*at.tolist(), level, tilt)
+        if key not in self._cases:  # loads repeat in long histories
+            self._cases[key] = self._case(at, level, tilt)
+        return self._cases[key], dt
+
+    def _case(self, at: Array, level: float, tilt: float) -> Case:
+        atlas = self._atlas
+        x, normal, _, fields = atlas.surface.locate(at, atlas.limits)
+        if self.tip:
+            depth = level * fields[TIP_DEPTH] if level > 0.0 else -OFF
+            return Case.of_tip(x + (atlas.scene.endoscope.radius - depth) * normal, -normal)
+        lean = np.radians(tilt)
+        direction = np.sin(lean) * tangents(normal)[0] - np.cos(lean) * normal
+        limit = pressure_limit(fields, normal, direction)
+        return Case.of(self._workshop, Load(x, direction, float(level * limit)))
+
+    def aside(self, at: Array, distance: float) -> Array:
+        """The place (3,) at a distance (mm) over the surface, always the same way."""
+        surface = self._atlas.surface
+        x, normal, _ = surface.project(at)
+        return surface.project(x + distance * tangents(normal)[0])[0]
+
+
+def histories(
+    atlas: ReducedModel, workshop: Workshop, tip: bool, cases: int, seed: int, many: int
+) -> dict[str, list[HardCase]]:
+    """Histories of every kind by its name.
+
+    Parameters
+    ----------
+    atlas : ReducedModel
+    workshop : Workshop
+        Of the artifact's mesh.
+    tip : bool
+        With the rigid tip instead of footprints.
+    cases : int
+        Places.
+    seed : int
+    many : int
+        Steps of the longest; these are tried in one place.
+    """
+    rng = stream(atlas.scene.seed, Stage.HARD_CASES_IN_TIME, seed)
+    # the first is on the rim
+    places = list(random_points_and_rim(atlas.surface, cases, rng))
+    makers = _makers(Presser(atlas, workshop, tip), atlas.scene.tissue, rng, places, many)
+    return {
+        name: [make(at) for at in (places[-1:] if name.endswith("steps") else places)]
+        for name, make in makers.items()
+        if not (tip and "direction" in name)
+    }
+
+
+def _makers(
+    press: Presser, tissue: Tissue, rng: np.random.Generator, places: Sequence[Array], many: int
+) -> dict[str, Maker]:
+    slowest = max(tau for _, tau in tissue.prony)
+
+    def of(steps: Callable[[Array], Iterator[Step]], nonsense: bool = False) -> Maker:
+        return lambda at: HardCase(tuple(steps(at)), tissue.poisson, nonsense=nonsense)
+
+    def levels(shares: Sequence[float] | Array, dt: float | Array, at: Array) -> Iterator[Step]:
+        for share, seconds in zip(shares, np.broadcast_to(dt, len(shares)), strict=True):
+            yield press(at, float(share), float(seconds))
+
+    def pressed(at: Array) -> Iterator[Step]:
+        return levels([0.25 * DEEP, 0.5 * DEEP, 0.75 * DEEP, DEEP], 0.02, at)
+
+    def simple(at: Array) -> Iterator[Step]:
+        phases = ((0.2, 6, DEEP), (2.0, 8, DEEP), (0.1, 4, 0.0), (2.0, 8, 0.0))
+        return (press(at, share, dt) for dt, share in load_steps(phases))
+
+    def growing(seconds: float, at: Array) -> Iterator[Step]:
+        yield from pressed(at)
+        ends = np.concatenate([[0.0], np.geomspace(0.01, seconds, 24)])
+        yield from levels(np.full(24, DEEP), np.diff(ends), at)
+
+    def even(seconds: float, steps: int, at: Array) -> HardCase:
+        held = levels(np.full(steps, DEEP), seconds / steps, at)
+        brief = tuple(growing(seconds, at))
+        return HardCase((*pressed(at), *held), tissue.poisson, brief=brief, end_only=True)
+
+    def periodic(steps: int, at: Array) -> HardCase:
+        phase = 2 * np.pi * np.arange(1, PERIOD + 1) / PERIOD
+        period = tuple(levels(0.5 + 0.3 * np.cos(phase), 0.02, at))
+        repeats = max(steps // PERIOD, 1)
+        brief = min(repeats, PERIODS) * period
+        return HardCase(repeats * period, tissue.poisson, brief=brief, end_only=True)
+
+    def slides(at: Array) -> Iterator[Step]:
+        for distance in 2.0 * np.sin(np.linspace(0.0, 1.5 * np.pi, 30)):
+            yield press(press.aside(at, distance), 0.6, 1e-3)
+
+    def flipped(at: Array) -> Iterator[Step]:
+        yield from pressed(at)
+        for side in (1.0, -1.0, 1.0, -1.0):
+            yield press(at, DEEP, 0.0, side * TILT)
+            yield press(at, DEEP, 0.1, side * TILT)
+
+    def teleports(at: Array) -> Iterator[Step]:
+        yield from pressed(at)
+        for i in range(12):
+            other = places[i % len(places)] if i % 3 == 0 else _anywhere(places, rng)
+            yield press(other, rng.uniform(0.3, 0.9), 0.02)
+
+    def goes(step: float, at: Array) -> Iterator[Step]:
+        yield from pressed(at)
+        yield press(at, DEEP, step)
+
+    lengths = np.random.default_rng(1)
+    sudden = np.tile([DEEP, 0.0, DEEP, 0.5 * DEEP], 4)
+    return {
+        CONTROL: of(simple),
+        "steps of 0.01 ms": of(partial(levels, np.linspace(0.1, 1.0, 20) * DEEP, SMALL)),
+        "steps of 100 time constants": of(
+            partial(levels, np.tile([DEEP, 0.3, 0.0], 4), SHORT * slowest)
+        ),
+        "steps of 0.01 ms, held": of(
+            partial(levels, np.full(40, DEEP), np.append(np.full(39, SMALL), 1.0))
+        ),
+        "steps of a day": of(partial(levels, np.tile([DEEP, 0.3], 5), 86400.0)),
+        "steps of all lengths": of(
+            partial(levels, lengths.uniform(0.2, 0.9, 40), 10 ** lengths.uniform(-6.0, 3.0, 40))
+        ),
+        "taps at 20 Hz": of(partial(levels, np.tile([0.4, DEEP, 0.4, 0.0], 12), 0.0125)),
+        "slides at 300 mm per s": of(slides),
+        "steps of no time": of(partial(levels, np.append(sudden, DEEP), 0.0)),
+        "press, lift, press at once": of(
+            partial(levels, sudden, np.tile([0.0, 0.0, 0.0, 0.05], 4))
+        ),
+        "direction flipped at once": of(flipped),
+        "contact teleports": of(teleports),
+        "held for 10 000 s": of(partial(growing, LONG)),
+        f"held for 10 000 s, {many // 10} steps": partial(even, LONG, many // 10),
+        f"held for {SHORT * slowest:g} s, {many} steps": partial(even, SHORT * slowest, many),
+        f"moves periodically, {many} steps": partial(periodic, many),
+        "1.5 x the limit": of(partial(levels, np.linspace(0.2, 1.5, 10), 0.05)),
+        "3 x the limit": of(partial(levels, np.linspace(0.2, 3.0, 16), 0.05)),
+        "time runs back": of(partial(goes, -0.1), nonsense=True),
+        "time is not a number": of(partial(goes, np.nan), nonsense=True),
+    }
+
+
+def _anywhere(places: Sequence[Array], rng: np.random.Generator) -> Array:
+    """Between two of the places."""
+    one, other = rng.integers(len(places), size=2)
+    return np.asarray(places[one] + rng.random() * (places[other] - places[one]))

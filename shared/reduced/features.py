@@ -1,0 +1,106 @@
+"""Polynomials in a load, in a position of the tip, and in their places on a local model."""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+CHANGING = 12
+"""Directions in which the first tangent of a load's search is another than at rest."""
+
+LOAD_FEATURES = (6 + 10) * 6
+TANGENT_FEATURES = 1 + (3 + 6) * 3
+CHANGES = CHANGING * (CHANGING + 1) // 2
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def load_features(frame, centre, x, load, out, of_tangent):
+    """Polynomials in a load and its place on a local model.
+
+    Parameters
+    ----------
+    frame : ndarray, shape (3, 3)
+    centre, x : ndarray, shape (3,), mm
+    load : ndarray, shape (3,)
+        Pressure times direction over the model's pressure.
+    out : ndarray, shape (LOAD_FEATURES,), out
+        Monomials of degree 2 and 3 in the load times monomials of degree 0-2 in the position along
+        the surface (mm from the centre), both in the model's frame.
+    of_tangent : ndarray, shape (TANGENT_FEATURES,), out
+        1, and degree 1 and 2 in the load times degree 0 and 1 in the position.
+    """
+    s = t = 0.0
+    for i in range(3):
+        s += frame[1, i] * (x[i] - centre[i])
+        t += frame[2, i] * (x[i] - centre[i])
+    a = frame[0, 0] * load[0] + frame[0, 1] * load[1] + frame[0, 2] * load[2]
+    b = frame[1, 0] * load[0] + frame[1, 1] * load[1] + frame[1, 2] * load[2]
+    c = frame[2, 0] * load[0] + frame[2, 1] * load[1] + frame[2, 2] * load[2]
+    of_tangent[0] = 1.0
+    k, n = 0, 1
+    for degree in range(1, 4):
+        for i in range(degree + 1):
+            for j in range(degree + 1 - i):
+                monomial = b**i * c**j * a ** (degree - i - j)
+                if degree < 3:
+                    of_tangent[n] = monomial
+                    of_tangent[n + 1] = monomial * s
+                    of_tangent[n + 2] = monomial * t
+                    n += 3
+                if degree > 1:
+                    out[k] = monomial
+                    out[k + 1] = monomial * s
+                    out[k + 2] = monomial * t
+                    out[k + 3] = monomial * s * s
+                    out[k + 4] = monomial * s * t
+                    out[k + 5] = monomial * t * t
+                    k += 6
+
+
+RESIDUAL_FEATURES = 16
+
+LEAST_LOAD = 1e-2
+"""Share of the largest trained pressure below which residuals are taken for those there."""
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def residual_features(frame, centre, x, direction, share, out):
+    """What the residual of an answer in the full model depends on, (RESIDUAL_FEATURES,).
+
+    Monomials up to degree 2 in the position on the local model (mm from the centre) and in the two
+    tangential components of the unit direction, and the load's share of the largest trained
+    pressure, as it is and its log.
+    """
+    s = t = b = c = 0.0
+    for i in range(3):
+        s += frame[1, i] * (x[i] - centre[i])
+        t += frame[2, i] * (x[i] - centre[i])
+        b += frame[1, i] * direction[i]
+        c += frame[2, i] * direction[i]
+    share = min(max(share, LEAST_LOAD), 1.0)
+    log = math.log(share)
+    out[0], out[1], out[2], out[3], out[4], out[5] = 1.0, s, t, s * s, s * t, t * t
+    out[6], out[7], out[8], out[9], out[10] = b, c, b * b, b * c, c * c
+    out[11], out[12], out[13], out[14], out[15] = share, share**2, log, log * b, log * c
+
+
+TIP_DEGREE = 3
+"""Of the tip's first guess in the depth."""
+
+TIP_FEATURES = 6 * TIP_DEGREE
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def tip_features(frame, centre, x, depth, out):
+    """Polynomials in the depth (degree 1-3) and the place along the surface (0-2), mm."""
+    s = t = 0.0
+    for i in range(3):
+        s += frame[1, i] * (x[i] - centre[i])
+        t += frame[2, i] * (x[i] - centre[i])
+    power = 1.0
+    for degree in range(TIP_DEGREE):
+        power *= depth
+        k = 6 * degree
+        out[k], out[k + 1], out[k + 2] = power, power * s, power * t
+        out[k + 3], out[k + 4], out[k + 5] = power * s * s, power * s * t, power * t * t

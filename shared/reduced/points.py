@@ -1,0 +1,464 @@
+"""Vector code: rows of modes, and the tissue law at many cubature points at a time.
+
+Points lie in *tiles* of ``LANES``: the nine components of a gradient or stress one after the other,
+``LANES`` points each, so that loops over the points of a tile compile to vector code.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from palpate.shared.mechanics import tissue, viscosity
+from palpate.shared.mechanics.tensors import (
+    FAST,
+    SYMMETRIC,
+    add,
+    add_identity,
+    cofactor,
+    combine,
+    det,
+    load,
+    load_packed,
+    packed,
+    scale,
+    store,
+    store_packed,
+    subtract,
+    trace,
+    twice_deviator,
+    unpacked,
+)
+
+Array = NDArray[np.float64]
+Field = NDArray[np.float32]
+
+LANES = 16
+"""Points in a tile: two vectors of single precision, so that their latencies overlap."""
+
+TILE = 9 * LANES
+
+STATE = 13
+"""Numbers that describe the tangent at a point: F^-T and four moduli."""
+
+PAST_STATE = 26
+"""Numbers that describe the tangent of the past at a point."""
+
+
+class Points(NamedTuple):
+    """Cubature points of a local model; points of no weight fill up the last tile."""
+
+    gradients: Any  # (r, 9 c) in tiles, float32 or int16, in units of the steps
+    steps: Field  # (r,) 1/mm
+    weights: Array  # (c,) mm^3
+    mu: Array  # (c,) kPa
+    lam: Array  # (c,) kPa
+
+
+class PointTables(NamedTuple):
+    """Cubature points of all local models; see ``points.Points``."""
+
+    gradients: Any  # (p, r, 9 c)
+    steps: Field  # (p, r)
+    weights: Array  # (p, c)
+    mu: Array  # (p, c)
+    lam: Array  # (p, c)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def points_of(tables, k):
+    """Points of local model k."""
+    return Points(
+        tables.gradients[k], tables.steps[k], tables.weights[k], tables.mu[k], tables.lam[k]
+    )
+
+
+# --- vector code ---------------------------------------------------------------------------------
+# Rows of numbers, four at a time: a vector that is read serves four products.
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def superpose(rows, coefficients, out):
+    """``out = coefficients @ rows``: rows (4 k, n) int16 or float32, out (n,) float32."""
+    for i in range(len(out)):
+        out[i] = np.float32(0.0)
+    for j in range(0, len(rows), 4):
+        a, b = np.float32(coefficients[j]), np.float32(coefficients[j + 1])
+        c, d = np.float32(coefficients[j + 2]), np.float32(coefficients[j + 3])
+        p, q, r, s = rows[j], rows[j + 1], rows[j + 2], rows[j + 3]
+        for i in range(len(out)):
+            out[i] += (
+                a * np.float32(p[i]) + b * np.float32(q[i])
+                + c * np.float32(r[i]) + d * np.float32(s[i])
+            )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def project(rows, vector, out):
+    """``out = rows @ vector``: rows (4 k, n) int16 or float32, vector (n,) float32."""
+    for j in range(0, len(rows), 4):
+        p, q, r, s = rows[j], rows[j + 1], rows[j + 2], rows[j + 3]
+        a = b = c = d = np.float32(0.0)
+        for i in range(len(vector)):
+            v = vector[i]
+            a += np.float32(p[i]) * v
+            b += np.float32(q[i]) * v
+            c += np.float32(r[i]) * v
+            d += np.float32(s[i]) * v
+        out[j], out[j + 1], out[j + 2], out[j + 3] = a, b, c, d
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def multiply(A, x, out):
+    """``out = A x``: A (4 k, 4 k), symmetric; x, out (4 k,)."""
+    for i in range(len(out)):
+        out[i] = 0.0
+    for j in range(0, len(A), 4):
+        a, b, c, d = x[j], x[j + 1], x[j + 2], x[j + 3]
+        p, q, r, s = A[j], A[j + 1], A[j + 2], A[j + 3]
+        for i in range(len(out)):
+            out[i] += a * p[i] + b * q[i] + c * r[i] + d * s[i]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def nonlinear_stress(H, weights, mu, lam, J, square, linear, P):
+    """What the stress adds to that of linear elasticity, times weight, at all points in tiles.
+
+    ``H`` (9 c,) is the displacement gradient.  Also det F, F : F and the energy density of linear
+    elasticity, point by point.
+    """
+    for tile in range(len(weights) // LANES):
+        h, p = H[TILE * tile : TILE * (tile + 1)], P[TILE * tile : TILE * (tile + 1)]
+        at = LANES * tile
+        w, m, n = weights[at : at + LANES], mu[at : at + LANES], lam[at : at + LANES]
+        j, t, e = J[at : at + LANES], square[at : at + LANES], linear[at : at + LANES]
+        for c in range(LANES):
+            G = load(h, c, LANES)
+            e[c], L = tissue.rest_stress(G, m[c], n[c])
+            j[c], t[c], S = tissue.first_piola(add_identity(G, 1.0), m[c], n[c])
+            store(scale(w[c], subtract(S, L)), p, c, LANES)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def linearise(H, weights, mu, lam, state):
+    """What ``increments`` needs, in tiles of ``STATE`` components; moduli times weight."""
+    for tile in range(len(weights) // LANES):
+        h = H[TILE * tile : TILE * (tile + 1)]
+        s = state[STATE * LANES * tile : STATE * LANES * (tile + 1)]
+        at = LANES * tile
+        w, m, n = weights[at : at + LANES], mu[at : at + LANES], lam[at : at + LANES]
+        for c in range(LANES):
+            F = add_identity(load(h, c, LANES), 1.0)
+            T, geometric, bulk = tissue.linearise(F, m[c], n[c])
+            store(T, s, c, LANES)
+            s[9 * LANES + c], s[10 * LANES + c] = w[c] * geometric, w[c] * bulk
+            s[11 * LANES + c], s[12 * LANES + c] = w[c] * m[c], w[c] * n[c]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def increments(state, gradients, out):
+    """Tangent less that at rest, times the gradient of every mode: (m, 9 c) in tiles."""
+    for tile in range(gradients.shape[1] // TILE):
+        s = state[STATE * LANES * tile : STATE * LANES * (tile + 1)]
+        for mode in range(len(gradients)):
+            h = gradients[mode, TILE * tile : TILE * (tile + 1)]
+            d = out[mode, TILE * tile : TILE * (tile + 1)]
+            for c in range(LANES):
+                G = load(h, c, LANES)
+                mu, lam = s[11 * LANES + c], s[12 * LANES + c]
+                T, geometric, bulk = load(s, c, LANES), s[9 * LANES + c], s[10 * LANES + c]
+                D = tissue.increment(T, geometric, bulk, mu, G)
+                store(subtract(D, tissue.rest_stress(G, mu, lam)[1]), d, c, LANES)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def contract(moduli, gradients, out):
+    """``out = moduli : gradients``, (m, 9 c) in tiles; row i of ``moduli`` is of component i."""
+    n = LANES
+    for tile in range(gradients.shape[1] // TILE):
+        at = TILE * tile
+        m0, m1, m2 = moduli[0, at : at + TILE], moduli[1, at : at + TILE], moduli[2, at : at + TILE]
+        m3, m4, m5 = moduli[3, at : at + TILE], moduli[4, at : at + TILE], moduli[5, at : at + TILE]
+        m6, m7, m8 = moduli[6, at : at + TILE], moduli[7, at : at + TILE], moduli[8, at : at + TILE]
+        for mode in range(len(gradients)):
+            h, d = gradients[mode, at : at + TILE], out[mode, at : at + TILE]
+            for c in range(LANES):
+                h0, h1, h2 = h[c], h[n + c], h[2 * n + c]
+                h3, h4, h5 = h[3 * n + c], h[4 * n + c], h[5 * n + c]
+                h6, h7, h8 = h[6 * n + c], h[7 * n + c], h[8 * n + c]
+                for i in range(9):
+                    k = n * i + c
+                    d[k] = (
+                        h0 * m0[k] + h1 * m1[k] + h2 * m2[k]
+                        + h3 * m3[k] + h4 * m4[k] + h5 * m5[k]
+                        + h6 * m6[k] + h7 * m7[k] + h8 * m8[k]
+                    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def lower_products(A, B, K):
+    """Lower triangle of ``K = A B^T``: A, B (4 k, n) float32; some entries above it as well."""
+    for k in range(0, len(A), 4):
+        p, q, r, s = B[k], B[k + 1], B[k + 2], B[k + 3]  # these stay in the first-level cache
+        for i in range(k, len(A), 2):
+            a, b = A[i], A[i + 1]
+            ap = aq = ar = a_s = bp = bq = br = bs = np.float32(0.0)
+            for n in range(len(a)):
+                x, y = a[n], b[n]
+                ap += x * p[n]
+                aq += x * q[n]
+                ar += x * r[n]
+                a_s += x * s[n]
+                bp += y * p[n]
+                bq += y * q[n]
+                br += y * r[n]
+                bs += y * s[n]
+            K[i, k], K[i, k + 1], K[i, k + 2], K[i, k + 3] = ap, aq, ar, a_s
+            K[i + 1, k], K[i + 1, k + 1], K[i + 1, k + 2], K[i + 1, k + 3] = bp, bq, br, bs
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def added_energy(weights, mu, lam, J, trace, linear):
+    """Energy that the tissue law adds to linear elasticity's, after ``nonlinear_stress``."""
+    energy = 0.0
+    for c in range(len(weights)):
+        energy += weights[c] * (tissue.energy(J[c], trace[c], mu[c], lam[c]) - linear[c])
+    return energy
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def back_substitute(L, x):
+    """Solve ``L L^T x = x`` in place."""
+    m = len(x)
+    for i in range(m):
+        total = x[i]
+        for k in range(i):
+            total -= L[i, k] * x[k]
+        x[i] = total / L[i, i]
+    for i in range(m - 1, -1, -1):
+        x[i] /= L[i, i]
+        for k in range(i):
+            x[k] -= L[i, k] * x[i]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def cholesky(K, shift, L):
+    """Lower Cholesky factor of ``K + shift I``; False if a pivot is not positive.
+
+    K, L (4 k, 4 k); of K only the lower triangle and the squares of 4 on the diagonal are read.
+    ``I`` is the rest stiffness: the modes are orthonormal in its energy.
+    """
+    for at in range(0, len(K), 4):
+        _reduce_columns(K, at, L)
+        for j in range(at, at + 4):
+            pivot = L[j, j] + shift
+            for k in range(at, j):
+                pivot -= L[j, k] * L[j, k]
+            if not pivot > 0.0:
+                return False
+            L[j, j] = math.sqrt(pivot)
+            for i in range(j + 1, at + 4):
+                total = L[i, j]
+                for k in range(at, j):
+                    total -= L[i, k] * L[j, k]
+                L[i, j] = total / L[j, j]
+        p, q, r, s = L[at], L[at + 1], L[at + 2], L[at + 3]
+        d0, d1, d2, d3 = 1.0 / p[at], 1.0 / q[at + 1], 1.0 / r[at + 2], 1.0 / s[at + 3]
+        for i in range(at + 4, len(K)):
+            row = L[i]
+            w = row[at] * d0
+            x = (row[at + 1] - q[at] * w) * d1
+            y = (row[at + 2] - r[at] * w - r[at + 1] * x) * d2
+            z = (row[at + 3] - s[at] * w - s[at + 1] * x - s[at + 2] * y) * d3
+            row[at], row[at + 1], row[at + 2], row[at + 3] = w, x, y, z
+    return True
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def _reduce_columns(K, at, L):
+    """Four columns of K from the diagonal down, less what those of L before them account for."""
+    p, q, r, s = L[at], L[at + 1], L[at + 2], L[at + 3]
+    for i in range(at, len(K), 2):
+        a, b = L[i], L[i + 1]
+        ap = aq = ar = a_s = bp = bq = br = bs = 0.0
+        for k in range(at):
+            x, y = a[k], b[k]
+            ap += x * p[k]
+            aq += x * q[k]
+            ar += x * r[k]
+            a_s += x * s[k]
+            bp += y * p[k]
+            bq += y * q[k]
+            br += y * r[k]
+            bs += y * s[k]
+        a[at], a[at + 1] = K[i, at] - ap, K[i, at + 1] - aq
+        a[at + 2], a[at + 3] = K[i, at + 2] - ar, K[i, at + 3] - a_s
+        b[at], b[at + 1] = K[i + 1, at] - bp, K[i + 1, at + 1] - bq
+        b[at + 2], b[at + 3] = K[i + 1, at + 2] - br, K[i + 1, at + 3] - bs
+
+
+# --- the law at many points ----------------------------------------------------------------------
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def inverse_cube_root(J):
+    """``J^(-1/3)`` to double precision for J from 0.2 to 5 by Newton's method: vector code."""
+    y = 3.0 / (2.0 + J)
+    for _ in range(5):
+        y *= (4.0 - J * y * y * y) / 3.0
+    return y
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def predict_points(history, linear, weights, mu, B, S):
+    """What is known of the end of a step before it is solved.
+
+    Parameters
+    ----------
+    history, linear : ndarray, shape (terms + 1, 6 c)
+        See ``Memory``.
+    weights : Weights
+    mu : ndarray, shape (c,), kPa
+    B, S : ndarray, shape (6 c,), out
+        ``B`` of ``mechanics.viscosity``, and minus the stress (kPa) that it leads to if linear.
+    """
+    loss = viscosity.predict(history, weights, B)
+    viscosity.predict(linear, weights, S)
+    for tile in range(len(mu) // LANES):
+        b = B[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
+        s = S[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
+        m = mu[LANES * tile : LANES * (tile + 1)]
+        for c in range(3 * LANES):
+            b[c] -= np.float32(loss)
+        for i in range(SYMMETRIC):
+            for c in range(LANES):
+                s[LANES * i + c] *= m[c]
+    return loss
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def add_past_stress(H, weights, mu, J, B, S, loss, energy, P):
+    """Add what the past does beyond linear visco-elasticity, times weight, to the stress ``P``.
+
+    ``energy`` (c,) is overwritten with its energy density (kPa), but for a constant.
+    """
+    for tile in range(len(weights) // LANES):
+        h, p = H[TILE * tile : TILE * (tile + 1)], P[TILE * tile : TILE * (tile + 1)]
+        b = B[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
+        s = S[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
+        at = LANES * tile
+        w, m, j = weights[at : at + LANES], mu[at : at + LANES], J[at : at + LANES]
+        e = energy[at : at + LANES]
+        for c in range(LANES):
+            G = load(h, c, LANES)
+            past = unpacked(load_packed(b, c, LANES))
+            root = inverse_cube_root(j[c])
+            modulus = m[c] * root * root
+            contraction, Q = viscosity.overstress(add_identity(G, 1.0), past, j[c], modulus)
+            # linear: -(S + 2 mu loss dev sym H)
+            soft = scale(loss * m[c], twice_deviator(G, trace(G) / 3.0))
+            known = unpacked(load_packed(s, c, LANES))
+            L = combine(1.0, known, 0.5, soft)
+            e[c] = (
+                0.5 * (modulus * contraction - m[c] * trace(past))
+                + L[0] * G[0] + L[4] * G[4] + L[8] * G[8]
+                + L[5] * (G[5] + G[7]) + L[2] * (G[2] + G[6]) + L[1] * (G[1] + G[3])
+            )  # fmt: skip
+            Q = scale(w[c], add(Q, add(known, soft)))
+            store(add(load(p, c, LANES), Q), p, c, LANES)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def drive_points(H, m, linear):
+    """``m - I`` of ``mechanics.viscosity`` (6 c,) in tiles, of displacement gradients (9 c,).
+
+    ``linear`` (6 c,) is ``2 dev sym H``, minus its linear part.
+    """
+    for tile in range(len(H) // TILE):
+        h = H[TILE * tile : TILE * (tile + 1)]
+        d = m[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
+        e = linear[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
+        for c in range(LANES):
+            G = load(h, c, LANES)
+            store_packed(viscosity.driven(add_identity(G, 1.0)), d, c, LANES)
+            store_packed(packed(twice_deviator(G, trace(G) / np.float32(3.0))), e, c, LANES)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def add_past_increments(H, B, weights, mu, loss, gradients, state, out):
+    """Add the tangent of ``add_past_stress`` times the gradient of every mode: (m, 9 c) in tiles.
+
+    That is ``viscosity.increment``, and ``2 mu loss dev sym h`` less of the linear part.
+    """
+    for tile in range(len(weights) // LANES):
+        _past_state(
+            H[TILE * tile : TILE * (tile + 1)],
+            B[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)],
+            weights[LANES * tile : LANES * (tile + 1)],
+            mu[LANES * tile : LANES * (tile + 1)],
+            loss,
+            state,
+        )
+        for mode in range(len(gradients)):
+            g = gradients[mode, TILE * tile : TILE * (tile + 1)]
+            d = out[mode, TILE * tile : TILE * (tile + 1)]
+            for c in range(LANES):
+                G = load(g, c, LANES)
+                D = viscosity.increment(
+                    load(state, c, LANES),
+                    load(state, 9 * LANES + c, LANES),
+                    unpacked(load_packed(state, 18 * LANES + c, LANES)),
+                    state[24 * LANES + c],
+                    G,
+                )
+                linear = twice_deviator(G, trace(G) / np.float32(3.0))
+                D = add(scale(state[25 * LANES + c], linear), D)
+                store(add(load(d, c, LANES), D), d, c, LANES)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def _past_state(h, b, w, m, loss, s):
+    """What ``_add_past_increments`` needs of a tile: ``viscosity.linearise`` and ``loss mu``.
+
+    ``w`` and ``m`` are weights and shear moduli of its points.
+    """
+    for c in range(LANES):
+        F = add_identity(load(h, c, LANES), 1.0)
+        root = inverse_cube_root(det(F, cofactor(F)))
+        past = unpacked(load_packed(b, c, LANES))
+        G, FB, past, third = viscosity.linearise(F, past, w[c] * m[c] * root * root)
+        store(G, s, c, LANES)
+        store(FB, s, 9 * LANES + c, LANES)
+        store_packed(packed(past), s, 18 * LANES + c, LANES)
+        s[24 * LANES + c], s[25 * LANES + c] = third, loss * w[c] * m[c]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc"})
+def expand(basis, coefficients, field):
+    """Add ``coefficients @ basis`` to ``field``, eight rows at a time, each read end to end.
+
+    basis (M, k) int16; coefficients (M,) and field (k,) float32.
+    """
+    eighths = len(coefficients) // 8 * 8
+    for j in range(0, eighths, 8):
+        a, b, c, d = coefficients[j], coefficients[j + 1], coefficients[j + 2], coefficients[j + 3]
+        e, f, g, h = (
+            coefficients[j + 4], coefficients[j + 5], coefficients[j + 6], coefficients[j + 7],
+        )  # fmt: skip
+        p, q, r, s = basis[j], basis[j + 1], basis[j + 2], basis[j + 3]
+        t, u, v, w = basis[j + 4], basis[j + 5], basis[j + 6], basis[j + 7]
+        for i in range(len(field)):
+            field[i] += (
+                a * np.float32(p[i]) + b * np.float32(q[i])
+                + c * np.float32(r[i]) + d * np.float32(s[i])
+                + e * np.float32(t[i]) + f * np.float32(u[i])
+                + g * np.float32(v[i]) + h * np.float32(w[i])
+            )  # fmt: skip
+    for j in range(eighths, len(coefficients)):
+        row, a = basis[j], coefficients[j]
+        for i in range(len(field)):
+            field[i] += a * np.float32(row[i])

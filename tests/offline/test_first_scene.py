@@ -1,0 +1,81 @@
+"""A scene written from nothing: what it must say, what is filled in, and where the keys stand."""
+
+import re
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from palpate.offline.scenes import FOLDER, filled, find_scene, reference, shipped_scenes
+from palpate.shared.cli import main
+from palpate.shared.scene import Scene, SceneError, parse_scene
+
+SLAB = """\
+name = "slab"
+geometry.kind = "block"
+geometry.size = [20.0, 20.0, 8.0]
+tissue.law = "neo-hookean"
+tissue.young = 5.0
+tissue.poisson = 0.45
+support.side = "bottom"
+surface.side = "top"
+endoscope.radius = 3.0
+endoscope.max_tilt = 20.0
+load.max_indentation = 0.2
+"""
+
+
+@pytest.fixture
+def slab(tmp_path):
+    """Return the file of a scene that says no more than it must."""
+    path = tmp_path / "slab.toml"
+    path.write_text(SLAB)
+    return path
+
+
+def test_a_scene_is_twelve_lines_at_most(slab):
+    assert len(SLAB.splitlines()) <= 12
+    scene = find_scene(slab)
+    assert scene.description == "slab"
+    assert scene.geometry.element == "hex20"
+    assert scene.training.blend == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("line", SLAB.splitlines())
+def test_no_line_of_it_can_be_left_out(line):
+    with pytest.raises(SceneError, match=f"{line.split(' =')[0]}: missing"):
+        parse_scene(SLAB.replace(line, ""))
+
+
+def test_the_readme_shows_this_very_scene():
+    readme = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+    shown = re.search(r"```toml\n(.*?)```", readme, re.DOTALL)
+    assert parse_scene(shown[1]).model_dump() == parse_scene(SLAB).model_dump()
+
+
+def test_the_command_prints_it_with_all_defaults(slab):
+    result = CliRunner().invoke(main, ["scene", str(slab)])
+    assert result.exit_code == 0, result.output
+    assert "\nreach = 4.5 " in result.stdout
+    assert parse_scene(result.stdout).model_dump() == find_scene(slab).model_dump()
+
+
+@pytest.mark.parametrize("name", shipped_scenes())
+def test_a_filled_scene_reads_back_as_it_was(name):
+    scene = find_scene(name)
+    assert parse_scene(filled(scene)).model_dump() == scene.model_dump()
+
+
+def test_a_filled_scene_explains_every_key(slab):
+    lines = filled(find_scene(slab)).splitlines()
+    for line, above in zip(lines[1:], lines, strict=False):
+        assert not line or line.count("# ") or above.startswith("# "), line
+        assert "None" not in line
+
+
+def test_the_readme_lists_all_keys_as_the_command_does():
+    assert reference() in (FOLDER / "README.md").read_text(encoding="utf-8")
+    assert CliRunner().invoke(main, ["scene", "--keys"]).stdout == reference()
+    for name, field in Scene.model_fields.items():
+        assert field.description, name
+    assert "None" not in reference()

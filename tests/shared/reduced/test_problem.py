@@ -1,0 +1,277 @@
+"""A local model with every quadrature point is the Galerkin model; with all modes, the full one."""
+
+from contextlib import contextmanager, nullcontext
+
+import numpy as np
+import pytest
+from numba import njit
+
+from palpate.offline.fem.mesh import build_mesh
+from palpate.offline.fem.model import FullModel, TipContact
+from palpate.offline.reduce.viscous import deviatoric_stiffness
+from palpate.offline.scenes import find_scene
+from palpate.shared.compiled import bind, bind_compiled
+from palpate.shared.mechanics import newton
+from palpate.shared.mechanics.sphere import room_for, tip_of, tip_surface
+from palpate.shared.mechanics.viscosity import step_weights
+from palpate.shared.reduced import press, touch
+from palpate.shared.reduced.corrections import Secants, Tangent, forget_secants
+from palpate.shared.reduced.past import begin_step, end_step, opened, remembering
+from palpate.shared.reduced.points import LANES, STATE, Points
+from palpate.shared.reduced.problem import Problem, Work, descend
+from palpate.shared.reduced.terms import Contact, Dead, Elastic, reaction
+
+YOUNG, POISSON, RADIUS = 15.0, 0.45, 2.0
+PRONY = ((0.3, 0.05), (0.2, 1.0))
+
+COURSE = ((0.5, 0.02), (1.0, 0.05), (1.0, 0.5), (0.3, 0.0), (0.6, 0.1))
+"""Shares of the load, which is a force or the depth of the tip, and time steps (s)."""
+
+FORCE = np.array([60.0, 0.0, -250.0])
+"""Of the dead load, mN."""
+
+DEPTH = 0.6
+"""Of the tip, mm."""
+
+TARGET = 2e-5
+"""Residual in equilibrium, in the energy norm, (mN mm)^(1/2); states have norms of 2 to 30."""
+
+ACCURATE = 1e-5
+"""Relative error of sums in single precision."""
+
+
+@njit(cache=True)
+def begin(past, mu):
+    return bind_compiled(begin_step(past, mu, 0, 0))
+
+
+@njit(cache=True)
+def end(past, points, work, q):
+    end_step(past, points, work, 0, q)
+
+
+@njit(cache=True)
+def potential(problem, q, residual):
+    return newton.potential(problem, q, residual)
+
+
+@njit(cache=True)
+def factorise(problem, q):
+    return newton.factorise(problem, q, 0.0)
+
+
+class Twins:
+    """The full model of a block, and a local model of it with every quadrature point."""
+
+    def __init__(self, in_time, modes):
+        scene = find_scene("quick")
+        size = {"size": (8.0, 8.0, 6.0), "divisions": (3, 3, 2), "element": "hex8"}
+        geometry = scene.geometry.model_copy(update=size)
+        self.mesh = mesh = build_mesh(scene.model_copy(update={"geometry": geometry}))
+        self.model = model = FullModel(mesh, "hex8", YOUNG, POISSON, PRONY if in_time else ())
+        self.in_time, self.history, self.q = in_time, model.at_rest, np.zeros(modes)
+        values, vectors = np.linalg.eigh(model.rest_stiffness.toarray())
+        nodal = np.zeros((3 * len(mesh.nodes), modes), np.float32)
+        nodal[model.free] = (vectors / np.sqrt(values))[:, :modes]
+        self.nodal, self.B = nodal, nodal[model.free].astype(float)
+        u = nodal.reshape(-1, 3, modes)[mesh.elements]
+        G = np.einsum("eqaj,eair->eqijr", model.gradients, u).reshape(-1, LANES, 9, modes)
+        self.count = model.weights.size
+        self.mu = np.repeat(model.mu, model.weights.shape[1])
+        self.points = bind(
+            Points(
+                gradients=G.transpose(3, 0, 2, 1).reshape(modes, -1).astype(np.float32),
+                steps=np.ones(modes, np.float32),
+                weights=model.weights.ravel(),
+                mu=self.mu,
+                lam=np.repeat(model.lam, model.weights.shape[1]),
+            )
+        )
+        fields, latest = np.zeros((2, 9 * self.count), np.float32), np.zeros(modes)
+        numbers = np.zeros((3, self.count))
+        self.work = bind(Work(*fields, *numbers, stepped=latest.astype(np.float32), latest=latest))
+        self.past = Elastic()
+        if in_time:
+            D = (self.B.T @ (deviatoric_stiffness(model) @ self.B)).astype(np.float32)
+            self.past = remembering(D[None], len(PRONY), self.count)
+            opened(self.past.records[0], len(PRONY), modes, self.count).share[-1] = 1.0
+        self._past = bind(self.past)
+
+    def solve(self, share, dt):
+        """Go to equilibrium under a share of the load after a time step; return the problem."""
+        if self.in_time:
+            for own, weights in zip(self.past.time, step_weights(PRONY, dt), strict=True):
+                own[:] = weights
+        past = begin(self._past, self.mu)
+        self.apply(share)
+        problem = bind(Problem(self.points, past, self.load, self.correction, self.work))
+        work = np.zeros((4, len(self.q)))
+        energy, smallest = potential(problem, self.q, work[0])
+        status, *_ = descend(problem, self.q, work, energy, smallest, TARGET, *self.search)
+        assert status == newton.CONVERGED
+        return problem
+
+    @contextmanager
+    def full(self, share, dt):
+        """Return the full model under the same load, after a past of the same displacements."""
+        self.apply_to_full(share)
+        with self.model._remembering(self.history, dt) if self.in_time else nullcontext():
+            yield self.model
+        self.model._contact = None
+
+    @property
+    def displacement(self):
+        """Of the nodes (n, 3) mm."""
+        return (self.nodal @ self.q).reshape(-1, 3)
+
+    def remember(self, dt):
+        """Let both models remember this equilibrium."""
+        if self.in_time:
+            end(self._past, self.points, self.work, self.q)
+            weights = step_weights(PRONY, dt)
+            self.history = self.model.advanced(self.history, self.displacement, weights)
+
+
+class Pressed(Twins):
+    """Under a dead load, solved by secants."""
+
+    search = np.inf, 400, True, press.ROUND_OFF
+
+    def __init__(self, in_time, modes):
+        super().__init__(in_time, modes)
+        vectors = np.zeros((3, modes))
+        self.f, self.external, _ = vectors
+        self.inverse, self.origin = np.zeros((modes, modes)), np.zeros((2, modes))
+        self.load = bind(Dead(self.f))
+        self.correction = bind(Secants(self.inverse, self.origin, self.external, vectors[2]))
+        middle = self.mesh.nodes.max(axis=0) * [0.4, 0.6, 1.0]
+        near = np.exp(-np.sum((self.mesh.nodes - middle) ** 2, axis=1) / 4)
+        self.whole = near[:, None] / near.sum() * FORCE
+
+    def apply(self, share):
+        self.f[:] = self.nodal.T @ (share * self.whole).ravel()
+        self.external[:] = self.f + (self.past.exerted if self.in_time else 0.0)
+        forget_secants(self.inverse, self.origin)
+
+    def apply_to_full(self, share):
+        self.model._load[:] = (share * self.whole).ravel()[self.model.free]
+
+    def full_answer(self, share, dt):
+        if self.in_time:
+            return self.model.step(self.history, share * self.whole, dt)[0]
+        return self.model.solve(share * self.whole)
+
+
+class Touched(Twins):
+    """Under the rigid tip, solved by tangents."""
+
+    search = 0.0, 100, False, touch.ROUND_OFF
+
+    def __init__(self, in_time, modes):
+        super().__init__(in_time, modes)
+        mesh, r = self.mesh, modes
+        surface = tip_surface(mesh.nodes, mesh.faces, mesh.accessible, RADIUS)
+        self.contact = TipContact(self.model, surface, tip_of(RADIUS, YOUNG))
+        faces, rows = len(surface.faces), 3 * surface.faces.shape[1]
+        self.x, self.latest, self.factor = np.zeros(3), np.zeros(r), np.zeros((r, r))
+        self.load = bind(
+            Contact(
+                tip=self.contact.tip,
+                surface=surface,
+                x=self.x,
+                nodes=np.arange(len(mesh.nodes), dtype=np.int32),
+                modes=self.nodal.reshape(-1, 3, r),
+                faces=np.arange(faces, dtype=np.int32),
+                corners=surface.faces,
+                moved=np.zeros((len(mesh.nodes), 3)),
+                own=np.zeros((rows * faces, r)),
+                folded=np.zeros((rows * faces, r)),
+                square=np.zeros((rows, rows)),
+                product=np.zeros((r, r)),
+                touching=room_for(surface, faces),
+                latest=self.latest,
+            )
+        )
+        self.correction = bind(
+            Tangent(
+                points=self.points,
+                state=np.zeros(STATE * self.count, np.float32),
+                units=np.tile(np.eye(9, dtype=np.float32).repeat(LANES, 1), self.count // LANES),
+                moduli=np.zeros((9, 9 * self.count), np.float32),
+                products=np.zeros((r, 9 * self.count), np.float32),
+                bulk=np.zeros((r, r)),
+                formed=np.full(2 * r + 1, np.inf),
+                lag=0.0,
+                whole=np.zeros((r, r)),
+                factor=self.factor,
+            )
+        )
+
+    def place(self, share):
+        """Centre of the tip (3,) mm."""
+        return self.mesh.nodes.max(axis=0) * [0.42, 0.55, 1.0] + [0, 0, RADIUS - share * DEPTH]
+
+    def apply(self, share):
+        self.x[:] = self.place(share)
+        self.latest[:] = np.inf
+
+    def apply_to_full(self, share):
+        self.model._contact = self.contact
+        self.contact.position[:] = self.place(share)
+
+    def full_answer(self, share, dt):
+        tip = self.contact, self.place(share), np.array([0.0, 0.0, -share * DEPTH])
+        if self.in_time:
+            return self.model.touch_step(self.history, *tip, dt)[0]
+        return self.model.touch(*tip)
+
+    def reaction(self, problem):
+        """Force on the tool (3,) mN and its derivative (3, 3) mN/mm."""
+        assert factorise(problem, self.q)
+        force, tangent = np.zeros(3), np.zeros((3, 3))
+        coupling, step = np.zeros((3, len(self.q))), np.zeros(len(self.q))
+        reaction(self.load, self.factor, coupling, step, force, tangent)
+        return force, tangent
+
+    def galerkin_reaction(self, model):
+        """The same by the full model's tangent in the modes."""
+        u = self.displacement.ravel().astype(float)
+        K = model.stiffness(u)
+        self.contact.stiffen(u, K.data, False)
+        force, own, coupling = self.contact.reaction(u)
+        C = self.B.T @ coupling[model.free]
+        return force, C.T @ np.linalg.solve(self.B.T @ (K @ self.B), C) - own
+
+
+def assert_close(found, expected, tolerance=ACCURATE):
+    assert np.linalg.norm(found - expected) <= tolerance * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("modes", [24, 96], ids=["some-modes", "all-modes"])
+@pytest.mark.parametrize("in_time", [False, True], ids=["at-once", "in-time"])
+@pytest.mark.parametrize("kind", [Pressed, Touched], ids=["dead", "tip"])
+def test_all_points_make_the_galerkin_model_and_all_modes_the_full_one(kind, in_time, modes, rng):
+    twins = kind(in_time, modes)
+    B, q, residual, force = twins.B, twins.q, np.zeros(modes), np.zeros(len(twins.B))
+    for share, dt in COURSE:
+        problem = twins.solve(share, dt)
+        away = q + 0.05 * np.linalg.norm(q) * rng.standard_normal(modes) / np.sqrt(modes)
+        energy = -potential(problem, q, residual)[0]
+        energy += potential(problem, away, residual)[0]
+        with twins.full(share, dt) as model:
+            expected = -model.potential(B @ q, force)[0]
+            assert np.linalg.norm(B.T @ force) <= 2 * TARGET
+            expected += model.potential(B @ away, force)[0]
+            assert_close(residual, B.T @ force)
+            assert energy == pytest.approx(expected, rel=2e-4)
+            if kind is Touched:
+                found = twins.reaction(problem)
+                for one, other in zip(found, twins.galerkin_reaction(model), strict=True):
+                    assert_close(one, other)
+        if modes == len(B):
+            answer = twins.full_answer(share, dt)
+            assert_close(twins.displacement, answer.displacement)
+            if kind is Touched:
+                assert_close(found[0], answer.force)
+                assert_close(found[1], answer.tangent)
+        twins.remember(dt)
