@@ -432,6 +432,7 @@ class ReducedModel:
         touch.place(own.solver, at, last)
         depth, radius = own.outcome.depth.item(), self.body.tip.radius
         if depth > radius:
+            own.active.number[:] = -1  # no search has begun that could be resumed
             raise QueryError(
                 "position",
                 f"the tip's centre lies {depth - radius:.2f} mm below the accessible surface",
