@@ -451,7 +451,7 @@ class ReducedModel:
         converged = found.status == newton.CONVERGED
         out_of_range: tuple[str, ...] = ()
         active: Active = ()
-        if touched and found.beside:
+        if found.beside and (touched or depth > 0.0):
             out_of_range += ("position",)
         if depth > found.limit * (1 + 1e-9):
             out_of_range += ("depth",)

@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 EXACT = 1e-9
 """Relative residual that needs no further point."""
 
+LINEAR = 0.01
+"""How much linear elasticity in a random displacement counts beside a training state."""
+
 STATES = 32
 """States whose stresses are held at once."""
 
@@ -175,6 +178,36 @@ def linear_forces(
     P += (lam[:, None] * np.trace(H, axis1=1, axis2=2))[:, None, None] * np.eye(3)[..., None]
     P = (weights[:, None, None, None] * P).reshape(len(gradients), 9, -1).astype(np.float32)
     return np.asarray((gradients.swapaxes(1, 2) @ P).reshape(len(gradients), -1))
+
+
+def with_linear_forces(
+    forces: NDArray[np.float32],
+    gradients: NDArray[np.float32],
+    law: tuple[Array, Array, Array],
+    count: int,
+    rng: np.random.Generator,
+) -> NDArray[np.float32]:
+    """Forces (c, k) of every point, and those of linear elasticity in random states beside them.
+
+    A local model adds to linear elasticity what the points have beyond it.  Points of great weight
+    do that well in training states and are far too stiff for linear elasticity in other directions,
+    in which the potential then falls without end.  So the points shall have its stiffness, too.
+
+    Parameters
+    ----------
+    forces : ndarray, shape (c, k)
+    gradients : ndarray, shape (c, 9, r), 1/mm
+    law : (ndarray, ndarray, ndarray), shape (c,)
+        Weights (mm^3) and Lame parameters (kPa).
+    count : int
+        Of random states.
+    rng : Generator
+    """
+    size = np.linalg.norm(forces.sum(axis=0)) / np.sqrt(forces.shape[1])
+    states = rng.standard_normal((count, gradients.shape[2]))
+    states *= LINEAR * size / np.linalg.norm(states, axis=1, keepdims=True)
+    linear = linear_forces(gradients, *law, states)
+    return np.hstack([forces, combined(linear, 2 * count, rng)])
 
 
 def nonlinear_forces(

@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 
 from palpate.offline.fem.model import FullModel
 from palpate.offline.reduce.cubature import (
+    combined,
     compress,
     damped_fit,
     nonlinear_forces,
     nonnegative,
     point_forces,
+    with_linear_forces,
 )
 from palpate.offline.reduce.ritz import RITZ_VECTORS, Footprint, local_modes, whole_numbers
 from palpate.offline.reduce.sampling import cone, fewer, tangents
@@ -50,6 +52,12 @@ most, random loads are rare."""
 
 OFF_EQUILIBRIUM = 0.03
 """Size of the random departure from equilibrium, relative to each mode's part in the states."""
+
+SKETCH = 24
+"""Random combinations that stand for all components of a force; their errors add up alike."""
+
+RESPONSES = 20
+"""Random displacements in which the points have to do what linear elasticity does."""
 
 STATES = 24
 """Random loads at each footprint, half of them at the largest tilt, that modes are made for."""
@@ -487,20 +495,19 @@ def _training_forces(
     """What each point (row) contributes to the internal force in and off equilibrium (columns).
 
     It is taken times the square root of the compliance there, so that its error is one of
-    displacement in the energy norm.
+    displacement in the energy norm; random combinations stand for all of its components.
     """
     columns = []
-    gradients = _by_point(trainer.gradients)
-    count = fewer(LOADS, scene.tolerance)
+    gradients, count = _by_point(trainer.gradients), fewer(LOADS, scene.tolerance)
     for sample in _answered(trainer, scene, task, _training_load, count, rng):
         q = sample.q
-        looks = np.linalg.cholesky(sample.compliance) / np.linalg.norm(q)
+        looks = (np.linalg.cholesky(sample.compliance) / np.linalg.norm(q)).astype(np.float32)
         departure = OFF_EQUILIBRIUM * np.abs(q) * rng.standard_normal(len(q))
         for state in (q, q + departure):
             force = point_forces(gradients, *trainer.law, state)
             if force is not None:
-                columns.append(force @ looks.astype(np.float32))
-    return np.hstack(columns)
+                columns.append(force @ combined(looks, SKETCH, rng))
+    return with_linear_forces(np.hstack(columns), gradients, trainer.law, RESPONSES, rng)
 
 
 def _by_point(rows: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -556,4 +563,4 @@ def _fit_tangent(reduced: LocalTrainer, samples: Sequence[Sample]) -> tuple[Arra
     rows, columns = np.tril_indices(CHANGING)
     seen = (U.T @ changes @ U)[:, rows, columns]
     features = np.array([s.tangent_features for s in samples])
-    return U.T, damped_fit(features, seen, GUESS_DAMPING)
+    return np.ascontiguousarray(U.T), damped_fit(features, seen, GUESS_DAMPING)

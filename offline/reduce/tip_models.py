@@ -19,9 +19,9 @@ from palpate.offline.fem.model import FullModel, NoEquilibrium
 from palpate.offline.reduce.cubature import (
     combined,
     damped_fit,
-    linear_forces,
     nonnegative,
     point_forces,
+    with_linear_forces,
 )
 from palpate.offline.reduce.sampling import farthest
 from palpate.offline.reduce.transfer import FOLLOWED, NEXT, neighbours, overlaps
@@ -82,9 +82,8 @@ DEPARTURE = 0.03
 EQUATIONS = 720
 """Random combinations that stand for the equations of all training states."""
 
-RESPONSES, LINEAR = 40, 0.01
-"""Random displacements in which the points have to do what linear elasticity does, and how much
-that counts beside a training state."""
+RESPONSES = 40
+"""Random displacements in which the points have to do what linear elasticity does."""
 
 ANSWERS = 48
 """Answers of the trained model, and of how they change with the position, that the first guess is
@@ -444,12 +443,8 @@ def _training_forces(
     Times the square root of the compliance, an error of the internal force counts by the
     displacement it causes in the energy norm; times the slope, by the change of the force on the
     tool.  Random combinations stand for all of these.
-
-    The model adds to linear elasticity what the points have beyond it.  Points of great weight do
-    that well in training states and are far too stiff for linear elasticity in other directions, in
-    which the potential then falls without end.  So the points shall have its stiffness, too.
     """
-    columns, equations = [], 0
+    columns = []
     each = EQUATIONS // (2 * len(states))
     for state in states:
         displacing = np.linalg.inv(state.factor).T / state.size
@@ -459,13 +454,7 @@ def _training_forces(
             force = point_forces(gradients, *law, q, state.past)
             if force is not None:
                 columns.append(force @ combined(looks.astype(np.float32), each, rng))
-                equations += looks.shape[1]
-    forces = np.hstack(columns)
-    size = np.linalg.norm(forces.sum(axis=0)) / np.sqrt(equations)
-    responses = rng.standard_normal((RESPONSES, gradients.shape[2]))
-    responses *= LINEAR * size / np.linalg.norm(responses, axis=1, keepdims=True)
-    linear = linear_forces(gradients, *law, responses)
-    return np.hstack([forces, combined(linear, 2 * RESPONSES, rng)])
+    return with_linear_forces(np.hstack(columns), gradients, law, RESPONSES, rng)
 
 
 def _fit_guess(models: TouchModels, states: list[_State]) -> Array:

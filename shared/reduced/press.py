@@ -324,8 +324,8 @@ def _solve(solver, k, slot):
 def _first_tangent(directions, table, scratch, inverse):
     """Add to the inverse (r, r) of the tangent at rest what the load changes in few directions.
 
-    With ``V`` these directions and ``K`` the tangent in them, that is ``V^T (K^-1 - I) V``; nothing
-    is added where the polynomials give no positive definite ``K``.
+    With ``V`` these directions and ``K`` the tangent in them, that is ``V^T (K^-1 - I) V``; a ``K``
+    that is not positive definite is shifted towards the rest stiffness until it is.
     """
     K, L, turned, change = scratch.tangent, scratch.factor, scratch.turned, scratch.fitted_change
     superpose(table, scratch.tangent_features, change)
@@ -335,8 +335,11 @@ def _first_tangent(directions, table, scratch, inverse):
             K[i, j] = K[j, i] = change[at]
             at += 1
         K[i, i] += 1.0
-    if not cholesky(K, 0.0, L):
-        return
+    shift = 0.0
+    while not cholesky(K, shift, L):
+        shift = max(0.1, 4.0 * shift)
+        if shift > newton.LARGEST_SHIFT:
+            return
     turned[:] = directions
     for i in range(len(K)):
         for j in range(i):
