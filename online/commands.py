@@ -223,7 +223,8 @@ def replay(recording: Path, artifact: Path, as_json: bool) -> None:
 
     RECORDING is what a client of a session wrote (`record=` of client.http); ARTIFACT the one
     that was served. The exit code is 1 if any reply differs. The same answers to the bit need the
-    same kind of processor and the same versions of the libraries.
+    same kind of processor, the same versions of the libraries, and a server that had its kernels
+    compiled before it was started.
     """
     from palpate.online.session.recording import read_recording
     from palpate.online.session.replay import replay

@@ -38,6 +38,9 @@ class Replay(NamedTuple):
 def replay(recording: Recording, model: ReducedModel) -> Replay:
     """Answer a recorded session again and compare.
 
+    The bits are those of compiled kernels from the cache: a process that has compiled some itself,
+    a server at its very first start, may differ from them in the last ones.
+
     Raises
     ------
     RecordingError
