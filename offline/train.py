@@ -91,11 +91,17 @@ from palpate.offline.validate.tip_histories import (
     random_courses,
     summarise_courses,
 )
-from palpate.shared.artifact import ArtifactError, Dataset, read_artifact, write_artifact
+from palpate.shared.artifact import (
+    ArtifactError,
+    Dataset,
+    datasets_of,
+    read_artifact,
+    write_artifact,
+)
+from palpate.shared.local_models import ESTIMATORS, Estimator, LocalModels, ViscousModels
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.model import ReducedModel
 from palpate.shared.scene import Scene, SceneError, Size, Tolerance
-from palpate.shared.tables import ESTIMATORS, Estimator, LocalModels, ViscousModels
 
 Array = NDArray[np.float64]
 
@@ -450,8 +456,7 @@ class Pipeline:
             if models.tips is not None:
                 tips = models.tips
                 soft = deviatoric_of_all(model, models, tips.modes)
-                viscous_tips = ViscousModels(soft, tips.pairs, tips.overlaps)
-                models = replace(models, viscous_tips=viscous_tips)
+                models = replace(models, tips=replace(tips, deviatoric=soft))
         return models
 
     def _lowered(self, models: LocalModels, limits: Array) -> Array:
@@ -641,99 +646,26 @@ class Pipeline:
         estimators: Mapping[str, Estimator],
         documents: dict[str, Any],
     ) -> None:
-        mesh, surface = self.workshop.mesh, self.surface
-        one = "1"
-        datasets = {
-            "nodes": Dataset(mesh.nodes, "mm", "nodes, dof = 3 node + axis"),
-            "elements": Dataset(mesh.elements, one, "nodes of each hexahedron, VTK order"),
-            "faces": Dataset(mesh.faces, one, "nodes of each boundary face, VTK order, outward"),
-            "clamped": Dataset(mesh.clamped, one, "nodes held fixed"),
-            "accessible": Dataset(mesh.accessible, one, "faces an endoscope can touch"),
+        surface = self.surface
+        datasets = datasets_of(self.workshop.body) | datasets_of(models)
+        datasets |= {
             "surface_vertices": Dataset(surface.vertices, "mm", "accessible surface"),
-            "surface_triangles": Dataset(surface.triangles, one, "triangles of it, outward"),
-            "surface_normals": Dataset(surface.normals, one, "outward unit normals at vertices"),
+            "surface_triangles": Dataset(surface.triangles, "1", "triangles of it, outward"),
+            "surface_normals": Dataset(surface.normals, "1", "outward unit normals at vertices"),
             "load_range": Dataset(
                 limits,
                 "kPa, mm/kPa, mm",
                 "at vertices: limit along the normal, compliance, depth of the tip",
             ),
-            "basis": Dataset(
-                models.basis, "basis_steps", "modes of each region, (r, M, 3 n)", compress=True
-            ),
-            "basis_steps": Dataset(models.steps, "mm", "value of one step of a mode"),
-            "patch_region": Dataset(models.region, one, "region of each local model"),
-            "patch_centres": Dataset(models.centres, "mm", "centres of local models"),
-            "patch_frames": Dataset(models.frames, one, "rows: normal and two tangents"),
-            "patch_pressures": Dataset(models.pressures, "kPa", "load scale of local models"),
-            "patch_modes": Dataset(models.whole, "patch_mix", "modes in the basis of the region"),
-            "patch_mix": Dataset(models.mix, one, "makes orthonormal modes of them", compress=True),
-            "patch_defect": Dataset(
-                models.defect.astype(np.float16), "mN", "force that cubature misses, polynomials"
-            ),
-            "patch_guess": Dataset(
-                models.guess.astype(np.float16), one, "answer beyond the linear one, polynomials"
-            ),
-            "patch_directions": Dataset(
-                models.directions.astype(np.float16), one, "in which the tangent changes"
-            ),
-            "patch_change": Dataset(
-                models.change.astype(np.float16), one, "change of the tangent there, polynomials"
-            ),
-            "patch_residuals": Dataset(
-                models.residuals, one, "log of the residual in the full model, polynomials"
-            ),
-            "patch_extent": Dataset(np.array(models.extent), "mm", "reach of a local model"),
-            "patch_blend": Dataset(np.array(models.blend), "mm", "width of blending"),
-            "cubature_from": Dataset(models.point_from, one, "first point of each local model"),
-            "cubature_points": Dataset(models.points, one, "quadrature point, by element"),
-            "cubature_weights": Dataset(models.weights, "mm^3", "weight of each point"),
         }
         datasets |= {
             ESTIMATORS[kind]: Dataset(
                 estimator.coefficients,
-                one,
+                "1",
                 "log error = c . features; rows: displacement, von Mises, under the tip force",
             )
             for kind, estimator in estimators.items()
         }
-        if models.tips is not None:
-            tips = models.tips
-            datasets |= {
-                "tip_modes": Dataset(
-                    tips.modes, one, "modes under the tip, orthonormal, in the basis of the region"
-                ),
-                "tip_from": Dataset(tips.point_from, one, "first point of each, under the tip"),
-                "tip_points": Dataset(tips.points, one, "quadrature point, by element"),
-                "tip_weights": Dataset(tips.weights, "mm^3", "weight of each point"),
-                "tip_guess": Dataset(
-                    tips.guess.astype(np.float16), one, "answer as polynomials of place and depth"
-                ),
-                "tip_pairs": Dataset(tips.pairs, one, "local models next to one another"),
-                "tip_overlaps": Dataset(
-                    tips.overlaps.astype(np.float16), one, "products of their modes, in energy"
-                ),
-                "tip_residuals": Dataset(
-                    tips.residuals, one, "log of the residual in the full model, polynomials"
-                ),
-            }
-        if models.viscous is not None:
-            viscous = models.viscous
-            datasets |= {
-                "viscous_deviatoric": Dataset(
-                    viscous.deviatoric, one, "deviatoric stiffness in the modes"
-                ),
-                "viscous_pairs": Dataset(viscous.pairs, one, "local models whose spaces meet"),
-                "viscous_overlap": Dataset(
-                    viscous.overlap.astype(np.float16), one, "products of their modes, in energy"
-                ),
-            }
-        if models.viscous_tips is not None:
-            viscous = models.viscous_tips
-            datasets |= {
-                "tip_viscous_deviatoric": Dataset(
-                    viscous.deviatoric, one, "the same in the modes of the tip"
-                ),
-            }
         documents["provenance"]["wall_seconds"] = round(time.perf_counter() - self.started, 1)
         write_artifact(path, self.scene.text, documents, datasets)
 

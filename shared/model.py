@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -15,42 +15,21 @@ from numpy.typing import ArrayLike, NDArray
 from palpate.shared.answer import Answer
 from palpate.shared.artifact import Artifact, ArtifactError, read_artifact
 from palpate.shared.errors import QueryError
-from palpate.shared.geometry.quadrature import stress_recovery
-from palpate.shared.geometry.surface import UPRIGHT, Surface, SurfaceIndex, boundary_triangles
+from palpate.shared.fields import FieldRecovery
+from palpate.shared.geometry.surface import Surface, SurfaceIndex, boundary_triangles
+from palpate.shared.local_models import Body, Estimator, Estimators, LocalModels, ViscousModels
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import TIP_DEPTH
-from palpate.shared.mechanics.sphere import tip_of
-from palpate.shared.mechanics.stress import (
-    nodal_von_mises,
-    nodal_von_mises_after,
-    remember,
-    remember_linearly,
-)
-from palpate.shared.mechanics.tissue import lame
 from palpate.shared.mechanics.viscosity import Weights, step_weights
+from palpate.shared.query import check_place, checked_load, out_of_range, vector
 from palpate.shared.reduced import press, touch
 from palpate.shared.reduced.outcome import TOUCH_FEATURES, Outcome
 from palpate.shared.reduced.past import Remembering, remembering
-from palpate.shared.reduced.points import expand
 from palpate.shared.reduced.terms import Elastic
 from palpate.shared.reduced.transfer import LeftBehind, Local, Past, Transfer, estimate_history
-from palpate.shared.reduced.workspace import (
-    TouchWorkspace,
-    Workspace,
-    press_workspace,
-    touch_workspace,
-)
+from palpate.shared.reduced.workspace import Warm, Workspace, press_workspace, touch_workspace
 from palpate.shared.scene import Scene, SceneError, parse_scene
-from palpate.shared.tables import (
-    Body,
-    Estimator,
-    Estimators,
-    LocalModels,
-    LocalTips,
-    ViscousModels,
-    press_models,
-    touch_models,
-)
+from palpate.shared.tables import press_models, touch_models
 
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
@@ -59,54 +38,8 @@ Region = Literal["surface", "all"]
 Active = tuple[tuple[int, float, Local], ...]
 Moves = dict[int, tuple[Mapping[int, LeftBehind], ...]]
 
-BESIDE = 0.1
-"""Millimetres beyond the rim of the surface at which the answer is not to the question any more."""
-
-ABSURD = 10.0
-"""Multiple of the largest trained pressure beyond which a load is not answered."""
-
 _NONE, _UNKNOWN = np.zeros(3), np.full(3, np.inf)
 """Estimated errors."""
-
-_INWARD = np.zeros(3)
-"""Direction that stands for the inward normal."""
-
-
-class Warm:
-    """Working memory and last answers of one caller; not to be shared between threads.
-
-    Parts for loads and for the tip, at once and in time, are made when first needed.
-    """
-
-    def __init__(self, model: ReducedModel) -> None:
-        self._model = model
-        self._made: dict[tuple[bool, bool], Workspace] = {}
-
-    def press(self, in_time: bool) -> Workspace:
-        """For loads."""
-        return self._part(tip=False, in_time=in_time)
-
-    def touch(self, in_time: bool) -> TouchWorkspace:
-        """For the tip."""
-        part = self._part(tip=True, in_time=in_time)
-        assert isinstance(part, TouchWorkspace)
-        return part
-
-    def _part(self, tip: bool, in_time: bool) -> Workspace:
-        if (tip, in_time) not in self._made:
-            self._made[tip, in_time] = self._model.workspace(tip, in_time)
-        return self._made[tip, in_time]
-
-    def forget(self) -> None:
-        """Make the next answer independent of the last."""
-        for part in self._made.values():
-            part.forget()
-
-    def resume(self) -> None:
-        """Start under the tip where the last search ended, which found no equilibrium."""
-        for part in self._made.values():
-            if isinstance(part, TouchWorkspace):
-                part.resume()
 
 
 class ReducedModel:
@@ -147,11 +80,8 @@ class ReducedModel:
         self.models = models
         self.estimators = estimators
         self.surface_nodes, self.surface_triangles = boundary_triangles(body.faces)
-        self._recovery = stress_recovery(
-            body.nodes, body.elements, body.mu, body.lam, precision=np.float32
-        )
-        self._stress = np.zeros(len(body.nodes))
-        self._own = Warm(self)
+        self.fields = FieldRecovery(body, models, self._transfer_of)
+        self._own = self.new_warm()
         self._index: SurfaceIndex = surface.ground(limits)
         self._last_step: tuple[float, Weights] | None = None
 
@@ -173,52 +103,17 @@ class ReducedModel:
     @classmethod
     def from_artifact(cls, artifact: Artifact) -> ReducedModel:
         """Build from the contents of an artifact."""
-        arrays = artifact.arrays
-        scene = parse_scene(artifact.scene)
-        tips = _local_tips(arrays) if scene.endoscope.tip else None
-        mu, lam = lame(scene.tissue.young, scene.tissue.poisson)
-        count = len(arrays["elements"])
+        arrays, scene = artifact.arrays, parse_scene(artifact.scene)
         return cls(
             name=scene.name,
             scene=scene,
             info=artifact.documents,
-            body=Body(
-                arrays["nodes"],
-                arrays["elements"],
-                arrays["faces"],
-                arrays["clamped"],
-                arrays["accessible"],
-                np.full(count, mu),
-                np.full(count, lam),
-                tip_of(scene.endoscope.radius, scene.tissue.young),
-            ),
+            body=Body.of(arrays, scene),
             surface=Surface(
                 arrays["surface_vertices"], arrays["surface_triangles"], arrays["surface_normals"]
             ),
             limits=arrays["load_range"],
-            models=LocalModels(
-                basis=arrays["basis"],
-                steps=arrays["basis_steps"],
-                region=arrays["patch_region"],
-                centres=arrays["patch_centres"],
-                frames=arrays["patch_frames"],
-                pressures=arrays["patch_pressures"],
-                whole=arrays["patch_modes"],
-                mix=arrays["patch_mix"],
-                point_from=arrays["cubature_from"],
-                points=arrays["cubature_points"],
-                weights=arrays["cubature_weights"],
-                defect=arrays["patch_defect"].astype(np.float32),
-                guess=arrays["patch_guess"].astype(np.float32),
-                directions=arrays["patch_directions"].astype(np.float32),
-                change=arrays["patch_change"].astype(np.float32),
-                residuals=arrays["patch_residuals"],
-                extent=float(arrays["patch_extent"]),
-                blend=float(arrays["patch_blend"]),
-                tips=tips,
-                viscous=_viscous_models(arrays) if scene.tissue.prony else None,
-                viscous_tips=_viscous_tips(arrays, tips) if scene.tissue.prony and tips else None,
-            ),
+            models=LocalModels.of(arrays, scene),
             estimators=Estimators.of(arrays),
         )
 
@@ -244,7 +139,7 @@ class ReducedModel:
 
     def new_warm(self) -> Warm:
         """Working memory and warm start for one session or thread."""
-        return Warm(self)
+        return Warm(self.workspace)
 
     def workspace(self, tip: bool, in_time: bool) -> Workspace:
         """Memory of one caller for loads or the tip, at once or in time.
@@ -346,10 +241,12 @@ class ReducedModel:
         if position is None:
             last = None if past is None else past.position
             position, pressure = self.surface.vertices[0] if last is None else last, 0.0
-        at, towards, radius = self._checked(position, pressure, direction, radius)
+        at, towards, radius = checked_load(
+            self.scene.endoscope, self.pressure_max, position, pressure, direction, radius
+        )
         own = self._warm(warm, past, dt).press(in_time=past is not None)
         press.place(own.solver, at, towards)
-        self._check_place(own.outcome.distance.item(), own.outcome.tilt.item())
+        check_place(self.scene.endoscope, own.outcome.distance.item(), own.outcome.tilt.item())
         moves = self._begin(own, self.press_transfer, past, dt) if past is not None else {}
         press.press(own.solver, pressure, radius)
         if past is None:
@@ -357,7 +254,7 @@ class ReducedModel:
         found = own.result()
         parts = tuple([(k, w, own.warm.q[slot].copy()) for slot, k, w in own.answering()])
         converged = found.status == newton.CONVERGED
-        out_of_range = self._out_of_range(at, found, pressure, radius)
+        outside = out_of_range(self.scene.endoscope, at, found, pressure, radius)
         active: Active = ()
         features, errors, after = found.features, found.errors, None
         if past is not None:
@@ -366,7 +263,7 @@ class ReducedModel:
                 own, past, dt, moves, self.estimators.histories, found, found.foot,
                 pressure / found.limit, response,
             )  # fmt: skip
-        if out_of_range or not converged:
+        if outside or not converged:
             errors = _UNKNOWN
         return Answer(
             contact_point=found.foot,
@@ -375,8 +272,8 @@ class ReducedModel:
             force=found.force,
             converged=converged,
             iterations=int(found.iterations),
-            in_range=not out_of_range,
-            out_of_range=out_of_range,
+            in_range=not outside,
+            out_of_range=outside,
             error_displacement=errors.item(0),
             error_von_mises=errors.item(1),
             error_force=0.0,
@@ -426,7 +323,7 @@ class ReducedModel:
             If the position is not finite, or the tip's centre lies below the surface.
         """
         started = time.perf_counter()
-        at = _vector("position", position)
+        at = vector("position", position)
         own = self._warm(warm, past, dt).touch(in_time=past is not None)
         last = at if past is None or past.position is None else past.position
         touch.place(own.solver, at, last)
@@ -449,12 +346,12 @@ class ReducedModel:
         found = own.result()
         parts = tuple([(k, w, own.scratch.q[slot].copy()) for slot, k, w in own.answering()])
         converged = found.status == newton.CONVERGED
-        out_of_range: tuple[str, ...] = ()
+        outside: tuple[str, ...] = ()
         active: Active = ()
         if found.beside and (touched or depth > 0.0):
-            out_of_range += ("position",)
+            outside += ("position",)
         if depth > found.limit * (1 + 1e-9):
-            out_of_range += ("depth",)
+            outside += ("depth",)
         features, errors, after = found.features[:TOUCH_FEATURES], found.errors, None
         if past is not None:
             response = math.hypot(*found.force.tolist())
@@ -462,7 +359,7 @@ class ReducedModel:
                 own, past, dt, moves, self.estimators.courses, found,
                 past.position if off else at, depth / found.limit, response,
             )  # fmt: skip
-        if out_of_range or not converged:
+        if outside or not converged:
             errors = _UNKNOWN
         elif not touched and past is None:
             errors = _NONE
@@ -473,8 +370,8 @@ class ReducedModel:
             force=found.force,
             converged=converged,
             iterations=int(found.iterations),
-            in_range=not out_of_range,
-            out_of_range=out_of_range,
+            in_range=not outside,
+            out_of_range=outside,
             error_displacement=errors.item(0),
             error_von_mises=errors.item(1),
             error_force=errors.item(2),
@@ -495,63 +392,6 @@ class ReducedModel:
             active=active,
             solve_seconds=time.perf_counter() - started,
         )
-
-    def _checked(
-        self,
-        position: ArrayLike,
-        pressure: float,
-        direction: ArrayLike | None,
-        radius: float | None,
-    ) -> tuple[Array, Array, float]:
-        """Position, direction (zero for the inward normal) and radius of a well-formed load."""
-        endoscope = self.scene.endoscope
-        if not (math.isfinite(pressure) and pressure >= 0):
-            raise QueryError("pressure", f"must be a finite number >= 0 kPa, not {pressure}")
-        if pressure > ABSURD * self.pressure_max:
-            raise QueryError(
-                "pressure",
-                f"must be at most {ABSURD:g} times the {self.pressure_max:.3g} kPa of the "
-                f"training, not {pressure:g}",
-            )
-        at = _vector("position", position)
-        if radius is None:
-            radius = endoscope.radius
-        elif not endoscope.radius / 2 <= radius <= endoscope.radius:
-            allowed = f"[{endoscope.radius / 2}, {endoscope.radius}] mm"
-            raise QueryError("radius", f"must be in {allowed}, not {radius}")
-        if direction is None:
-            return at, _INWARD, radius
-        towards = _vector("direction", direction)
-        if not any(towards.tolist()):
-            raise QueryError("direction", "must not be the zero vector")
-        return at, towards, radius
-
-    def _check_place(self, distance: float, tilt: float) -> None:
-        """Raise ``QueryError`` if a load is out of reach or does not press."""
-        reach = self.scene.endoscope.reach
-        if distance > reach:
-            raise QueryError(
-                "position",
-                f"{distance:.2f} mm from the accessible surface, at most {reach} mm allowed",
-            )
-        if not tilt < 90.0:
-            raise QueryError("direction", "must point into the tissue")
-
-    def _out_of_range(
-        self, at: Array, found: Outcome, pressure: float, radius: float
-    ) -> tuple[str, ...]:
-        """Fields of a load that are not of the kind the model was trained for."""
-        endoscope = self.scene.endoscope
-        fields: tuple[str, ...] = ()
-        if found.distance > BESIDE and _beside(at, found):
-            fields += ("position",)
-        if pressure > found.limit * (1 + 1e-9):
-            fields += ("pressure",)
-        if found.tilt > endoscope.max_tilt + 1e-6:
-            fields += ("direction",)
-        if radius != endoscope.radius:
-            fields += ("radius",)
-        return fields
 
     def _warm(self, warm: Warm | None, past: Past | None, dt: float) -> Warm:
         """Memory to answer with: the caller's, or the model's own, which knows no last answer."""
@@ -612,41 +452,12 @@ class ReducedModel:
         left = after.share > 1.0 + 1e-9  # the trained range, now or before
         return features, _UNKNOWN if left else errors, after, active
 
-    def coefficients(self, answer: Answer) -> dict[int, Field]:
-        """Displacement as coefficients (M,) in the basis of each region that takes part."""
-        if answer.past is None:
-            return self._by_region(answer, answer.parts)
-        return self._by_region(
-            answer, self._transfer_of(answer).displacements(answer.time, answer.active)
-        )
-
     def _transfer_of(self, answer: Answer) -> Transfer:
         return self.touch_transfer if answer.tip else self.press_transfer
 
-    def _by_region(
-        self, answer: Answer, parts: Sequence[tuple[int, float, Array]]
-    ) -> dict[int, Field]:
-        """Coefficients of states in the modes that an answer is given in."""
-        modes = self.models.modes
-        if answer.tip:
-            assert self.models.tips is not None, "or there would be no such answer"
-            modes = self.models.tips.modes
-        total: dict[int, Field] = {}
-        for k, weight, q in parts:
-            region = int(self.models.region[k])
-            share = modes[k] @ (weight * q).astype(np.float32)
-            total[region] = total[region] + share if region in total else share
-        return total
-
-    def _field(self, coefficients: Mapping[int, Field]) -> Field:
-        field = np.zeros(self.models.basis.shape[2], np.float32)
-        for number, part in coefficients.items():
-            expand(self.models.basis[number], self.models.steps[number] * part, field)
-        return field.reshape(-1, 3)
-
     def displacement(self, answer: Answer, region: Region = "all") -> Field:
         """Nodal displacement (k, 3) mm, of all nodes or those of ``surface_nodes``."""
-        displacement = self._field(self.coefficients(answer))
+        displacement = self.fields.displacement(answer)
         return displacement if region == "all" else displacement[self.surface_nodes]
 
     def von_mises(
@@ -654,62 +465,6 @@ class ReducedModel:
     ) -> Field:
         """Nodal von Mises stress (k,) kPa; ``displacement`` of all nodes saves its recovery."""
         if displacement is None:
-            displacement = self.displacement(answer, "all")
-        if answer.past is None:
-            nodal_von_mises(self._recovery, displacement, self._stress)
-        else:
-            B = self._remembered(answer)
-            nodal_von_mises_after(self._recovery, displacement, B, self._stress)
-        stress = self._stress if region == "all" else self._stress[self.surface_nodes]
-        # an answer that did not converge may be beyond single precision
-        with np.errstate(over="ignore"):
-            return stress.astype(np.float32)
-
-    def _remembered(self, answer: Answer) -> Array:
-        """``B`` of ``mechanics.viscosity`` (e, 6, 8) at the points of all elements."""
-        transfer = self._transfer_of(answer)
-        B = np.zeros((len(self.body.elements), 6, 8))
-        for k, share, knot in transfer.knots(answer.active):
-            u = self._field(self._by_region(answer, [(k, 1.0, knot)]))
-            remember(self._recovery, u, share, B)
-        lasting = transfer.lasting(answer.time, answer.active)
-        if lasting:
-            remember_linearly(self._recovery, self._field(self._by_region(answer, lasting)), B)
-        return B
-
-
-def _local_tips(arrays: dict[str, NDArray[Any]]) -> LocalTips:
-    return LocalTips(
-        modes=arrays["tip_modes"],
-        point_from=arrays["tip_from"],
-        points=arrays["tip_points"],
-        weights=arrays["tip_weights"],
-        guess=arrays["tip_guess"].astype(np.float32),
-        pairs=arrays["tip_pairs"],
-        overlaps=arrays["tip_overlaps"].astype(np.float32),
-        residuals=arrays["tip_residuals"],
-    )
-
-
-def _viscous_models(arrays: dict[str, NDArray[Any]]) -> ViscousModels:
-    overlap = arrays["viscous_overlap"].astype(np.float32)
-    return ViscousModels(arrays["viscous_deviatoric"], arrays["viscous_pairs"], overlap)
-
-
-def _viscous_tips(arrays: dict[str, NDArray[Any]], tips: LocalTips) -> ViscousModels:
-    return ViscousModels(arrays["tip_viscous_deviatoric"], tips.pairs, tips.overlaps)
-
-
-def _beside(position: Array, found: Outcome) -> bool:
-    """Whether a position lies rather beside the surface, beyond its rim, than above or below it."""
-    return bool(abs(np.dot(position - found.foot, found.upward)) < UPRIGHT * found.distance)
-
-
-def _vector(field: str, value: ArrayLike) -> Array:
-    try:
-        vector = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise QueryError(field, "must be three numbers") from error
-    if vector.shape != (3,) or not all(map(math.isfinite, vector.tolist())):
-        raise QueryError(field, "must be three finite numbers")
-    return vector
+            displacement = self.fields.displacement(answer)
+        stress = self.fields.von_mises(answer, displacement)
+        return stress if region == "all" else stress[self.surface_nodes]

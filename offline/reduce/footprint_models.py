@@ -23,6 +23,7 @@ from palpate.offline.reduce.ritz import RITZ_VECTORS, Footprint, local_modes, wh
 from palpate.offline.reduce.sampling import cone, fewer, tangents
 from palpate.offline.reduce.tip_models import TipResult, compile_tip_query, train_tip
 from palpate.shared.geometry.surface import Surface
+from palpate.shared.local_models import Body, LocalModels
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH, footprint, pressure_limit
 from palpate.shared.reduced.features import (
@@ -39,7 +40,7 @@ from palpate.shared.reduced.press import place, press
 from palpate.shared.reduced.terms import Elastic
 from palpate.shared.reduced.workspace import press_workspace
 from palpate.shared.scene import Scene, Size
-from palpate.shared.tables import Body, LocalModels, press_models
+from palpate.shared.tables import press_models
 
 Array = NDArray[np.float64]
 

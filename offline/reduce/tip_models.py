@@ -27,6 +27,7 @@ from palpate.offline.reduce.sampling import farthest
 from palpate.offline.reduce.transfer import FOLLOWED, NEXT, neighbours, overlaps
 from palpate.offline.reduce.viscous import deviatoric_of
 from palpate.shared.geometry.surface import Surface
+from palpate.shared.local_models import Body, LocalModels, LocalTips
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS
 from palpate.shared.mechanics.sphere import FORCE, room_for
@@ -44,7 +45,7 @@ from palpate.shared.reduced.points import LANES, SYMMETRIC, predict_points
 from palpate.shared.reduced.terms import Elastic
 from palpate.shared.reduced.touch import MAX_ITERATIONS, TouchModels, place, touch
 from palpate.shared.reduced.workspace import touch_workspace
-from palpate.shared.tables import Body, LocalModels, LocalTips, touch_models
+from palpate.shared.tables import touch_models
 
 Array = NDArray[np.float64]
 Past = tuple[NDArray[np.float32], NDArray[np.float32]]

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from palpate.offline.fem.model import FullModel
-from palpate.shared.tables import LocalModels
+from palpate.shared.local_models import LocalModels
 
 Array = NDArray[np.float64]
 

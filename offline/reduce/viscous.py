@@ -10,7 +10,7 @@ from scipy.sparse import csr_matrix
 
 from palpate.offline.fem.model import FullModel
 from palpate.offline.reduce.transfer import region_basis
-from palpate.shared.tables import LocalModels
+from palpate.shared.local_models import LocalModels
 
 Array = NDArray[np.float64]
 

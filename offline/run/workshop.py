@@ -42,12 +42,12 @@ from palpate.offline.validate.norms import relative
 from palpate.shared.artifact import Artifact, read_artifact
 from palpate.shared.geometry.quadrature import stress_recovery
 from palpate.shared.geometry.surface import Surface
+from palpate.shared.local_models import Body, Estimators, LocalModels
 from palpate.shared.mechanics.footprint import footprint
 from palpate.shared.mechanics.sphere import tip_of, tip_surface
 from palpate.shared.mechanics.stress import StressRecovery, nodal_von_mises, nodal_von_mises_after
 from palpate.shared.model import ReducedModel
 from palpate.shared.scene import Scene, parse_scene
-from palpate.shared.tables import Body, Estimators, LocalModels
 
 Array = NDArray[np.float64]
 

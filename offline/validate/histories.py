@@ -23,11 +23,11 @@ from palpate.offline.validate.norms import relative, statistics
 from palpate.shared.answer import Answer
 from palpate.shared.errors import QueryError
 from palpate.shared.geometry.surface import Surface
+from palpate.shared.local_models import Estimator
 from palpate.shared.mechanics.footprint import pressure_limit
 from palpate.shared.model import ReducedModel
 from palpate.shared.reduced.transfer import REST
 from palpate.shared.scene import Scene
-from palpate.shared.tables import Estimator
 
 Array = NDArray[np.float64]
 

@@ -21,10 +21,10 @@ from palpate.offline.validate.norms import relative, statistics
 from palpate.shared.artifact import read_artifact
 from palpate.shared.errors import PalpateError
 from palpate.shared.geometry.surface import Surface
+from palpate.shared.local_models import Estimator
 from palpate.shared.mechanics.footprint import pressure_limit
 from palpate.shared.model import ReducedModel
 from palpate.shared.scene import Scene
-from palpate.shared.tables import Estimator
 
 Array = NDArray[np.float64]
 

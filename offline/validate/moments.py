@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from palpate.offline.validate.loads import calibrate, coverage
 from palpate.offline.validate.tip import OTHER_EQUILIBRIUM
 from palpate.shared.answer import Answer
-from palpate.shared.tables import Estimator
+from palpate.shared.local_models import Estimator
 
 Array = NDArray[np.float64]
 

@@ -16,10 +16,10 @@ from palpate.offline.validate.loads import calibrate, coverage, unseen, verdict
 from palpate.offline.validate.norms import relative, statistics
 from palpate.shared.answer import Answer
 from palpate.shared.geometry.surface import Surface
+from palpate.shared.local_models import Estimator
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.model import ReducedModel
 from palpate.shared.scene import Scene
-from palpate.shared.tables import Estimator
 
 Array = NDArray[np.float64]
 

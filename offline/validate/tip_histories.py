@@ -24,11 +24,11 @@ from palpate.offline.validate.tip import OTHER_EQUILIBRIUM, QUANTITIES
 from palpate.shared.answer import Answer
 from palpate.shared.errors import QueryError
 from palpate.shared.geometry.surface import Surface
+from palpate.shared.local_models import Estimator
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.model import ReducedModel
 from palpate.shared.reduced.transfer import REST
 from palpate.shared.scene import Scene
-from palpate.shared.tables import Estimator
 
 Array = NDArray[np.float64]
 

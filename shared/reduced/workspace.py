@@ -6,6 +6,7 @@ itself remembers is a value of its own, ``transfer.Past``.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -197,3 +198,45 @@ def touch_workspace(
         TouchSolver(models, index, coefficients, past, active, warm, scratch, outcome)
     )
     return workspace
+
+
+class Warm:
+    """Working memory and last answers of one caller; not to be shared between threads.
+
+    Parts for loads and for the tip, at once and in time, are made when first needed.
+
+    Parameters
+    ----------
+    make : callable
+        Workspace for the tip or for loads, in time or at once.
+    """
+
+    def __init__(self, make: Callable[[bool, bool], Workspace]) -> None:
+        self._make = make
+        self._made: dict[tuple[bool, bool], Workspace] = {}
+
+    def press(self, in_time: bool) -> Workspace:
+        """For loads."""
+        return self._part(tip=False, in_time=in_time)
+
+    def touch(self, in_time: bool) -> TouchWorkspace:
+        """For the tip."""
+        part = self._part(tip=True, in_time=in_time)
+        assert isinstance(part, TouchWorkspace)
+        return part
+
+    def _part(self, tip: bool, in_time: bool) -> Workspace:
+        if (tip, in_time) not in self._made:
+            self._made[tip, in_time] = self._make(tip, in_time)
+        return self._made[tip, in_time]
+
+    def forget(self) -> None:
+        """Make the next answer independent of the last."""
+        for part in self._made.values():
+            part.forget()
+
+    def resume(self) -> None:
+        """Start under the tip where the last search ended, which found no equilibrium."""
+        for part in self._made.values():
+            if isinstance(part, TouchWorkspace):
+                part.resume()

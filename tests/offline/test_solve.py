@@ -8,10 +8,11 @@ from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.run.workshop import Workshop
 from palpate.offline.scenes import find_scene
 from palpate.offline.solve import solve
-from palpate.shared import model
+from palpate.shared import query
 from palpate.shared.artifact import read_artifact
 from palpate.shared.errors import QueryError
-from palpate.shared.model import ABSURD, ReducedModel
+from palpate.shared.model import ReducedModel
+from palpate.shared.query import ABSURD
 
 POSITION = (4.0, 5.5, find_scene("quick").geometry.size[2] + 0.2)
 DIRECTION = (0.2, 0.1, -1.0)
@@ -95,7 +96,7 @@ def test_no_load_has_no_error(artifact):
 
 
 def test_a_load_without_equilibrium_is_told(artifact, monkeypatch):
-    monkeypatch.setattr(model, "ABSURD", np.inf)
+    monkeypatch.setattr(query, "ABSURD", np.inf)
     with pytest.raises(NoEquilibrium, match=r"^pressure: no equilibrium .* up to [0-9.]+ kPa"):
         solve(artifact, POSITION, 1e4)
 

@@ -10,7 +10,7 @@ from palpate.shared.answer import Answer
 from palpate.shared.errors import QueryError
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH
-from palpate.shared.model import ABSURD
+from palpate.shared.query import ABSURD
 from palpate.shared.reduced.transfer import Past
 from palpate.shared.scene import load_scene
 

@@ -7,7 +7,8 @@ import pytest
 
 from palpate.shared.answer import describe
 from palpate.shared.errors import QueryError
-from palpate.shared.model import ABSURD, ReducedModel
+from palpate.shared.model import ReducedModel
+from palpate.shared.query import ABSURD
 
 UP = np.array([0.0, 0.0, 1.0])
 

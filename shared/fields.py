@@ -1,0 +1,102 @@
+"""Fields of an answer at all nodes: displacement and von Mises stress."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.shared.answer import Answer
+from palpate.shared.geometry.quadrature import stress_recovery
+from palpate.shared.local_models import Body, LocalModels
+from palpate.shared.mechanics.stress import (
+    nodal_von_mises,
+    nodal_von_mises_after,
+    remember,
+    remember_linearly,
+)
+from palpate.shared.reduced.points import expand
+from palpate.shared.reduced.transfer import Transfer
+
+Array = NDArray[np.float64]
+Field = NDArray[np.float32]
+
+
+class FieldRecovery:
+    """Recovers fields from the states of local models; not to be shared between threads.
+
+    Parameters
+    ----------
+    body : Body
+    models : LocalModels
+    transfer_of : callable
+        What knows the past of an answer of tissue that remembers.
+    """
+
+    def __init__(
+        self, body: Body, models: LocalModels, transfer_of: Callable[[Answer], Transfer]
+    ) -> None:
+        self._body = body
+        self._models = models
+        self._transfer_of = transfer_of
+        self._recovery = stress_recovery(
+            body.nodes, body.elements, body.mu, body.lam, precision=np.float32
+        )
+        self._stress = np.zeros(len(body.nodes))
+
+    def coefficients(self, answer: Answer) -> dict[int, Field]:
+        """Displacement as coefficients (M,) in the basis of each region that takes part."""
+        if answer.past is None:
+            return self._by_region(answer, answer.parts)
+        return self._by_region(
+            answer, self._transfer_of(answer).displacements(answer.time, answer.active)
+        )
+
+    def _by_region(
+        self, answer: Answer, parts: Sequence[tuple[int, float, Array]]
+    ) -> dict[int, Field]:
+        """Coefficients of states in the modes that an answer is given in."""
+        modes = self._models.modes
+        if answer.tip:
+            assert self._models.tips is not None, "or there would be no such answer"
+            modes = self._models.tips.modes
+        total: dict[int, Field] = {}
+        for k, weight, q in parts:
+            region = int(self._models.region[k])
+            share = modes[k] @ (weight * q).astype(np.float32)
+            total[region] = total[region] + share if region in total else share
+        return total
+
+    def _field(self, coefficients: Mapping[int, Field]) -> Field:
+        field = np.zeros(self._models.basis.shape[2], np.float32)
+        for number, part in coefficients.items():
+            expand(self._models.basis[number], self._models.steps[number] * part, field)
+        return field.reshape(-1, 3)
+
+    def displacement(self, answer: Answer) -> Field:
+        """Nodal displacement (n, 3) mm."""
+        return self._field(self.coefficients(answer))
+
+    def von_mises(self, answer: Answer, displacement: Field) -> Field:
+        """Nodal von Mises stress (n,) kPa of an answer with this displacement of all nodes."""
+        if answer.past is None:
+            nodal_von_mises(self._recovery, displacement, self._stress)
+        else:
+            B = self._remembered(answer)
+            nodal_von_mises_after(self._recovery, displacement, B, self._stress)
+        # an answer that did not converge may be beyond single precision
+        with np.errstate(over="ignore"):
+            return self._stress.astype(np.float32)
+
+    def _remembered(self, answer: Answer) -> Array:
+        """``B`` of ``mechanics.viscosity`` (e, 6, 8) at the points of all elements."""
+        transfer = self._transfer_of(answer)
+        B = np.zeros((len(self._body.elements), 6, 8))
+        for k, share, knot in transfer.knots(answer.active):
+            u = self._field(self._by_region(answer, [(k, 1.0, knot)]))
+            remember(self._recovery, u, share, B)
+        lasting = transfer.lasting(answer.time, answer.active)
+        if lasting:
+            remember_linearly(self._recovery, self._field(self._by_region(answer, lasting)), B)
+        return B

@@ -1,0 +1,111 @@
+"""What a query must be to be answered, and what it must be to be within the trained range."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from palpate.shared.errors import QueryError
+from palpate.shared.geometry.surface import UPRIGHT
+from palpate.shared.reduced.outcome import Outcome
+from palpate.shared.scene import Endoscope
+
+Array = NDArray[np.float64]
+
+BESIDE = 0.1
+"""Millimetres beyond the rim of the surface at which the answer is not to the question any more."""
+
+ABSURD = 10.0
+"""Multiple of the largest trained pressure beyond which a load is not answered."""
+
+INWARD = np.zeros(3)
+"""Direction that stands for the inward normal."""
+
+
+def checked_load(
+    endoscope: Endoscope,
+    pressure_max: float,
+    position: ArrayLike,
+    pressure: float,
+    direction: ArrayLike | None,
+    radius: float | None,
+) -> tuple[Array, Array, float]:
+    """Position, direction (zero for the inward normal) and radius of a well-formed load.
+
+    Raises
+    ------
+    QueryError
+        If not; ``pressure_max`` (kPa) is the largest trained pressure.
+    """
+    if not (math.isfinite(pressure) and pressure >= 0):
+        raise QueryError("pressure", f"must be a finite number >= 0 kPa, not {pressure}")
+    if pressure > ABSURD * pressure_max:
+        raise QueryError(
+            "pressure",
+            f"must be at most {ABSURD:g} times the {pressure_max:.3g} kPa of the "
+            f"training, not {pressure:g}",
+        )
+    at = vector("position", position)
+    if radius is None:
+        radius = endoscope.radius
+    elif not endoscope.radius / 2 <= radius <= endoscope.radius:
+        allowed = f"[{endoscope.radius / 2}, {endoscope.radius}] mm"
+        raise QueryError("radius", f"must be in {allowed}, not {radius}")
+    if direction is None:
+        return at, INWARD, radius
+    towards = vector("direction", direction)
+    if not any(towards.tolist()):
+        raise QueryError("direction", "must not be the zero vector")
+    return at, towards, radius
+
+
+def check_place(endoscope: Endoscope, distance: float, tilt: float) -> None:
+    """Raise ``QueryError`` if a load is out of reach (mm) or does not press (tilt in degrees)."""
+    reach = endoscope.reach
+    if distance > reach:
+        raise QueryError(
+            "position",
+            f"{distance:.2f} mm from the accessible surface, at most {reach} mm allowed",
+        )
+    if not tilt < 90.0:
+        raise QueryError("direction", "must point into the tissue")
+
+
+def out_of_range(
+    endoscope: Endoscope, at: Array, found: Outcome, pressure: float, radius: float
+) -> tuple[str, ...]:
+    """Fields of a load that are not of the kind the model was trained for."""
+    fields: tuple[str, ...] = ()
+    if found.distance > BESIDE and _beside(at, found):
+        fields += ("position",)
+    if pressure > found.limit * (1 + 1e-9):
+        fields += ("pressure",)
+    if found.tilt > endoscope.max_tilt + 1e-6:
+        fields += ("direction",)
+    if radius != endoscope.radius:
+        fields += ("radius",)
+    return fields
+
+
+def _beside(position: Array, found: Outcome) -> bool:
+    """Whether a position lies rather beside the surface, beyond its rim, than above or below it."""
+    return bool(abs(np.dot(position - found.foot, found.upward)) < UPRIGHT * found.distance)
+
+
+def vector(field: str, value: ArrayLike) -> Array:
+    """Read three finite numbers.
+
+    Raises
+    ------
+    QueryError
+        That names the field.
+    """
+    try:
+        numbers = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise QueryError(field, "must be three numbers") from error
+    if numbers.shape != (3,) or not all(map(math.isfinite, numbers.tolist())):
+        raise QueryError(field, "must be three finite numbers")
+    return numbers
