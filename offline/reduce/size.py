@@ -71,13 +71,18 @@ class Trial:
 
     @classmethod
     def of(cls, size: Size, results: list[TrialResult]) -> Trial:
-        """Gather the results of the patches."""
+        """Gather the results of the patches, without the load of the largest error.
+
+        Where the tissue gives way the load range is lowered only after training: a load beyond
+        that says nothing about a size.
+        """
         displacement = np.concatenate([r.displacement for r in results])
+        kept = np.argsort(displacement)[:-1]
         return cls(
             size,
-            statistics(displacement),
-            statistics(np.concatenate([r.von_mises for r in results])),
-            len(displacement),
+            statistics(displacement[kept]),
+            statistics(np.concatenate([r.von_mises for r in results])[kept]),
+            len(kept),
             1e6 * float(np.median([r.seconds for r in results])),
         )
 
