@@ -71,18 +71,19 @@ class Trial:
 
     @classmethod
     def of(cls, size: Size, results: list[TrialResult]) -> Trial:
-        """Gather the results of the patches, without the load of the largest error.
+        """Gather the results of the patches, without the one of the largest error.
 
-        Where the tissue gives way the load range is lowered only after training: a load beyond
-        that says nothing about a size.
+        Where the tissue gives way the load range is lowered only after training: loads beyond that
+        say nothing about a size.
         """
-        displacement = np.concatenate([r.displacement for r in results])
-        kept = np.argsort(displacement)[:-1]
+        worst = np.argmax([r.displacement.max() for r in results])
+        kept = [r for i, r in enumerate(results) if i != worst] or results
+        displacement = np.concatenate([r.displacement for r in kept])
         return cls(
             size,
-            statistics(displacement[kept]),
-            statistics(np.concatenate([r.von_mises for r in results])[kept]),
-            len(kept),
+            statistics(displacement),
+            statistics(np.concatenate([r.von_mises for r in kept])),
+            len(displacement),
             1e6 * float(np.median([r.seconds for r in results])),
         )
 
