@@ -247,6 +247,21 @@ def study() -> None:
     """Compare methods and redo the measurements behind the choices."""
 
 
+@study.command()
+@click.option(
+    "--measure", metavar="PATTERN", help="Run the commands that match, such as 'bench *'."
+)
+def figures(measure: str | None) -> None:
+    """Write artifacts/FIGURES.md and README's figures.
+
+    They come from the last reports of the commands that artifacts/figures.toml lists; --measure
+    runs those that match PATTERN first and keeps their reports in artifacts/figures.json.
+    """
+    from palpate.offline.studies.figures import figures
+
+    figures(Path("artifacts"), measure)
+
+
 @study.command("mesh-error")
 @click.option(
     "--report",
