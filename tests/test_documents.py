@@ -1,0 +1,124 @@
+"""Documents: what they name is there, what they print works, what is generated is up to date."""
+
+import json
+import re
+import shlex
+import tomllib
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+
+from palpate.offline.scenes import shipped_scenes
+from palpate.offline.studies.figures import TABLE, document, table
+from palpate.shared.cli import main
+
+ROOT = Path(__file__).parents[1]
+FIGURES = ROOT / "artifacts"
+SIDES = ROOT / "shared", ROOT / "offline"
+DOCUMENTS = [
+    ROOT / name
+    for name in (
+        "README.md", "artifacts/README.md", "artifacts/FIGURES.md", "offline/README.md",
+        "offline/scenes/README.md", "online/README.md", "shared/THEORY.md",
+    )
+]  # fmt: skip
+TEXTS = {path: path.read_text("utf-8") for path in DOCUMENTS}
+WANTED = tomllib.loads((FIGURES / "figures.toml").read_text("utf-8"))
+FOUND = json.loads((FIGURES / "figures.json").read_text("utf-8"))
+
+PRINTED = {
+    " ".join(command.split())
+    for text in TEXTS.values()
+    for command in re.findall(r"(?m)`palpate ([^`]+)`|^palpate ([^#\n]+)", text)
+    for command in command
+    if command and "COMMAND" not in command
+}
+MEASURED = {command for section in WANTED["section"] for command in section["commands"]}
+
+
+@pytest.fixture
+def trained(tmp_path, monkeypatch):
+    """Go where every scene seems to have been trained."""
+    (tmp_path / "artifacts").mkdir()
+    for name in shipped_scenes():
+        (tmp_path / "artifacts" / f"{name}.h5").touch()
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize("line", sorted(PRINTED | MEASURED))
+def test_commands_parse(line, trained):
+    words, command = shlex.split(line), main
+    while isinstance(command, click.Group) and words:
+        command = command.get_command(click.Context(command), words.pop(0))
+        assert command is not None, line
+    if "--help" not in words and not isinstance(command, click.Group):
+        command.make_context(line, words)
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_links_lead_somewhere(path):
+    for link in re.findall(r"\]\(([^)]+)\)", TEXTS[path]):
+        if not link.startswith("http"):
+            name, _, heading = link.partition("#")
+            target = path.parent / name if name else path
+            assert target.exists(), link
+            titles = re.findall(r"(?m)^#+ (.*)$", target.read_text("utf-8")) if heading else []
+            slugs = {re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles}
+            assert not heading or heading in slugs, link
+
+
+def test_the_theory_names_code_that_is_there():
+    code = {path: path.read_text("utf-8") for side in SIDES for path in side.rglob("*.py")}
+    for name in re.findall(r"`((?:\w+[./])*\w{4,})`", TEXTS[ROOT / "shared" / "THEORY.md"]):
+        if "/" in name:
+            assert any((side / f"{name}.py") in code for side in SIDES), name
+            continue
+        owner, _, last = name.rpartition(".")
+        own = [text for path, text in code.items() if path.stem == owner] or code.values()
+        assert any(re.search(rf"\b{last}\b", text) for text in own), name
+
+
+def test_the_readme_is_read_in_five_minutes():
+    assert len(TEXTS[ROOT / "README.md"].encode()) <= 12_288
+
+
+def test_its_python_runs(visco_artifact, capsys):
+    example = re.search(
+        r"```python\n(from palpate import ReducedModel.*?)```", TEXTS[DOCUMENTS[0]], re.S
+    )
+    own = (("artifacts/turbinate-visco.h5", str(visco_artifact)), ("(10, 20, 11)", "(5, 5, 8)"),
+           ("(11.9, 20, 11)", "(5, 5, 9.8)"))  # fmt: skip
+    script = example[1]
+    for shown, here in own:
+        assert shown in script
+        script = script.replace(shown, here)
+    names = {}
+    exec(script, names)
+    answer = names["answer"]
+    assert answer.converged
+    assert answer.time == pytest.approx(1.0)
+    assert np.linalg.norm(answer.contact_displacement) > 0
+    assert capsys.readouterr().out
+
+
+def test_figures_are_what_the_command_writes():
+    assert TEXTS[FIGURES / "FIGURES.md"] == document(WANTED, FOUND)
+    assert TABLE.search(TEXTS[ROOT / "README.md"])[0] == table(WANTED, FOUND)
+    assert set(FOUND) | {row["command"] for row in WANTED["readme"]} <= MEASURED
+
+
+def test_what_has_not_been_measured_is_said():
+    wanted = {
+        "heading": "", "readme": [],
+        "section": [{"title": "Time", "commands": ["a", "b"],
+                     "columns": {"cold": "{time/cold|warm:µs}", "share": "{share:%}", "n": "{n}"}}],
+    }  # fmt: skip
+    report = {"time": {"cold": 123.456, "warm": None}, "share": 0.00417}
+    found = {"a": {"commit": "c0ffee", "date": "2026-01-01", "report": report}}
+    rows = document(wanted, found).splitlines()[-2:]
+    assert rows == [
+        "| `a` | 123 µs / – | 0.42 % | – | c0ffee, 2026-01-01 |",
+        "| `b` | not measured | not measured | not measured |  |",
+    ]
