@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from palpate.offline.scenes import shipped_scenes
-from palpate.offline.studies.figures import TABLE, document, table
+from palpate.offline.studies.figures import TABLE, document, figures, table
 from palpate.shared.cli import main
 
 ROOT = Path(__file__).parents[1]
@@ -122,3 +122,25 @@ def test_what_has_not_been_measured_is_said():
         "| `a` | 123 µs / – | 0.42 % | – | c0ffee, 2026-01-01 |",
         "| `b` | not measured | not measured | not measured |  |",
     ]
+
+
+def test_a_report_is_measured_and_kept(visco_artifact, tmp_path, monkeypatch):
+    folder = tmp_path / "artifacts"
+    folder.mkdir()
+    (folder / "quick-visco.h5").symlink_to(visco_artifact)
+    (folder / "figures.json").write_text("{}")
+    (folder / "figures.toml").write_text(
+        'heading = ""\n'
+        'readme = [{what = "size", figure = "{bytes:MB}", command = "info quick-visco"}]\n'
+        '[[section]]\ntitle = "Size"\ncommands = ["info quick-visco", "bench quick-visco"]\n'
+        'columns = {size = "{bytes:MB}"}\n'
+    )
+    (tmp_path / "README.md").write_text("<!-- figures -->\nold\n<!-- end of figures -->\n")
+    monkeypatch.chdir(tmp_path)
+    figures(Path("artifacts"), "info *")
+    size = f"{visco_artifact.stat().st_size / 1e6:.3g} MB"
+    assert f"| `info quick-visco` | {size} | " in (folder / "FIGURES.md").read_text("utf-8")
+    assert "| `bench quick-visco` | not measured |" in (folder / "FIGURES.md").read_text("utf-8")
+    readme = (tmp_path / "README.md").read_text("utf-8")
+    assert f"| size | {size} | " in readme
+    assert "old" not in readme

@@ -25,13 +25,11 @@ Found = dict[str, dict[str, Any]]
 """``report``, ``commit`` and ``date`` by command."""
 
 RUN = "from palpate.shared.cli import main; main()"
-CODE = "offline", "online", "shared"
 
 UNITS = {"%": (100, 2), "s": (1, 3), "ms": (1e-3, 2), "µs": (1, 3), "MB": (1e-6, 3)}
 """Factor from what reports hold (1, s, µs, bytes), and digits shown."""
 
 TABLE = re.compile(r"(?<=<!-- figures -->\n).*?(?=<!-- end of figures -->)", re.DOTALL)
-"""README's figures."""
 
 
 def figures(folder: Path, pattern: str | None) -> None:
@@ -53,11 +51,13 @@ def _measure(path: Path, command: str) -> None:
     done = subprocess.run(run, stdout=subprocess.PIPE, text=True)
     if done.returncode:
         raise PalpateError(f"palpate {command}: failed")
-    head = subprocess.check_output(["git", "rev-parse", "--short", "HEAD"], text=True).strip()
-    changed = subprocess.call(["git", "diff", "--quiet", "HEAD", "--", *CODE])
+    here = Path(__file__).parent
+    head = subprocess.check_output(["git", "rev-parse", "--short", "HEAD"], cwd=here, text=True)
+    code = ":/offline", ":/online", ":/shared"
+    changed = subprocess.call(["git", "diff", "--quiet", "HEAD", "--", *code], cwd=here)
     found = json.loads(path.read_text("utf-8"))
     found[command] = {
-        "commit": head + "+" * changed,
+        "commit": head.strip() + "+" * changed,
         "date": datetime.now(UTC).date().isoformat(),
         "report": json.loads(done.stdout),
     }
