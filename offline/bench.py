@@ -1,6 +1,6 @@
-"""How long queries take, beside the full model: all kinds in turns, so that they share the weather.
+"""How long queries take beside the full model: in turns, at the same speed of the machine.
 
-A query's time is that of ``ReducedModel.solve`` as a caller sees it, from a position in space to an
+A query's time is that of ``ReducedModel.press`` as a caller sees it, from a position in space to an
 answer with its error estimate; fields are recovered after a cold query of their own.
 """
 
@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from palpate.offline.reduce.sampling import tangents
 from palpate.offline.run.workshop import Load, Workshop
 from palpate.offline.validate.loads import unseen_loads
+from palpate.shared.answer import Answer
 from palpate.shared.artifact import read_artifact
 from palpate.shared.mechanics.footprint import TIP_DEPTH, pressure_limit
 from palpate.shared.model import ReducedModel, Region
@@ -29,6 +31,9 @@ QUERIES = 100
 """Of each kind in a round, beside one full solution."""
 
 STEP = 0.05  # mm
+
+TURNS = 20
+"""Headings tried where the surface ends; if none leads on, the last is taken."""
 
 
 def bench(artifact: Path) -> dict[str, Any]:
@@ -51,45 +56,46 @@ def bench(artifact: Path) -> dict[str, Any]:
     workshop = Workshop.of_artifact(read_artifact(artifact))
     state, walker = atlas.new_warm(), atlas.new_warm()
     rng = np.random.default_rng(atlas.scene.seed)
+    times: dict[str, list[float]] = {}
 
-    def cold(load: Load) -> None:
+    def cold(load: Load) -> Answer:
         state.forget()
-        atlas.press(load.position, load.pressure, load.direction, warm=state)
+        return atlas.press(load.position, load.pressure, load.direction, warm=state)
 
-    def warm(load: Load) -> None:
-        atlas.press(load.position, load.pressure, load.direction, warm=walker)
+    def warm(load: Load) -> Answer:
+        return atlas.press(load.position, load.pressure, load.direction, warm=walker)
 
-    def with_fields(load: Load, region: Region) -> None:
-        state.forget()
-        solution = atlas.press(load.position, load.pressure, load.direction, warm=state)
-        displacement = atlas.displacement(solution)
-        atlas.von_mises(solution, region, displacement)
+    def touch(position: Array) -> Answer:
+        return atlas.touch(position, warm=walker)
+
+    def with_fields(region: Region, load: Load) -> None:
+        answer = cold(load)
+        displacement = atlas.displacement(answer)
+        atlas.von_mises(answer, region, displacement)
         if region == "surface":
             np.take(displacement, atlas.surface_nodes, axis=0)
 
-    times: dict[str, list[float]] = {}
-
-    def touch(position: Array) -> None:
-        atlas.touch(position, warm=walker)
-
-    def take(kind: str, query: Callable[[Any], object], loads: list[Any]) -> None:
-        times.setdefault(kind, []).extend(_time(query, load) for load in loads)
+    def take(kind: str, query: Callable[[Any], object], asked: Sequence[Any]) -> None:
+        for one in asked:
+            started = time.perf_counter()
+            query(one)
+            taken = time.perf_counter() - started
+            times.setdefault(kind, []).append(1e6 * taken)
 
     for round_ in range(ROUNDS + 1):
         loads = unseen_loads(atlas, QUERIES, round_)
-        first, *steps = walk(atlas, loads[0], QUERIES + 1, rng)
+        path = walk(atlas, loads[0], QUERIES + 1, rng)
         take("cold_us", cold, loads)
-        warm(first)
-        take("warm_us", warm, steps)
-        take("surface_us", lambda load: with_fields(load, "surface"), loads)
-        take("fields_us", lambda load: with_fields(load, "all"), loads)
+        warm(path[0])
+        take("warm_us", warm, path[1:])
+        take("surface_us", partial(with_fields, "surface"), loads)
+        take("fields_us", partial(with_fields, "all"), loads)
         take("full_us", workshop.sample, loads[:1])
         if atlas.models.tips is not None:
-            first_touch, *touches = [tip_at(atlas, load) for load in (first, *steps)]
-            touch(first_touch)
-            take("tip_us", touch, touches)
-        if round_ == 0:
-            # compiled code came in from disk
+            touches = [tip_at(atlas, load) for load in path]
+            touch(touches[0])
+            take("tip_us", touch, touches[1:])
+        if round_ == 0:  # compiled code came in from disk
             times.clear()
     medians = {kind: float(np.median(found)) for kind, found in times.items()}
     return medians | {
@@ -98,28 +104,36 @@ def bench(artifact: Path) -> dict[str, Any]:
     }
 
 
-def walk(atlas: ReducedModel, start: Load, count: int, rng: np.random.Generator) -> list[Load]:
-    """Loads that glide over the surface in steps of ``STEP``, turning where it ends.
+def walk(
+    atlas: ReducedModel, start: Load, count: int, rng: np.random.Generator, step: float = STEP
+) -> list[Load]:
+    """Loads that glide over the surface in steps (mm), turning where it ends.
 
     Tilt and share of the local pressure limit are those of ``start``.
     """
-    surface = atlas.surface
-    x, normal, _, fields = surface.locate(start.position, atlas.limits)
-    share = start.pressure / pressure_limit(fields, normal, start.direction)
+    surface, x = atlas.surface, start.position
+    normal = surface.project(x)[1]
+    share = start.pressure / limit_at(atlas, x, start.direction)
     cosine = min(1.0, -float(start.direction @ normal))
-    heading = _random_tangent(normal, rng)
+    heading, turns = _random_tangent(normal, rng), 0
     loads: list[Load] = []
     while len(loads) < count:
-        reached, normal, _, fields = surface.locate(x + STEP * heading, atlas.limits)
-        if np.linalg.norm(reached - x) < 0.9 * STEP:
-            heading = _random_tangent(normal, rng)
+        reached, above, _ = surface.project(x + step * heading)
+        if np.linalg.norm(reached - x) < 0.9 * step and turns < TURNS:
+            heading, turns = _random_tangent(normal, rng), turns + 1
             continue
-        x = reached
+        x, normal, turns = reached, above, 0
         heading = heading - (heading @ normal) * normal
         heading /= np.linalg.norm(heading)
         direction = math.sqrt(1 - cosine**2) * heading - cosine * normal
-        loads.append(Load(x, direction, share * pressure_limit(fields, normal, direction)))
+        loads.append(Load(x, direction, share * limit_at(atlas, x, direction)))
     return loads
+
+
+def limit_at(atlas: ReducedModel, position: Array, direction: Array) -> float:
+    """Largest trained pressure (kPa) at a place along a direction."""
+    _, normal, _, fields = atlas.surface.locate(position, atlas.limits)
+    return float(pressure_limit(fields, normal, direction))
 
 
 def tip_at(atlas: ReducedModel, load: Load) -> Array:
@@ -132,10 +146,3 @@ def _random_tangent(normal: Array, rng: np.random.Generator) -> Array:
     turn = 2 * math.pi * rng.random()
     t, b = tangents(normal)
     return math.cos(turn) * t + math.sin(turn) * b
-
-
-def _time(query: Callable[[Any], object], load: Any) -> float:
-    """Time of one query, µs."""
-    started = time.perf_counter()
-    query(load)
-    return 1e6 * (time.perf_counter() - started)

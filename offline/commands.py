@@ -262,14 +262,16 @@ def figures(measure: str | None) -> None:
     figures(Path("artifacts"), measure)
 
 
+def report_option(default: Path | None) -> Callable[[Callable[..., T]], Callable[..., T]]:
+    """Option of the folder that tables and pictures go to."""
+    kind, shown = click.Path(file_okay=False, path_type=Path), default is not None
+    text = "Folder for tables and pictures."
+    text += "" if shown else "  [default: artifacts/SCENE/report]"
+    return click.option("--report", type=kind, default=default, show_default=shown, help=text)
+
+
 @study.command("mesh-error")
-@click.option(
-    "--report",
-    type=click.Path(file_okay=False, path_type=Path),
-    default=Path("artifacts/turbinate/report"),
-    show_default=True,
-    help="Folder for the tables and the chart.",
-)
+@report_option(Path("artifacts/turbinate/report"))
 @reporting
 def mesh_error(report: Path) -> Report:
     """Compare elements of about 6048 DOFs with a fine mesh.
@@ -301,86 +303,7 @@ def chart(scene: str, artifact: Path | None, **settings: Any) -> Report:
     from palpate.offline.studies.chart import chart
 
     found = find_scene(scene)
-    return chart(found, artifact or default_artifact(found), **settings)
-
-
-@study.command()
-@artifact_argument
-@count_option("--paths", 10, "Number of paths.")
-@count_option("--steps", 60, "Steps of each path.")
-@seed_option
-@click.option(
-    "--tip", is_flag=True, help="Glide with the rigid tip and measure jumps of the force on it."
-)
-@reporting
-def continuity(**settings: Any) -> Report:
-    """Measure jumps in the answers of an artifact as the contact glides.
-
-    The change over steps of 0.05 mm that the full model does not show: of the displacement, largest
-    of all nodes, in mm; of the force on the tip, over its largest on the path.
-    """
-    from palpate.offline.studies.continuity import continuity
-
-    return continuity(**settings)
-
-
-paper_report = click.option(
-    "--report",
-    type=click.Path(file_okay=False, path_type=Path),
-    help="Folder for table and pictures.  [default: artifacts/SCENE/report]",
-)
-
-
-@study.command()
-@click.argument("scene", type=click.Choice(["cube", "cube-visco"]), default="cube")
-@paper_report
-@reporting
-def cube(scene: str, report: Path | None) -> Report:
-    """Redraw figure 1 of Radermacher & Reese.
-
-    A cube under compression in modal, Ritz and POD bases: relative error at a point and ratio of
-    CPU times against the number of bases, and which of the paper's claims hold. SCENE cube-visco is
-    of visco-elastic tissue: pressed, held and let go.
-    """
-    from palpate.offline.studies import paper
-
-    return paper.cube(scene, report or Path("artifacts", scene, "report"))
-
-
-@study.command()
-@click.argument("scene", type=click.Choice(["turbinate", "turbinate-visco"]), default="turbinate")
-@paper_report
-@reporting
-def turbinate(scene: str, report: Path | None) -> Report:
-    """Redraw figures 1, 2c and 2d of Radermacher & Reese.
-
-    The turbinate under one footprint in modal, Ritz and POD bases, and contours of the relative
-    errors in five POD bases, for which PyVista is needed: pip install -e '.[pictures]'. SCENE
-    turbinate-visco is of visco-elastic tissue, pressed, held and let go; without contours.
-    """
-    from palpate.offline.studies import paper
-
-    return paper.turbinate(scene, report or Path("artifacts", scene, "report"))
-
-
-@study.command()
-@click.argument("scene")
-@artifact_option
-@count_option("--cases", 20, "Number of cases of each kind.")
-@seed_option
-@reporting
-def stability(scene: str, artifact: Path | None, **settings: Any) -> Report:
-    """Map which methods fail under what, and whether they say so.
-
-    The artifact of SCENE and other methods answer CASES loads of every kind, in range and far
-    beyond it, for which the full model's answer is known. The map goes to NAME/report/stability.csv
-    and .png beside the artifact, the artifact's silent errors to
-    stability_silent.csv. A killed run goes on where it stopped.
-    """
-    from palpate.offline.scenes import default_artifact, find_scene
-    from palpate.offline.studies.stability import stability
-
-    return stability(artifact or default_artifact(find_scene(scene)), **settings)
+    return chart(artifact or default_artifact(found), found, **settings)
 
 
 @study.command("chart-in-time")
@@ -397,9 +320,29 @@ def chart_in_time(artifact: Path, histories: int, snapshots: int, seed: int) -> 
     with this seed. Table, picture and page go to NAME/report/chart_in_time.csv, .png and .html
     beside the artifact.
     """
-    from palpate.offline.studies.chart import chart_in_time
+    from palpate.offline.studies.chart import chart
 
-    return chart_in_time(artifact, histories, snapshots, seed)
+    return chart(artifact, None, snapshots, histories, seed)
+
+
+@study.command()
+@click.argument("scene")
+@artifact_option
+@count_option("--cases", 20, "Number of cases of each kind.")
+@seed_option
+@reporting
+def stability(scene: str, artifact: Path | None, **settings: Any) -> Report:
+    """Map which methods fail under what, and whether they say so.
+
+    The artifact of SCENE and other methods answer CASES loads of every kind, in range and far
+    beyond it, for which the full model's answer is known. The map goes to NAME/report/stability.csv
+    and .png beside the artifact, the artifact's silent errors to stability_silent.csv. A killed run
+    goes on where it stopped.
+    """
+    from palpate.offline.scenes import default_artifact, find_scene
+    from palpate.offline.studies.stability import stability
+
+    return stability(artifact or default_artifact(find_scene(scene)), **settings)
 
 
 @study.command("stability-in-time")
@@ -423,6 +366,56 @@ def stability_in_time(**settings: Any) -> Report:
 
 @study.command()
 @artifact_argument
+@count_option("--paths", 10, "Number of paths.")
+@count_option("--steps", 60, "Steps of each path.")
+@seed_option
+@click.option("--tip", is_flag=True, help="Glide with the rigid tip: jumps of the force on it.")
+@reporting
+def continuity(**settings: Any) -> Report:
+    """Measure jumps in the answers of an artifact as the contact glides.
+
+    The change over steps of 0.05 mm that the full model does not show: of the displacement, largest
+    of all nodes, in mm; of the force on the tip, over its largest on the path.
+    """
+    from palpate.offline.studies.continuity import continuity
+
+    return continuity(**settings)
+
+
+@study.command()
+@click.argument("scene", type=click.Choice(["cube", "cube-visco"]), default="cube")
+@report_option(None)
+@reporting
+def cube(scene: str, report: Path | None) -> Report:
+    """Redraw figure 1 of Radermacher & Reese.
+
+    A cube under compression in modal, Ritz and POD bases: relative error at a point and ratio of
+    CPU times against the number of bases, and which of the paper's claims hold. SCENE cube-visco is
+    of visco-elastic tissue: pressed, held and let go.
+    """
+    from palpate.offline.studies import paper
+
+    return paper.cube(scene, report or Path("artifacts", scene, "report"))
+
+
+@study.command()
+@click.argument("scene", type=click.Choice(["turbinate", "turbinate-visco"]), default="turbinate")
+@report_option(None)
+@reporting
+def turbinate(scene: str, report: Path | None) -> Report:
+    """Redraw figures 1, 2c and 2d of Radermacher & Reese.
+
+    The turbinate under one footprint in modal, Ritz and POD bases, and contours of the relative
+    errors in five POD bases, for which PyVista is needed: pip install -e '.[pictures]'. SCENE
+    turbinate-visco is of visco-elastic tissue, pressed, held and let go; without contours.
+    """
+    from palpate.offline.studies import paper
+
+    return paper.turbinate(scene, report or Path("artifacts", scene, "report"))
+
+
+@study.command()
+@artifact_argument
 @place_option(False, "Where to press, mm.  [default: the middle]")
 @reporting
 def relaxation(artifact: Path, position: tuple[float, float, float] | None) -> Report:
@@ -431,9 +424,6 @@ def relaxation(artifact: Path, position: tuple[float, float, float] | None) -> R
     Force and depth over time, of the full and the reduced model, go to NAME/report/relaxation.csv
     and .png beside the artifact.
     """
-    import numpy as np
-
     from palpate.offline.studies.relaxation import relaxation
 
-    at = None if position is None else np.array(position)
-    return relaxation(artifact, at)
+    return relaxation(artifact, position)

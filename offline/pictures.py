@@ -8,7 +8,7 @@ deformed surface lets it: the model knows its pressure only.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from palpate.shared.errors import PalpateError
 from palpate.shared.model import ReducedModel
 
 Array = NDArray[np.float64]
+Fields = Mapping[str, NDArray[np.floating[Any]]]
 
 SIZE = (1500, 720)
 SUBDIVISIONS = 3
@@ -41,6 +42,49 @@ ROOM = (0.95, 0.72)
 COLOURS = "YlOrRd"
 INK, FAINT, STEEL = "#202428", "#8a949e", "#5b7c99"
 SHINE = {"smooth_shading": True, "ambient": 0.65, "diffuse": 0.45}
+
+
+def require_pyvista() -> Any:
+    """Return the module ``pyvista``, or say how to install it."""
+    try:
+        import pyvista
+    except ImportError as error:
+        raise PalpateError("pictures need PyVista: pip install -e '.[pictures]'") from error
+    return pyvista
+
+
+def body(nodes: Array, elements: NDArray[np.integer[Any]], at: Array, fields: Fields) -> Any:
+    """A body's grid and its surface, with nodal fields and the distance ``from_contact``."""
+    pv = require_pyvista()
+    grid = pv.UnstructuredGrid({CELL_TYPES[elements.shape[1]]: elements}, nodes)
+    for name, values in fields.items():
+        grid[name] = values
+    surface = grid.extract_surface(algorithm="dataset_surface", nonlinear_subdivision=SUBDIVISIONS)
+    surface["from_contact"] = np.linalg.norm(surface.points - at, axis=1)
+    return grid, surface
+
+
+def ring(surface: Any, at: Array, radius: float, thickness: float) -> Any:
+    """A tube along the rim of a footprint on a surface of ``body``."""
+    rim = surface.contour([radius], scalars="from_contact")
+    return rim.connectivity("closest", closest_point=at).tube(radius=thickness * radius)
+
+
+def new_plotter(shape: tuple[int, int], size: tuple[int, int]) -> Any:
+    """A white plotter without a window."""
+    pv = require_pyvista()
+    # VTK reports every way to a window that it tries in vain
+    with pv.vtk_verbosity("off"):
+        plotter = pv.Plotter(off_screen=True, shape=shape, window_size=size, border=False)
+    plotter.set_background("white")
+    return plotter
+
+
+def save(plotter: Any, out: Path) -> None:
+    """Write what is drawn as PNG."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    plotter.screenshot(str(out))
+    plotter.close()
 
 
 def picture(
@@ -67,41 +111,29 @@ def picture(
     PalpateError
         If PyVista is missing, the artifact is unusable or the load makes no sense.
     """
-    try:
-        import pyvista as pv
-    except ImportError as error:
-        raise PalpateError("pictures need PyVista: pip install -e '.[pictures]'") from error
+    require_pyvista()
     atlas = ReducedModel.load(artifact)
     solution = atlas.press(position, pressure, direction)
-    displacement = atlas.displacement(solution).astype(float)
-    elements = atlas.body.elements
-    grid = pv.UnstructuredGrid({CELL_TYPES[elements.shape[1]]: elements}, atlas.nodes)
-    grid["displacement"] = displacement
-    grid["von_mises"] = atlas.von_mises(solution)
-    rest = grid.extract_surface(algorithm="dataset_surface", nonlinear_subdivision=SUBDIVISIONS)
-    rest["from_contact"] = np.linalg.norm(rest.points - solution.contact_point, axis=1)
+    stress = atlas.von_mises(solution)
+    fields = {"displacement": atlas.displacement(solution).astype(float), "von_mises": stress}
+    grid, rest = body(atlas.nodes, atlas.body.elements, solution.contact_point, fields)
     pressed = rest.warp_by_vector("displacement")
-    tip = _tip_centre(pressed.points, solution)
+    endoscope = _endoscope(_tip_centre(pressed.points, solution), solution)
     # at the edge of the support the stress is the mesh's, not the tissue's
-    most = max(float(np.ceil(10 * np.percentile(grid["von_mises"], 99.5)) / 10), 0.1)
+    most = max(float(np.ceil(10 * np.percentile(stress, 99.5)) / 10), 0.1)
     paint = {"scalars": "von_mises", "cmap": COLOURS, "clim": (0.0, most), "show_scalar_bar": False}
-
-    # VTK reports every way to a window that it tries in vain
-    with pv.vtk_verbosity("off"):
-        plotter = pv.Plotter(off_screen=True, shape=(1, 2), window_size=SIZE, border=False)
-    plotter.set_background("white")
     normal, across = solution.normal, _across(atlas.nodes, solution)
     cut = {"normal": across, "origin": solution.contact_point}
     words = {"position": TITLE, "viewport": True, "font_size": 11, "color": INK}
-    edges = {"feature_angle": SHARP, "boundary_edges": False}
+    edges = rest.extract_feature_edges(feature_angle=SHARP, boundary_edges=False)
+    rim = ring(pressed, solution.contact_point, solution.radius, 0.03)
 
+    plotter = new_plotter((1, 2), SIZE)
     plotter.subplot(0, 0)
     plotter.add_mesh(pressed, **paint, **SHINE)
-    plotter.add_mesh(rest.extract_feature_edges(**edges), color=FAINT, line_width=1.5, opacity=0.5)
-    rim = pressed.contour([solution.radius], scalars="from_contact")
-    rim = rim.connectivity("closest", closest_point=solution.contact_point)
-    plotter.add_mesh(rim.tube(radius=0.03 * solution.radius), color=INK)
-    for part in _endoscope(pv, tip, solution):
+    plotter.add_mesh(edges, color=FAINT, line_width=1.5, opacity=0.5)
+    plotter.add_mesh(rim, color=INK)
+    for part in endoscope:
         plotter.add_mesh(part, color=STEEL, opacity=0.6, smooth_shading=True)
     plotter.add_axes(color=INK, line_width=2)
     plotter.add_text(_caption(solution), **words)
@@ -109,11 +141,10 @@ def picture(
 
     plotter.subplot(0, 1)
     section = grid.warp_by_vector("displacement").tessellate(max_n_subdivide=SUBDIVISIONS)
-    section = section.slice(**cut)
-    painted = plotter.add_mesh(section, **paint, lighting=False)
+    painted = plotter.add_mesh(section.slice(**cut), **paint, lighting=False)
     plotter.add_mesh(rest.slice(**cut), color=FAINT, line_width=2)
     plotter.add_mesh(pressed.slice(**cut), color=INK, line_width=2)
-    for part in _endoscope(pv, tip, solution):
+    for part in endoscope:
         plotter.add_mesh(part.slice(**cut), color=STEEL, lighting=False, line_width=6)
     plotter.add_text("Cut through the contact\ngrey: at rest", **words)
     plotter.add_scalar_bar(
@@ -122,9 +153,7 @@ def picture(
         label_font_size=18,
     )  # fmt: skip
     _look(plotter, across, _up(normal))
-    out.parent.mkdir(parents=True, exist_ok=True)
-    plotter.screenshot(str(out))
-    plotter.close()
+    save(plotter, out)
 
 
 def _tip_centre(surface: Array, solution: Answer) -> Array:
@@ -140,9 +169,9 @@ def _tip_centre(surface: Array, solution: Answer) -> Array:
     return centre
 
 
-def _endoscope(pv: Any, tip: Array, solution: Answer) -> list[Any]:
+def _endoscope(tip: Array, solution: Answer) -> list[Any]:
     """Surfaces of the half ball and of the shaft behind it."""
-    d, R = solution.direction, solution.radius
+    pv, d, R = require_pyvista(), solution.direction, solution.radius
     ball = pv.Sphere(radius=R, center=tip, theta_resolution=60, phi_resolution=60)
     shaft = pv.Cylinder(
         center=tip - SHAFT / 2 * R * d, direction=d, radius=R, height=SHAFT * R,

@@ -18,15 +18,14 @@ from palpate.offline.fem.model import FullModel
 from palpate.offline.methods.cubatures import PointForces, point_forces
 from palpate.offline.methods.deim import Deim, PlainNewton, force_modes, sample
 from palpate.offline.methods.full import Full, Remeshed
-from palpate.offline.methods.galerkin import Galerkin, GalerkinAtHand, GalerkinInTime
-from palpate.offline.methods.galerkin_model import Cubature, GalerkinModel
+from palpate.offline.methods.galerkin import Cubature, Galerkin, GalerkinAtHand, GalerkinModel
 from palpate.offline.methods.lattice import scaled
 from palpate.offline.methods.mass_spring import MassSpring
 from palpate.offline.methods.method import Case, Method, Snapshots
 from palpate.offline.methods.regression import Linear, Regression, compliance
-from palpate.offline.methods.shipped import Shipped, ShippedInTime, TipInTime, Warm
+from palpate.offline.methods.shipped import Shipped, Way
 from palpate.offline.methods.spaces import Inner, krylov, mass, modal, pod, static_derivatives
-from palpate.offline.methods.tensor_mass import Law, TensorMass
+from palpate.offline.methods.tensor_mass import TensorMass
 from palpate.offline.reduce.ritz import TANGENTIAL
 from palpate.offline.reduce.sampling import spread_points, tangents
 from palpate.offline.run.workshop import Workshop
@@ -89,22 +88,10 @@ class Training:
         """Random numbers of a stage, the same whatever was built before."""
         return np.random.default_rng([self.seed, *stage])
 
-    @property
-    def artifact(self) -> ReducedModel:
-        """The artifact's reduced model; ``PalpateError`` if there is none."""
-        if self.atlas is None:
-            raise PalpateError("artifact: the training context has none")
-        return self.atlas
-
     @cached_property
     def mass(self) -> csr_matrix:
         """Mass of the free dofs; see ``offline.methods.spaces.mass``."""
         return mass(self.model)
-
-    @cached_property
-    def cases(self) -> list[Case]:
-        """Cases of the first snapshots."""
-        return [Case.of(self.workshop, load) for load in self.snapshots.loads[:CASES]]
 
     @cached_property
     def _footprints(self) -> Array:
@@ -127,13 +114,11 @@ class Training:
 
     def point_forces(self, basis: Array) -> PointForces:
         """What a cubature of a basis is fitted to."""
-        reduced = GalerkinModel(self.model, basis.shape[1], Cubature.full(self.model))
+        size, per_element = basis.shape[1], self.model.weights.shape[1]
+        reduced = GalerkinModel(self.model, size, Cubature.full(self.model))
         reduced.adopt(basis)
-        per_element = self.model.weights.shape[1]
-        return point_forces(reduced, per_element, self.cases, self.rng(basis.shape[1]))
-
-
-Builder = Callable[[int, Training], Method]
+        cases = [Case.of(self.workshop, load) for load in self.snapshots.loads[:CASES]]
+        return point_forces(reduced, per_element, cases, self.rng(size))
 
 
 def build(name: str, size: float, training: Training) -> Method:
@@ -155,7 +140,7 @@ def build(name: str, size: float, training: Training) -> Method:
 
 
 def _every_point(training: Training, basis: Array) -> Method:
-    return (GalerkinInTime if training.in_time else Galerkin)(training.workshop, basis)
+    return Galerkin(training.workshop, basis, in_time=training.in_time)
 
 
 def _krylov(size: int, training: Training, moments: int = MOMENTS) -> Method:
@@ -165,15 +150,15 @@ def _krylov(size: int, training: Training, moments: int = MOMENTS) -> Method:
 
 def _pod_ecm(size: int, training: Training, points: int = POINTS_PER_MODE) -> Method:
     basis = training.pod(size)
-    most = points * basis.shape[1]
-    cubature = training.point_forces(basis).by_point(most, training.rng(size))
+    forces = training.point_forces(basis)
+    cubature = forces.by_point(points * basis.shape[1], training.rng(size))
     return Galerkin(training.workshop, basis, cubature)
 
 
 def _pod_ecsw(size: int, training: Training) -> Method:
     basis = training.pod(size)
-    most = ELEMENTS_PER_MODE * basis.shape[1]
-    cubature = training.point_forces(basis).by_element(most, training.rng(size))
+    forces = training.point_forces(basis)
+    cubature = forces.by_element(ELEMENTS_PER_MODE * basis.shape[1], training.rng(size))
     return Galerkin(training.workshop, basis, cubature)
 
 
@@ -221,6 +206,14 @@ def loads_about(workshop: Workshop, case: Case) -> Array:
 # --- all of them ---------------------------------------------------------------------------------
 
 
+def _shipped(size: int, training: Training, way: Way = "cold") -> Method:
+    if training.atlas is None:
+        raise PalpateError("artifact: the training context has none")
+    if way == "cold" and training.in_time:
+        way = "in time"
+    return Shipped(training.workshop, training.atlas, way)
+
+
 def _full(factor: float, training: Training) -> Method:
     if factor == 1:
         return Full(training.workshop)
@@ -229,11 +222,7 @@ def _full(factor: float, training: Training) -> Method:
     return Remeshed(training.scene, factor)
 
 
-def _tensor_mass(factor: float, training: Training, law: Law) -> Method:
-    return TensorMass(training.workshop, scaled(training.workshop.scene, factor), law)
-
-
-BUILDERS: dict[str, Builder] = {
+BUILDERS: dict[str, Callable[[int, Training], Method]] = {
     "modal": lambda size, t: _every_point(t, modal(t.model, size)),
     "ritz": partial(_krylov, moments=1),
     "krylov": _krylov,
@@ -249,16 +238,15 @@ BUILDERS: dict[str, Builder] = {
     "derivatives": _derivatives,
     "linear": lambda size, t: Linear(t.workshop, t.compliance[:, :size]),
     "regression": lambda size, t: Regression(t.workshop, t.pod(size), t.snapshots),
-    "artifact": lambda size, t: (ShippedInTime if t.in_time else Shipped)(t.artifact),
-    "artifact, warm": lambda size, t: Warm(t.artifact),
-    "artifact, tip": lambda size, t: TipInTime(t.artifact),
+    "artifact": _shipped,
+    "artifact, warm": partial(_shipped, way="warm"),
+    "artifact, tip": partial(_shipped, way="tip"),
 }
 """Methods whose size is their number of unknowns."""
 
 MESHED: dict[str, Callable[[float, Training], Method]] = {
     "full": _full,
     "mass-spring": lambda factor, t: MassSpring(t.workshop, scaled(t.workshop.scene, factor)),
-    "tensor-mass linear": partial(_tensor_mass, law="linear"),
-    "tensor-mass nonlinear": partial(_tensor_mass, law="st-venant-kirchhoff"),
+    "tensor-mass": lambda factor, t: TensorMass(t.workshop, scaled(t.workshop.scene, factor)),
 }
 """Methods with a mesh of their own, whose size is the factor on the divisions of the scene's."""

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.methods.galerkin_model import Cubature, GalerkinModel, stress_points
+from palpate.offline.methods.galerkin import Cubature, GalerkinModel, stress_points
 from palpate.offline.methods.method import Case
 from palpate.offline.reduce.cubature import compress, nonnegative
 from palpate.shared.reduced.points import LANES
@@ -86,28 +86,23 @@ def point_forces(
     for case in cases:
         if not reduced.solve(case)[0]:
             continue
-        q = reduced.content.q.copy()
-        L = np.tril(reduced.content.problem.correction.factor)
+        q = reduced.state
+        L = np.linalg.cholesky(reduced.tangent(q))
         departure = OFF_EQUILIBRIUM * np.abs(q) * rng.standard_normal(len(q))
         for state in (q, q + departure):
             looks = np.linalg.solve(L.T, rng.standard_normal((len(q), LOOKS)))
             looks /= np.sqrt(LOOKS) * np.linalg.norm(q)
-            forces = _contributions(reduced, state, looks)
-            if forces is not None:
-                columns.append(forces)
+            if stress_points(reduced.content, state) > 0.0:
+                columns.append(_contributions(reduced, looks))
     count = len(reduced.points)
-    weights = reduced.content.problem.points.weights[:count]
+    weights = reduced.content.points.weights[:count]
     return PointForces(np.hstack(columns)[:count], weights, per_element)
 
 
-def _contributions(
-    reduced: GalerkinModel, q: Array, looks: NDArray[np.floating]
-) -> NDArray[np.float32] | None:
-    """Nonlinear forces (c, k) along ``looks`` (m, k) at coordinates q; None beyond inversion."""
-    problem = reduced.content.problem
-    if not stress_points(problem, q) > 0.0:
-        return None
-    work = (looks.T.astype(np.float32) @ problem.points.gradients) * problem.work.P
+def _contributions(reduced: GalerkinModel, looks: Array) -> NDArray[np.float32]:
+    """Nonlinear forces (c, k) of the points' stress along ``looks`` (m, k)."""
+    content = reduced.content
+    work = (looks.T.astype(np.float32) @ content.points.gradients) * content.work.P
     tiles = work.reshape(len(work), -1, 9, LANES).sum(axis=2)
     return np.ascontiguousarray(tiles.reshape(len(work), -1).T)
 

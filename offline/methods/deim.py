@@ -27,8 +27,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from palpate.offline.fem.model import FullModel
-from palpate.offline.methods.galerkin_model import (
-    MAX_ITERATIONS,
+from palpate.offline.methods.galerkin import (
     TOLERANCE,
     Content,
     Cubature,
@@ -38,12 +37,14 @@ from palpate.offline.methods.galerkin_model import (
     reduce_load,
     stress_points,
 )
-from palpate.offline.methods.method import Answer, Case, Memoryless
+from palpate.offline.methods.method import Answer, Case, Method
 from palpate.offline.run.workshop import Workshop
 from palpate.shared.compiled import bind
-from palpate.shared.reduced.points import project
+from palpate.shared.reduced.points import STATE, project
 
 Array = NDArray[np.float64]
+
+MAX_ITERATIONS = 60
 
 
 @dataclass(frozen=True)
@@ -99,35 +100,36 @@ def sample(modes: Array, per_mode: int) -> Samples:
 
 class _Content(NamedTuple):
     trial: Content
-    test: NDArray[np.float32]  # (m, 9 c) gradients of the test functions, in tiles
+    test: NDArray[np.float32]  # (r, 9 c) gradients of the test functions, in tiles
+    state: NDArray[np.float32]  # scratch of ``linearise_points``
+    products: NDArray[np.float32]  # (r, 9 c)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _newton(content, nodes, forces):
     """Plain Newton's method from rest: (converged, iterations), and ``q``."""
-    test, q, work = content.test, content.trial.q, content.trial.newton
-    s = content.trial.problem
-    reduce_load(content.trial.modes, nodes, forces, s.load.f)
-    q[:] = s.load.f
-    residual = work[0]
-    target = max(TOLERANCE * math.sqrt(np.dot(s.load.f, s.load.f)), 1e-12)
+    trial, test = content.trial, content.test
+    q, f, residual = trial.q, trial.load.f, trial.newton[0]
+    reduce_load(trial.modes, nodes, forces, f)
+    q[:] = f
+    target = max(TOLERANCE * math.sqrt(np.dot(f, f)), 1e-12)
     for iteration in range(1, MAX_ITERATIONS):
-        if not stress_points(s, q) > 0.0:
+        if not stress_points(trial, q) > 0.0:
             return False, iteration
-        project(test, s.work.P, residual)
+        project(test, trial.work.P, residual)
         for i in range(len(q)):
-            residual[i] += q[i] - s.load.f[i]
+            residual[i] += q[i] - f[i]
         if math.sqrt(np.dot(residual, residual)) <= target:
             return True, iteration
-        linearise_points(s)
-        s.correction.whole[:] = np.dot(test, s.correction.products.T)
+        linearise_points(trial, content.state, content.products)
+        tangent = np.dot(test, content.products.T).astype(np.float64)
         for i in range(len(q)):
-            s.correction.whole[i, i] += 1.0
-        q -= np.linalg.solve(s.correction.whole, residual)
+            tangent[i, i] += 1.0
+        q -= np.linalg.solve(tangent, residual)
     return False, MAX_ITERATIONS
 
 
-class PlainNewton(Memoryless):
+class PlainNewton(Method):
     """A reduced model by Newton's method without a line search: every step is taken whole.
 
     With the trial functions as test functions it is a Galerkin method.  The state is the modes'
@@ -154,7 +156,9 @@ class PlainNewton(Memoryless):
     ) -> None:
         super().__init__(workshop, unknowns, label)
         self._reduced = reduced
-        self._bound = bind(_Content(reduced.content, test))
+        points = len(reduced.content.points.weights)
+        scratch = np.empty(STATE * points, np.float32), np.empty_like(test)
+        self._bound = bind(_Content(reduced.content, test, *scratch))
 
     @classmethod
     def galerkin(cls, workshop: Workshop, basis: Array) -> PlainNewton:
@@ -162,7 +166,7 @@ class PlainNewton(Memoryless):
         model, m = workshop.model, basis.shape[1]
         reduced = GalerkinModel(model, m, Cubature.full(model))
         reduced.adopt(basis)
-        return cls(workshop, m, "no line search", reduced, reduced.content.problem.points.gradients)
+        return cls(workshop, m, "no line search", reduced, reduced.content.points.gradients)
 
     def step(self, state: Array | None, case: Case, dt: float = 0.0) -> Answer:
         """See ``Method``."""
@@ -170,11 +174,10 @@ class PlainNewton(Memoryless):
             converged, iterations = _newton(self._bound, case.nodes, case.forces)
         except np.linalg.LinAlgError:  # a singular tangent, or none that is finite
             converged, iterations = False, MAX_ITERATIONS
-        found = self._reduced.content.q.copy() if converged else state
-        return Answer(found, converged, converged, iterations)
+        return Answer(self._reduced.state if converged else state, converged, iterations)
 
     def field(self, state: Array) -> Array:
-        """See ``Memoryless``."""
+        """See ``Method``."""
         return self._reduced.displacement(state)
 
 
@@ -193,20 +196,15 @@ class Deim(PlainNewton):
 
     def __init__(self, workshop: Workshop, basis: Array, modes: Array, samples: Samples) -> None:
         model, unknowns = workshop.model, basis.shape[1]
-        self.points = _points_touched(model, samples.dofs)
+        touched = np.isin(model.connectivity, model.free[samples.dofs] // 3).any(axis=1)
+        own = np.arange(model.weights.shape[1])
+        self.points = (len(own) * np.flatnonzero(touched)[:, None] + own).ravel()
         weights = model.weights.ravel()[self.points]
         reduced = GalerkinModel(model, unknowns, Cubature(self.points, weights))
         reduced.adopt(basis)
         functions = np.zeros((3 * len(model.mesh.nodes), unknowns))
         functions[model.free[samples.dofs]] = (basis.T @ modes @ samples.fit).T
-        test = np.zeros_like(reduced.content.problem.points.gradients)
+        test = np.zeros_like(reduced.content.points.gradients)
         point_gradients(model.connectivity, model.gradients, self.points, functions, test)
         label = f"{unknowns} modes, {len(samples.dofs)} sampled dofs"
         super().__init__(workshop, unknowns, label, reduced, test)
-
-
-def _points_touched(model: FullModel, dofs: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Quadrature points of the elements that have a share in the force on free dofs."""
-    touched = np.isin(model.connectivity, model.free[dofs] // 3).any(axis=1)
-    per_element = model.weights.shape[1]
-    return (per_element * np.flatnonzero(touched)[:, None] + np.arange(per_element)).ravel()

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from palpate.offline.fem.model import History, NoEquilibrium
 from palpate.offline.methods.lattice import coordinates, interpolation, lattice
-from palpate.offline.methods.method import Answer, Case, Memoryless, Method
+from palpate.offline.methods.method import Answer, Case, Method
 from palpate.offline.run.workshop import Load, Workshop
 from palpate.shared.scene import Scene, divisions_of
 
@@ -15,51 +15,36 @@ Array = NDArray[np.float64]
 
 
 class Full(Method):
-    """Newton's method on every free degree of freedom.
-
-    Elastic tissue is solved from rest, in one jump if that converges; visco-elastic tissue steps
-    on from its history.
+    """Newton's method on every free degree of freedom, from the last answer.
 
     Parameters
     ----------
     workshop : Workshop
     """
 
-    label = "full"
-
     def __init__(self, workshop: Workshop) -> None:
-        self.unknowns = len(workshop.model.free)
-        self._workshop, self._model = workshop, workshop.model
+        super().__init__(workshop, len(workshop.model.free), "full")
 
     def at_rest(self) -> History:
         """See ``Method``."""
-        return self._model.at_rest
+        return self.workshop.model.at_rest
 
     def step(self, state: History, case: Case, dt: float = 0.0) -> Answer:
         """See ``Method``."""
         load = case.load(len(state.displacement))
         try:
-            if self._model.prony:
-                found, after = self._model.step(state, load, dt)
-            else:
-                found = self._model.solve(load)
-                after = History(found.displacement, state.points)
+            found, after = self.workshop.model.step(state, load, dt)
         except NoEquilibrium:
-            return Answer(state, False, False)
-        return Answer(after, True, True, found.iterations)
+            return Answer(state, False)
+        return Answer(after, True, found.iterations)
 
-    def displacement(self, state: History) -> Array:
+    def field(self, state: History) -> Array:
         """See ``Method``."""
         return state.displacement
 
     def von_mises(self, state: History) -> Array:
         """See ``Method``."""
-        if self._model.prony:
-            return self._workshop.von_mises_after(state)
-        return self._workshop.von_mises(state.displacement)
-
-
-# --- the same body in other meshes ---------------------------------------------------------------
+        return self.workshop.von_mises_after(state)
 
 
 def divided(scene: Scene, factor: float) -> Scene:
@@ -69,10 +54,11 @@ def divided(scene: Scene, factor: float) -> Scene:
     return scene.model_copy(update={"geometry": geometry})
 
 
-class Remeshed(Memoryless):
+class Remeshed(Method):
     """Full model of a scene in another mesh, compared at the nodes of the scene's own.
 
-    It finds the nodes that a contact loads by itself; other methods are given them.
+    It finds the nodes that a contact loads by itself; other methods are given them.  The state is
+    the displacement of the other mesh's nodes.
 
     Parameters
     ----------
@@ -91,13 +77,13 @@ class Remeshed(Memoryless):
         self._to_scene = interpolation(at, lattice(other), self._other.mesh.elements)
 
     def step(self, state: Array | None, case: Case, dt: float = 0.0) -> Answer:
-        """See ``Method``; the state is the displacement of the other mesh's nodes."""
+        """See ``Method``."""
         load = np.sum([self._load(contact) for contact in case.contacts], axis=0)
         try:
             found = self._other.model.solve(load)
         except NoEquilibrium:
-            return Answer(state, False, False)
-        return Answer(found.displacement, True, True, found.iterations)
+            return Answer(state, False)
+        return Answer(found.displacement, True, found.iterations)
 
     def _load(self, contact: Load) -> Array:
         """Nodal forces (m, 3) mN on the other mesh, pressed where the scene's own mesh is.
@@ -110,5 +96,5 @@ class Remeshed(Memoryless):
         return contact.pressure * nodal[:, None] * contact.direction
 
     def field(self, state: Array) -> Array:
-        """See ``Memoryless``."""
+        """See ``Method``."""
         return np.asarray(self._to_scene @ state)

@@ -1,24 +1,22 @@
-"""Galerkin methods: one basis for the whole surface, or one made for each load; also in time."""
+"""Galerkin methods: the full model in the span of a basis, summed over the points of a cubature.
+
+The mechanics are those of the artifact's local models (``reduced.problem``, ``reduced.past``) with
+other modes and points, under a dead load: equilibrium is sought with the inverse tangent that
+secants make up, from rest on elastic tissue and from the last answer on tissue that remembers.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from palpate.offline.fem.model import History
-from palpate.offline.methods.galerkin_model import (
-    MAX_ITERATIONS,
-    TOLERANCE,
-    Content,
-    Cubature,
-    GalerkinModel,
-    reduce_load,
-)
-from palpate.offline.methods.method import Answer, Case, Memoryless, Method
+from palpate.offline.fem.model import POINTWISE, FullModel, History
+from palpate.offline.methods.method import Answer, Case, Method
 from palpate.offline.reduce.viscous import deviatoric_stiffness
 from palpate.offline.run.workshop import Workshop
 from palpate.shared.compiled import bind, bind_compiled
@@ -35,16 +33,271 @@ from palpate.shared.reduced.past import (
     opened,
     remembering,
 )
-from palpate.shared.reduced.points import LANES
+from palpate.shared.reduced.points import (
+    LANES,
+    STATE,
+    TILE,
+    Points,
+    increments,
+    linearise,
+    nonlinear_stress,
+    superpose,
+)
 from palpate.shared.reduced.press import ROUND_OFF, SMALLEST_TARGET, external_force
-from palpate.shared.reduced.problem import Problem, descend
+from palpate.shared.reduced.problem import Problem, Work, descend
+from palpate.shared.reduced.terms import Dead, Elastic
+from palpate.shared.reduced.workspace import new_work
 
 Array = NDArray[np.float64]
-Field = NDArray[np.float32]
+
+TOLERANCE = 1e-4
+"""Residual at equilibrium relative to load and past, in the energy norm: the solver's share of the
+error, small beside that of any basis here.  Single precision ends at about 1e-6."""
+
+MAX_ITERATIONS = 400
 
 
-class Galerkin(Memoryless):
-    """One basis for the whole surface; the state is the modes' coordinates.
+@dataclass(frozen=True)
+class Cubature:
+    """Quadrature points (c,), counted element by element, and their weights (c,) mm^3."""
+
+    points: NDArray[np.int64]
+    weights: Array
+
+    @classmethod
+    def full(cls, model: FullModel) -> Cubature:
+        """Every point with its own weight."""
+        return cls(np.arange(model.weights.size), model.weights.ravel())
+
+
+class Content(NamedTuple):
+    """A reduced model in memory, with room for r modes."""
+
+    points: Points
+    past: Any  # Elastic or Remembering
+    load: Dead
+    secants: Secants
+    work: Work
+    modes: Array  # (3 nodes, r) mm
+    q: Array  # (r,) coordinates of the answer
+    newton: Array  # (4, r)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc"})
+def point_gradients(connectivity, gradients, points, modes, out):
+    """Displacement gradients of modes at quadrature points, in the tiles of ``reduced.points``.
+
+    Parameters
+    ----------
+    connectivity : ndarray, shape (e, n), int32
+    gradients : ndarray, shape (e, q, n, 3), 1/mm
+    points : ndarray, shape (c,), int
+        Quadrature points, counted element by element.
+    modes : ndarray, shape (3 nodes, m), mm
+    out : ndarray, shape (>= m, 9 c), float32, 1/mm
+        With ``c`` filled up to whole tiles; what fills up is not written.
+    """
+    m = modes.shape[1]
+    tile = np.zeros((9 * LANES, m))
+    for first in range(0, len(points), LANES):
+        tile[:] = 0.0
+        for lane in range(min(LANES, len(points) - first)):
+            e, q = divmod(points[first + lane], gradients.shape[1])
+            for a in range(connectivity.shape[1]):
+                for i in range(3):
+                    mode = modes[3 * connectivity[e, a] + i]
+                    for j in range(3):
+                        slope, row = gradients[e, q, a, j], tile[(3 * i + j) * LANES + lane]
+                        for k in range(m):
+                            row[k] += slope * mode[k]
+        start = 9 * first
+        for k in range(m):
+            for c in range(9 * LANES):
+                out[k, start + c] = tile[c, k]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def reduce_load(modes, nodes, forces, load):
+    """``load = modes^T f``: nodal forces (k, 3) on nodes (k,), modes (3 n, m)."""
+    load[:] = 0.0
+    for a in range(len(nodes)):
+        for i in range(3):
+            force, mode = forces[a, i], modes[3 * nodes[a] + i]
+            for k in range(len(load)):
+                load[k] += force * mode[k]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def stress_points(content, q):
+    """Write the stress of the points at coordinates ``q``; return the smallest det F."""
+    points, work = content.points, content.work
+    superpose(points.gradients, q, work.H)
+    nonlinear_stress(
+        work.H, points.weights, points.mu, points.lam, work.J, work.trace, work.linear, work.P
+    )
+    return work.J.min()
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def linearise_points(content, state, products):
+    """Write the change of the points' stress with every mode (r, 9 c), at ``work.H``."""
+    points = content.points
+    linearise(content.work.H, points.weights, points.mu, points.lam, state)
+    increments(state, points.gradients, products)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _step(content, nodes, forces, accurate):
+    """Go to the end of a time step: (status, iterations); the past is advanced if it is found."""
+    points, past, load, secants = content.points, content.past, content.load, content.secants
+    q, work = content.q, content.newton
+    reduce_load(content.modes, nodes, forces, load.f)
+    term = bind_compiled(begin_step(past, points.mu, 0, 0))
+    problem = bind_compiled(Problem(points, term, load, secants, content.work))
+    size = external_force(term, load.f, secants.external, secants.origin)
+    last_answer(past, 0, q)
+    energy, smallest = newton.potential(problem, q, work[0])
+    target = max(accurate * size, SMALLEST_TARGET)
+    status, iterations, _, _ = descend(
+        problem, q, work, energy, smallest, target, np.inf, MAX_ITERATIONS, True, ROUND_OFF
+    )
+    if status == newton.CONVERGED:
+        end_step(past, points, content.work, 0, q)
+    else:
+        forget_secants(secants.inverse, secants.origin)
+    return status, iterations
+
+
+class GalerkinModel:
+    """The full model in the span of modes that can be exchanged; not to be shared by threads.
+
+    Parameters
+    ----------
+    model : FullModel
+    size : int
+        Most modes.
+    cubature : Cubature
+    in_time : bool
+        Whether the tissue remembers, at every point of the cubature.
+
+    Raises
+    ------
+    ValueError
+        If the points of an element cannot be summed one by one.
+    """
+
+    def __init__(
+        self, model: FullModel, size: int, cubature: Cubature, in_time: bool = False
+    ) -> None:
+        if model.element not in POINTWISE:
+            raise ValueError(f"{model.element}: its points share a dilatation")
+        self.points, self._model = cubature.points, model
+        element = self.points // model.weights.shape[1]
+        rows, count = -(-size // 4) * 4, -(-len(self.points) // LANES) * LANES
+        fill = (0, count - len(self.points))
+        points = Points(
+            gradients=np.zeros((rows, TILE // LANES * count), np.float32),
+            steps=np.ones(rows, np.float32),
+            weights=np.pad(cubature.weights, fill),
+            mu=np.pad(model.mu[element], fill),
+            lam=np.pad(model.lam[element], fill),
+        )
+        past: Elastic | Remembering = Elastic()
+        if in_time:
+            past = remembering(np.zeros((1, rows, rows), np.float32), len(model.prony), count)
+        self.content = Content(
+            points=points,
+            past=past,
+            load=Dead(np.zeros(rows)),
+            secants=Secants(np.eye(rows), np.full((2, rows), np.nan), *np.zeros((2, rows))),
+            work=new_work(rows, count),
+            modes=np.zeros((3 * len(model.mesh.nodes), rows)),
+            q=np.zeros(rows),
+            newton=np.zeros((4, rows)),
+        )
+        self._bound = bind(self.content)
+
+    def adopt(self, basis: Array) -> None:
+        """Take a basis (free dofs, <= size) that is orthonormal in the energy at rest."""
+        model, m, content = self._model, basis.shape[1], self.content
+        content.modes[model.free, :m] = basis
+        content.modes[:, m:] = 0.0
+        content.points.gradients[m:] = 0.0
+        point_gradients(
+            model.connectivity, model.gradients, self.points, content.modes[:, :m].copy(),
+            content.points.gradients,
+        )  # fmt: skip
+        if isinstance(content.past, Remembering):
+            soft = basis.T @ (deviatoric_stiffness(model) @ basis)
+            content.past.deviatoric[0, :m, :m] = soft
+
+    def at_rest(self) -> Array | None:
+        """Record of tissue that remembers nothing yet; the next search knows no secants."""
+        self._forget()
+        past = self.content.past
+        if not isinstance(past, Remembering):
+            return None
+        record = np.zeros_like(past.records[0])
+        self.opened(record).share[-1] = 1.0
+        return record
+
+    def _forget(self) -> None:
+        forget_secants(self.content.secants.inverse, self.content.secants.origin)
+
+    def solve(
+        self, case: Case, state: Array | None = None, dt: float = 0.0, accurate: float = TOLERANCE
+    ) -> tuple[bool, int]:
+        """Whether there is an equilibrium ``dt`` (s) after a state, and the iterations made."""
+        past = self.content.past
+        if isinstance(past, Remembering):
+            for own, weights in zip(past.time, step_weights(self._model.prony, dt), strict=True):
+                own[:] = weights
+            past.records[0] = state
+        else:
+            self._forget()
+        status, iterations = _step(self._bound, case.nodes, case.forces, accurate)
+        return status == newton.CONVERGED, iterations
+
+    @property
+    def state(self) -> Array:
+        """The last answer: coordinates of the modes, on tissue that remembers as its record."""
+        past = self.content.past
+        in_time = isinstance(past, Remembering)
+        return (past.records[0] if in_time else self.content.q).copy()
+
+    def displacement(self, state: Array) -> Array:
+        """Nodal displacement (n, 3) mm."""
+        modes = self.content.modes  # a record starts with the coordinates
+        return (modes @ state[: modes.shape[1]]).reshape(-1, 3)
+
+    def opened(self, record: Array) -> Memory:
+        """Views of a record."""
+        points = self.content.points
+        memory: Memory = opened(
+            record, len(self._model.prony), len(points.gradients), len(points.weights)
+        )
+        return memory
+
+    def history(self, record: Array) -> History:
+        """A record as the full model's history, without the means that only energies need."""
+        elements, own = self._model.weights.shape
+        histories = self.opened(record).points
+        terms = len(histories)
+        tiles = histories.reshape(terms, -1, SYMMETRIC, LANES).transpose(0, 1, 3, 2)
+        points = tiles.reshape(terms, -1, SYMMETRIC)[:, : elements * own].astype(float)
+        return History(self.displacement(record), points.reshape(terms, elements, own, SYMMETRIC))
+
+    def tangent(self, q: Array) -> Array:
+        """Tangent (r, r) at coordinates."""
+        points = self.content.points
+        products = np.empty_like(points.gradients)
+        stress_points(self._bound, q)
+        linearise_points(self._bound, np.empty(STATE * len(points.weights), np.float32), products)
+        return np.eye(len(q)) + points.gradients @ products.T
+
+
+class Galerkin(Method):
+    """One basis for the whole surface; see ``GalerkinModel.state``.
 
     Parameters
     ----------
@@ -52,28 +305,49 @@ class Galerkin(Memoryless):
     basis : ndarray, shape (free dofs, m), mm
         Orthonormal in the energy at rest.
     cubature : Cubature, optional
-        Every quadrature point if absent.
+        Every quadrature point if absent, which in time it must be.
+    in_time : bool
+        Whether the tissue remembers.
+    accurate : float
+        See ``TOLERANCE``.
     """
 
-    def __init__(self, workshop: Workshop, basis: Array, cubature: Cubature | None = None) -> None:
+    def __init__(
+        self,
+        workshop: Workshop,
+        basis: Array,
+        cubature: Cubature | None = None,
+        in_time: bool = False,
+        accurate: float = TOLERANCE,
+    ) -> None:
         model, m = workshop.model, basis.shape[1]
         cubature = cubature or Cubature.full(model)
         super().__init__(workshop, m, f"{m} modes, {len(cubature.points)} points")
-        self.reduced = GalerkinModel(model, m, cubature)
+        self.reduced = GalerkinModel(model, m, cubature, in_time)
         self.reduced.adopt(basis)
+        self._in_time, self._accurate = in_time, accurate
+
+    def at_rest(self) -> Array | None:
+        """See ``Method``."""
+        return self.reduced.at_rest()
 
     def step(self, state: Array | None, case: Case, dt: float = 0.0) -> Answer:
         """See ``Method``."""
-        converged, iterations = self.reduced.solve(case)
-        found = self.reduced.content.q.copy() if converged else state
-        return Answer(found, converged, converged, iterations)
+        converged, iterations = self.reduced.solve(case, state, dt, self._accurate)
+        return Answer(self.reduced.state if converged else state, converged, iterations)
 
     def field(self, state: Array) -> Array:
-        """See ``Memoryless``."""
+        """See ``Method``."""
         return self.reduced.displacement(state)
 
+    def von_mises(self, state: Array | None) -> Array:
+        """See ``Method``."""
+        if state is None or not self._in_time:
+            return super().von_mises(state)
+        return self.workshop.von_mises_after(self.reduced.history(state))
 
-class GalerkinAtHand(Memoryless):
+
+class GalerkinAtHand(Method):
     """A basis made for each case while the user waits, with every quadrature point.
 
     The state is the basis and the coordinates in it.
@@ -89,131 +363,20 @@ class GalerkinAtHand(Memoryless):
 
     def __init__(self, workshop: Workshop, size: int, space: Callable[[Case], Array]) -> None:
         super().__init__(workshop, size, f"{size} vectors of the load at hand")
-        self.reduced = GalerkinModel(workshop.model, size, Cubature.full(workshop.model))
+        self._reduced = GalerkinModel(workshop.model, size, Cubature.full(workshop.model))
         self._space, self._free = space, workshop.model.free
 
     def step(self, state: tuple[Array, Array] | None, case: Case, dt: float = 0.0) -> Answer:
         """See ``Method``."""
         basis = self._space(case) if case.forces.any() else np.empty((len(self._free), 0))
-        self.reduced.adopt(basis)
-        converged, iterations = self.reduced.solve(case)
-        if not converged:
-            return Answer(state, False, False, iterations)
-        q = self.reduced.content.q[: basis.shape[1]].copy()
-        return Answer((basis, q), True, True, iterations)
+        self._reduced.adopt(basis)
+        converged, iterations = self._reduced.solve(case)
+        found = basis, self._reduced.state[: basis.shape[1]]
+        return Answer(found if converged else state, converged, iterations)
 
     def field(self, state: tuple[Array, Array]) -> Array:
-        """See ``Memoryless``."""
+        """See ``Method``."""
         basis, q = state
         u = np.zeros(self.workshop.mesh.nodes.size)
         u[self._free] = basis @ q
         return u.reshape(-1, 3)
-
-
-# --- in time -------------------------------------------------------------------------------------
-
-
-class _Stepper(NamedTuple):
-    """A Galerkin model with its past, and working memory of a step."""
-
-    content: Content
-    past: Remembering
-    secants: Secants
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _step(stepper, nodes, forces, accurate):
-    """Go to the end of a time step: (status, iterations); the record is advanced if it is found."""
-    content, past, secants = stepper.content, stepper.past, stepper.secants
-    whole, q = content.problem, content.q
-    reduce_load(content.modes, nodes, forces, whole.load.f)
-    term = bind_compiled(begin_step(past, whole.points.mu, 0, 0))
-    problem = bind_compiled(Problem(whole.points, term, whole.load, secants, whole.work))
-    size = external_force(term, whole.load.f, secants.external, secants.origin)
-    last_answer(past, 0, q)
-    energy, smallest = newton.potential(problem, q, content.newton[0])
-    status, iterations, _, _ = descend(
-        problem, q, content.newton, energy, smallest, max(accurate * size, SMALLEST_TARGET),
-        np.inf, MAX_ITERATIONS, True, ROUND_OFF,
-    )  # fmt: skip
-    if status == newton.CONVERGED:
-        end_step(past, whole.points, whole.work, 0, q)
-    else:
-        forget_secants(secants.inverse, secants.origin)
-    return status, iterations
-
-
-class GalerkinInTime(Method):
-    """One basis for the whole surface of visco-elastic tissue, with every quadrature point.
-
-    A step is that of the artifact's local models (``reduced.problem``, ``reduced.past``) with other
-    modes and points; what the tissue remembers is kept at every quadrature point.  The state is the
-    record of it.
-
-    Parameters
-    ----------
-    workshop : Workshop
-    basis : ndarray, shape (free dofs, m), mm
-        Orthonormal in the energy at rest.
-    accurate : float
-        Residual at equilibrium relative to load and past; single precision ends at about 1e-6.
-    """
-
-    def __init__(self, workshop: Workshop, basis: Array, accurate: float = TOLERANCE) -> None:
-        model, m = workshop.model, basis.shape[1]
-        self._workshop, self._accurate = workshop, accurate
-        cubature = Cubature.full(model)
-        self.unknowns, self.label = m, f"{m} modes, {len(cubature.points)} points"
-        self._reduced = GalerkinModel(model, m, cubature)
-        self._reduced.adopt(basis)
-        points = self._reduced.content.problem.points
-        rows, count = len(points.gradients), len(points.weights)
-        deviatoric = np.zeros((1, rows, rows), np.float32)
-        deviatoric[0, :m, :m] = basis.T @ (deviatoric_stiffness(model) @ basis)
-        self._sizes = len(model.prony), rows, count
-        self._past = remembering(deviatoric, len(model.prony), count)
-        self._secants = Secants(
-            np.eye(rows), np.full((2, rows), np.nan), np.zeros(rows), np.zeros(rows)
-        )
-        self._bound = bind(_Stepper(self._reduced.content, self._past, self._secants))
-
-    def at_rest(self) -> Array:
-        """See ``Method``; the next search knows no secants."""
-        forget_secants(self._secants.inverse, self._secants.origin)
-        record = np.zeros_like(self._past.records[0])
-        self.opened(record).share[-1] = 1.0
-        return record
-
-    def step(self, state: Array, case: Case, dt: float = 0.0) -> Answer:
-        """See ``Method``."""
-        for own, weights in zip(
-            self._past.time, step_weights(self._workshop.model.prony, dt), strict=True
-        ):
-            own[:] = weights
-        self._past.records[0] = state
-        status, iterations = _step(self._bound, case.nodes, case.forces, self._accurate)
-        if status != newton.CONVERGED:
-            return Answer(state, False, False, iterations)
-        return Answer(self._past.records[0].copy(), True, True, iterations)
-
-    def displacement(self, state: Array) -> Array:
-        """See ``Method``."""
-        return self._reduced.displacement(self.opened(state).q)
-
-    def von_mises(self, state: Array) -> Array:
-        """See ``Method``."""
-        return self._workshop.von_mises_after(self.history(state))
-
-    def opened(self, state: Array) -> Memory:
-        """Views of the record."""
-        memory: Memory = opened(state, *self._sizes)
-        return memory
-
-    def history(self, state: Array) -> History:
-        """The state as the full model's history, without the means that only energies need."""
-        elements, own = self._workshop.model.weights.shape
-        histories = self.opened(state).points
-        terms = len(histories)
-        tiles = histories.reshape(terms, -1, SYMMETRIC, LANES).transpose(0, 1, 3, 2)
-        points = tiles.reshape(terms, -1, SYMMETRIC)[:, : elements * own].astype(float)
-        return History(self.displacement(state), points.reshape(terms, elements, own, SYMMETRIC))

@@ -22,101 +22,68 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse import csr_matrix
 
-from palpate.offline.methods.calibration import stiffening
 from palpate.offline.methods.lattice import Divisions, Ints
-from palpate.offline.methods.relaxation import TOLERANCE, Relaxed, Stencil
-from palpate.offline.methods.tetrahedra import Tetrahedra, edges_of, gradients
+from palpate.offline.methods.relaxation import Relaxed
+from palpate.offline.methods.tetrahedra import Tetrahedra, edges_of, stiffness
 from palpate.offline.run.workshop import Workshop
-from palpate.shared.mechanics.tissue import lame
 
 Array = NDArray[np.float64]
 
 POISSON = 0.25
 """Poisson's ratio of every network of springs."""
 
-FORCING = 0.1
-"""See ``offline.methods.relaxation.Elastic``."""
-
 SWEEPS, STALL = 2000, 1e-4
 """Most sweeps of the identification; it ends at this change, relative to the stiffest spring."""
 
 
 class MassSpring(Relaxed):
-    """Mass-spring system in a scene's body.
+    """Mass-spring system in a scene's body, at large displacements.
+
+    Small loads get the full model's answer in the mean.
 
     Parameters
     ----------
     workshop : Workshop
     divisions : tuple of 3 int
         Cells along the axes of the scene's lattice; see ``offline.methods.lattice``.
-    young : float, optional
-        kPa; if absent, such that small loads get the full model's answer in the mean.
-    tolerance : float
-        Residual of an answer relative to its load.
-    """
 
-    def __init__(
-        self,
-        workshop: Workshop,
-        divisions: Divisions,
-        young: float | None = None,
-        tolerance: float = TOLERANCE,
-    ) -> None:
-        mesh, tissue = Tetrahedra.of(workshop, divisions), workshop.scene.tissue.young
-        springs = Springs.identified(mesh, tissue if young is None else young)
-        if young is None:
-            springs = springs.stiffened(stiffening(workshop, mesh, springs))
-        super().__init__(workshop, mesh, springs, f"{len(springs.ends)} springs", tolerance)
-
-
-class Springs:
-    """Linear springs between points, at large displacements.
-
-    Parameters
+    Attributes
     ----------
-    points : ndarray, shape (m, 3), mm
-        Free ones first.
-    free : int
-    ends : ndarray, shape (s, 2), int
+    ends : ndarray, shape (s, 2), int32
         Points that a spring joins, each pair once.
     stiffness : ndarray, shape (s,), mN/mm
+    factor : float
+        By which that is more than what was identified.
     """
 
-    forcing = FORCING
+    forcing = 0.1
 
-    def __init__(self, points: Array, free: int, ends: Ints, stiffness: Array) -> None:
-        self.points, self.ends, self.stiffness = points, ends, stiffness
-        self.stencil = Stencil(ends, len(points), free)
-        self._ends = ends.astype(np.int32)
-        self._vectors = points[ends[:, 1]] - points[ends[:, 0]]
-        self._lengths = np.linalg.norm(self._vectors, axis=1)
-        self._ranks = np.stack(
-            [self.stencil.ranks(ends), self.stencil.ranks(ends[:, ::-1])], axis=1
-        )
-
-    @classmethod
-    def identified(cls, mesh: Tetrahedra, young: float) -> Springs:
-        """Springs that come nearest to linear elastic tissue of a Young's modulus, kPa."""
+    def __init__(self, workshop: Workshop, divisions: Divisions) -> None:
+        mesh = Tetrahedra.of(workshop, divisions)
         ends = edges_of(mesh.both_cuts)
-        return cls(mesh.nodes, mesh.free, ends, identify(mesh.nodes, mesh.both_cuts, ends, young))
-
-    def stiffened(self, factor: float) -> Springs:
-        """The same with all springs stiffer by a factor."""
-        return Springs(self.points, self.stencil.free, self.ends, factor * self.stiffness)
+        super().__init__(workshop, mesh, mesh.both_cuts, f"{len(ends)} springs")
+        self.ends = ends.astype(np.int32)
+        self._vectors = mesh.nodes[ends[:, 1]] - mesh.nodes[ends[:, 0]]
+        self._lengths = np.linalg.norm(self._vectors, axis=1)
+        pairs = ends, ends[:, ::-1]
+        self._ranks = np.stack([self.stencil.ranks(pair) for pair in pairs], axis=1)
+        self.stiffness = identify(mesh.nodes, mesh.both_cuts, ends, workshop.scene.tissue.young)
+        self.factor = self.stiffening()
+        self.stiffness *= self.factor
 
     def internal(self, displacement: Array, force: Array) -> float:
-        """Internal force; see ``offline.methods.relaxation.Elastic``."""
+        """See ``Relaxed``."""
         force[:] = 0.0
-        springs = self._ends, self._vectors, self._lengths, self.stiffness
-        return _internal(*springs, displacement, force)
+        springs = self.ends, self._vectors, self._lengths, self.stiffness
+        return spring_forces(*springs, displacement, force)
 
     def linearise(self, displacement: Array) -> None:
-        """Tangent; see ``offline.methods.relaxation.Elastic``."""
+        """See ``Relaxed``."""
         tensors = self.stencil.tensors
         tensors[:] = 0.0
-        springs = self._ends, self._vectors, self._lengths, self.stiffness
+        springs = self.ends, self._vectors, self._lengths, self.stiffness
         _tangent(*springs, displacement, self._ranks, tensors)
         self.stencil.prepare()
 
@@ -135,7 +102,7 @@ def identify(points: Array, elements: Ints, ends: Ints, young: float) -> Array:
 
     Returns
     -------
-    stiffness : ndarray, shape (s,), mN/mm
+    k : ndarray, shape (s,), mN/mm
         Not negative.
 
     Notes
@@ -149,24 +116,9 @@ def identify(points: Array, elements: Ints, ends: Ints, young: float) -> Array:
     values = np.stack([-along, along], axis=1).ravel()
     elongation = csr_matrix((values, (rows, columns)), (len(ends), points.size))
     normal = (elongation @ elongation.T).power(2).tocsr()
-    stiffness = 0.5 * linear_stiffness(points, elements, young)
-    wanted = np.asarray((elongation @ stiffness).multiply(elongation).sum(axis=1)).ravel()
+    K = 0.5 * stiffness(points, elements, young, POISSON)
+    wanted = np.asarray((elongation @ K).multiply(elongation).sum(axis=1)).ravel()
     return _nonnegative(normal.indptr, normal.indices, normal.data, normal.diagonal(), wanted)
-
-
-def linear_stiffness(points: Array, elements: Ints, young: float) -> csr_matrix:
-    """Stiffness matrix (3 m, 3 m) mN/mm of linear tetrahedra with the springs' Poisson's ratio."""
-    mu, lam = lame(young, POISSON)
-    g, volume = gradients(points, elements)
-    dot = np.einsum("tai,tbi->tab", g, g)
-    blocks = (
-        lam * np.einsum("t,tai,tbj->taibj", volume, g, g)
-        + mu * np.einsum("t,taj,tbi->taibj", volume, g, g)
-        + mu * np.einsum("t,tab,ij->taibj", volume, dot, np.eye(3))
-    )
-    dofs = (3 * elements[:, :, None] + np.arange(3)).reshape(len(elements), 12)
-    rows, columns = np.repeat(dofs, 12, axis=1).ravel(), np.tile(dofs, (1, 12)).ravel()
-    return coo_matrix((blocks.ravel(), (rows, columns)), (points.size, points.size)).tocsr()
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -188,7 +140,7 @@ def _nonnegative(indptr, indices, data, diagonal, wanted):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _internal(ends, vectors, lengths, stiffness, u, force):
+def spring_forces(ends, vectors, lengths, stiffness, u, force):
     """Add the springs' force at ``u`` (3, m) to ``force`` (3, m); return the energy.
 
     The elongation is computed from ``|v + w|^2 - |v|^2 = w . (2 v + w)``, free of cancellation.

@@ -55,9 +55,8 @@ class Case:
         """Case of contacts, each with the nodal weights (n,) mm^2 of its unit pressure."""
         shares = np.array([x.pressure * own for x, own in zip(contacts, weights, strict=True)])
         nodes = np.flatnonzero(np.any(shares != 0.0, axis=0))
-        shares = shares[:, nodes]
         directions = np.array([contact.direction for contact in contacts])
-        return cls(contacts, nodes, shares.T @ directions, shares, radius)
+        return cls(contacts, nodes, shares[:, nodes].T @ directions, shares[:, nodes], radius)
 
     @classmethod
     def of_tip(cls, position: Array, direction: Array) -> Case:
@@ -69,6 +68,10 @@ class Case:
         load = np.zeros((nodes, 3))
         load[self.nodes] = self.forces
         return load
+
+
+Steps = Sequence[tuple[Case, float]]
+"""A history: cases, and the time (s) in which each is reached from the one before."""
 
 
 @dataclass(frozen=True)
@@ -90,44 +93,51 @@ class Answer:
         step starts from it.  Without an answer, the state before the step.
     converged : bool
         Whether the method reports an answer at all.
-    trusted : bool
-        Whether it vouches for the answer: in range, and estimated to be within the scene's
-        tolerance.  Methods that cannot tell vouch for every answer that converged.
     iterations : int
+    doubted : bool
+        Whether the method says that the answer may be wrong.  Most cannot tell.
     refused : bool
         Whether it declined the case instead of trying.
     """
 
     state: Any = field(repr=False)
-    converged: bool
-    trusted: bool
+    converged: bool = True
     iterations: int = 0
+    doubted: bool = False
     refused: bool = False
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the method vouches for the answer."""
+        return self.converged and not self.doubted
 
 
 class Method(ABC):
     """A way to answer cases.
 
-    Attributes
+    Parameters
     ----------
-    label : str
-        Describes the size of the method, for people.
+    workshop : Workshop
+        Of the scene.
     unknowns : int
         Numbers solved for in a step.
+    label : str
+        Describes the size of the method, for people.
     """
 
-    label: str
-    unknowns: int
+    def __init__(self, workshop: Workshop, unknowns: int, label: str) -> None:
+        self.workshop, self.unknowns, self.label = workshop, unknowns, label
 
-    @abstractmethod
     def at_rest(self) -> Any:
-        """State of a body to which nothing has happened."""
+        """State of a body to which nothing has happened: None, unless a method remembers more."""
+        return None
 
     @abstractmethod
     def step(self, state: Any, case: Case, dt: float = 0.0) -> Answer:
         """Answer a case that is reached ``dt`` (s) after a state, which is not changed.
 
-        A load without an answer is reported, not raised.
+        Methods for elastic tissue depend on the case alone.  A load without an answer is reported,
+        not raised.
 
         Raises
         ------
@@ -136,52 +146,24 @@ class Method(ABC):
         """
 
     @abstractmethod
-    def displacement(self, state: Any) -> Array:
-        """Nodal displacement (n, 3) mm."""
+    def field(self, state: Any) -> Array:
+        """Nodal displacement (n, 3) mm of an answer."""
 
-    @abstractmethod
+    def displacement(self, state: Any) -> Array:
+        """Nodal displacement (n, 3) mm of an answer, or at rest."""
+        return np.zeros_like(self.workshop.mesh.nodes) if state is None else self.field(state)
+
     def von_mises(self, state: Any) -> Array:
         """Nodal von Mises stress (n,) kPa."""
+        return self.workshop.von_mises(self.displacement(state))
 
     def solve(self, case: Case) -> Answer:
         """Answer a case from rest: one step of no time."""
         return self.step(self.at_rest(), case)
 
     def follow(self, steps: Iterable[tuple[Case, float]]) -> list[Any]:
-        """States at the ends of steps, cases with times (s), one after the other from rest."""
+        """States at the ends of steps, one after the other from rest."""
         states = [self.at_rest()]
         for case, dt in steps:
             states.append(self.step(states[-1], case, dt).state)
         return states[1:]
-
-
-class Memoryless(Method):
-    """A method for elastic tissue: its answer depends on the case alone, not on state or time.
-
-    Its state is None at rest and otherwise whatever ``field`` needs.
-
-    Parameters
-    ----------
-    workshop : Workshop
-    unknowns : int
-    label : str
-    """
-
-    def __init__(self, workshop: Workshop, unknowns: int, label: str) -> None:
-        self.workshop, self.unknowns, self.label = workshop, unknowns, label
-
-    def at_rest(self) -> Any:
-        """See ``Method``."""
-        return None
-
-    @abstractmethod
-    def field(self, state: Any) -> Array:
-        """Nodal displacement (n, 3) mm of an answer."""
-
-    def displacement(self, state: Any) -> Array:
-        """See ``Method``."""
-        return np.zeros_like(self.workshop.mesh.nodes) if state is None else self.field(state)
-
-    def von_mises(self, state: Any) -> Array:
-        """See ``Method``."""
-        return self.workshop.von_mises(self.displacement(state))

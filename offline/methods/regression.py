@@ -5,12 +5,11 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from palpate.offline.methods.galerkin_model import reduce_load
-from palpate.offline.methods.method import Answer, Case, Memoryless, Snapshots
+from palpate.offline.methods.galerkin import reduce_load
+from palpate.offline.methods.method import Answer, Case, Method, Snapshots
 from palpate.offline.reduce.ritz import energy_pod
 from palpate.offline.run.workshop import Load, Workshop
 
@@ -48,8 +47,21 @@ def _within_reach(workshop: Workshop) -> NDArray[np.int64]:
     return np.flatnonzero(distance <= workshop.scene.endoscope.radius + edge)
 
 
-class Linear(Memoryless):
-    """Superposition of compressed nodal compliances; the state is the modes' coordinates.
+class _InModes(Method):
+    """Whatever gives coordinates of modes (free dofs, m) mm, which are the state."""
+
+    def __init__(self, workshop: Workshop, basis: Array, label: str) -> None:
+        super().__init__(workshop, basis.shape[1], label)
+        self._modes = np.zeros((workshop.mesh.nodes.size, self.unknowns))
+        self._modes[workshop.model.free] = basis
+
+    def field(self, state: Array) -> Array:
+        """See ``Method``."""
+        return (self._modes @ state).reshape(-1, 3)
+
+
+class Linear(_InModes):
+    """Superposition of compressed nodal compliances.
 
     It answers every load, and cannot tell when its answer is wrong.
 
@@ -61,56 +73,23 @@ class Linear(Memoryless):
     """
 
     def __init__(self, workshop: Workshop, basis: Array) -> None:
-        super().__init__(workshop, basis.shape[1], f"{basis.shape[1]} modes")
-        self._modes = np.zeros((workshop.mesh.nodes.size, self.unknowns))
-        self._modes[workshop.model.free] = basis
+        super().__init__(workshop, basis, f"{basis.shape[1]} modes")
 
     def step(self, state: Array | None, case: Case, dt: float = 0.0) -> Answer:
         """See ``Method``."""
         q = np.empty(self.unknowns)
         reduce_load(self._modes, case.nodes, case.forces, q)
-        return Answer(q, True, True)
-
-    def field(self, state: Array) -> Array:
-        """See ``Memoryless``."""
-        return (self._modes @ state).reshape(-1, 3)
+        return Answer(q)
 
 
 # --- radial basis functions ----------------------------------------------------------------------
 
-KERNELS = {"linear": 1, "thin_plate_spline": 2, "cubic": 3}
-"""Power of the distance in the kernels of ``scipy.interpolate.RBFInterpolator``."""
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _kernel(squared, degree):
-    """Kernel at a squared distance: -r, r^2 log r or r^3, conditionally positive definite."""
-    if degree == 1:
-        return -np.sqrt(squared)
-    if degree == 2:
-        return 0.5 * squared * np.log(squared) if squared > 0.0 else 0.0
-    return squared * np.sqrt(squared)
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _kernels(x, centres, degree, out):
-    """Kernels (k,) round every centre (k, d) at x (d,), then 1 and x."""
-    k, d = centres.shape
-    for i in range(k):
-        squared = 0.0
-        for j in range(d):
-            squared += (x[j] - centres[i, j]) ** 2
-        out[i] = _kernel(squared, degree)
-    out[k] = 1.0
-    out[k + 1 :] = x
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _evaluate(features, axes, centres, degree, coefficients, basis, values):
-    """Interpolated values (m,) per pressure, times the pressure ``features[-1]``."""
-    _kernels(np.dot(features, axes), centres, degree, basis)
-    np.dot(basis, coefficients, values)
-    values *= features[-1]
+KERNELS = {
+    "linear": lambda r: -r,
+    "thin_plate_spline": lambda r: r * r * np.log(np.maximum(r, 1e-300)),
+    "cubic": lambda r: r**3,
+}
+"""Of the distance, conditionally positive definite: as in ``scipy.interpolate.RBFInterpolator``."""
 
 
 class Interpolant:
@@ -136,24 +115,24 @@ class Interpolant:
         # on a flat surface a coordinate never changes, and polynomials in it cannot be told apart
         _, spread, axes = np.linalg.svd(scaled - scaled.mean(axis=0), full_matrices=False)
         self._axes = scales[:, None] * axes[spread > 1e-6 * spread[0]].T
-        self._degree = KERNELS[kernel]
-        self._centres = features @ self._axes
+        self._kernel, self._centres = KERNELS[kernel], features @ self._axes
         k, d = self._centres.shape
         system = np.zeros((k + d + 1, k + d + 1))
-        for x, row in zip(self._centres, system, strict=False):
-            _kernels(x, self._centres, self._degree, row)
+        system[:k] = [self._terms(x) for x in self._centres]
         system[k:, :k] = system[:k, k:].T
         wanted = np.vstack([values / features[:, -1:], np.zeros((d + 1, values.shape[1]))])
         self._coefficients = np.linalg.solve(system, wanted)
-        self._basis, self._values = np.empty(k + d + 1), np.empty(values.shape[1])
+
+    def _terms(self, x: Array) -> Array:
+        """Kernels (k,) round every centre at x (d,), then 1 and x."""
+        away = self._centres - x
+        distance = np.sqrt(np.einsum("kd,kd->k", away, away))
+        return np.concatenate([self._kernel(distance), [1.0], x])
 
     def __call__(self, features: Array) -> Array:
         """Values (m,) at features (7,)."""
-        _evaluate(
-            features, self._axes, self._centres, self._degree, self._coefficients, self._basis,
-            self._values,
-        )  # fmt: skip
-        return self._values.copy()
+        found: Array = features[-1] * (self._terms(features @ self._axes) @ self._coefficients)
+        return found
 
 
 def fit_interpolant(features: Array, values: Array) -> Interpolant:
@@ -170,10 +149,10 @@ def fit_interpolant(features: Array, values: Array) -> Interpolant:
     return Interpolant(features, values, *min(choices, key=lambda choice: error(*choice)))
 
 
-class Regression(Memoryless):
+class Regression(_InModes):
     """Coordinates of POD modes by radial basis functions of the load; no mechanics.
 
-    It refuses several contacts and answers every single one.  The state is the coordinates.
+    It refuses several contacts and answers every single one.
 
     Parameters
     ----------
@@ -184,9 +163,9 @@ class Regression(Memoryless):
     """
 
     def __init__(self, workshop: Workshop, basis: Array, snapshots: Snapshots) -> None:
-        m = basis.shape[1]
-        super().__init__(workshop, m, f"{m} modes of {len(snapshots.loads)} samples")
-        model, self._basis = workshop.model, basis
+        label = f"{basis.shape[1]} modes of {len(snapshots.loads)} samples"
+        super().__init__(workshop, basis, label)
+        model = workshop.model
         coordinates = snapshots.displacements[:, model.free] @ (model.rest_stiffness @ basis)
         given = np.array([_features(load) for load in snapshots.loads])
         self._interpolant = fit_interpolant(given, coordinates)
@@ -194,14 +173,8 @@ class Regression(Memoryless):
     def step(self, state: Array | None, case: Case, dt: float = 0.0) -> Answer:
         """See ``Method``."""
         if len(case.contacts) != 1:
-            return Answer(state, False, False, refused=True)
-        return Answer(self._interpolant(_features(case.contacts[0])), True, True)
-
-    def field(self, state: Array) -> Array:
-        """See ``Memoryless``."""
-        u = np.zeros(self.workshop.mesh.nodes.size)
-        u[self.workshop.model.free] = self._basis @ state
-        return u.reshape(-1, 3)
+            return Answer(state, False, refused=True)
+        return Answer(self._interpolant(_features(case.contacts[0])))
 
 
 def _features(load: Load) -> Array:

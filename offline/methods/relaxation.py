@@ -14,19 +14,21 @@ points, then second ones, and so on, so that vector instructions take many point
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from abc import abstractmethod
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from palpate.offline.methods.lattice import Ints
-from palpate.offline.methods.method import Answer, Case, Memoryless
-from palpate.offline.methods.tetrahedra import Tetrahedra
+from palpate.offline.methods.method import Answer, Case, Method
+from palpate.offline.methods.tetrahedra import Tetrahedra, edges_of
+from palpate.offline.reduce.sampling import random_points
 from palpate.offline.run.workshop import Workshop
+from palpate.shared.mechanics.tensors import cofactor, det, load, scale, store
 
 Array = NDArray[np.float64]
-Single = NDArray[np.float32]
 
 TOLERANCE = 3e-3
 """Residual relative to the load: on the turbinate, displacements are then within 1 % in the median,
@@ -41,6 +43,9 @@ SMALLEST_STEP = 1e-4
 ROUND_OFF = 1e-12
 """Relative error with which a potential is known."""
 
+LOADS, RESIDUAL = 24, 1e-3
+"""Small loads by which a body's stiffness is fitted, and the residual of its answers to them."""
+
 
 class Rest(NamedTuple):
     """Where a relaxation ended."""
@@ -51,8 +56,18 @@ class Rest(NamedTuple):
     iterations: int  # of conjugate gradients
 
 
-class Elastic(Protocol):
-    """A body of points that can be relaxed.
+class Relaxed(Method):
+    """An elastic body of points at the corners of tetrahedra, relaxed from rest under each load.
+
+    The state is the displacement (3, m) mm of the points.
+
+    Parameters
+    ----------
+    workshop : Workshop
+    mesh : Tetrahedra
+    elements : ndarray, shape (t, 4), int
+        Tetrahedra whose edges join the points that act on each other.
+    label : str
 
     Attributes
     ----------
@@ -62,50 +77,55 @@ class Elastic(Protocol):
         By how much conjugate gradients lower the residual before the tangent is taken anew.
     """
 
-    stencil: Stencil
     forcing: float
 
+    def __init__(self, workshop: Workshop, mesh: Tetrahedra, elements: Ints, label: str) -> None:
+        super().__init__(workshop, 3 * mesh.free, label)
+        self.mesh = mesh
+        self.stencil = Stencil(edges_of(elements), len(mesh.nodes), mesh.free)
+        self._load = np.zeros((3, len(mesh.nodes)))
+
+    @abstractmethod
     def internal(self, displacement: Array, force: Array) -> float:
         """Write the internal force (3, m) mN of a displacement (3, m) mm; return energy, mN mm."""
-        ...
 
+    @abstractmethod
     def linearise(self, displacement: Array) -> None:
         """Bring the stencil's tangent up to a displacement (3, m) mm."""
-        ...
-
-
-class Relaxed(Memoryless):
-    """A body of points at the corners of tetrahedra, relaxed from rest.
-
-    The state is the displacement (3, m) mm of the points.
-
-    Parameters
-    ----------
-    workshop : Workshop
-    mesh : Tetrahedra
-    body : Elastic
-    label : str
-    tolerance : float
-        Residual of an answer relative to its load.
-    """
-
-    def __init__(
-        self, workshop: Workshop, mesh: Tetrahedra, body: Elastic, label: str, tolerance: float
-    ) -> None:
-        super().__init__(workshop, 3 * mesh.free, label)
-        self.mesh, self.body, self.tolerance = mesh, body, tolerance
-        self._load = np.zeros((3, len(mesh.nodes)))
 
     def step(self, state: Array | None, case: Case, dt: float = 0.0) -> Answer:
         """See ``Method``."""
         self.mesh.load(case, self._load)
-        rest = relax(self.body, self._load, self.tolerance)
+        rest = relax(self, self._load, TOLERANCE)
         found = rest.displacement if rest.converged else state
-        return Answer(found, rest.converged, rest.converged, rest.iterations)
+        return Answer(found, rest.converged, rest.iterations)
 
     def field(self, state: Array) -> Array:
-        """See ``Memoryless``."""
+        """See ``Method``."""
         return self.mesh.displacement(state)
+
+    def stiffening(self) -> float:
+        """Factor on the body's stiffness with which it best answers small loads all over it.
+
+        It minimises the sum of squared differences from the full model, over loads and nodes.
+        """
+        model, mesh = self.workshop.model, self.mesh
+        rng = np.random.default_rng(self.workshop.scene.seed)
+        self.linearise(np.zeros((3, len(mesh.nodes))))
+        own, step = np.zeros((3, len(mesh.nodes))), np.zeros((3, mesh.free))
+        both, square = 0.0, 0.0
+        for point in random_points(self.workshop.surface, LOADS, rng):
+            weights, normal = self.workshop.unit_load(point)
+            load = -weights[:, None] * normal
+            wanted = np.zeros(load.size)
+            wanted[model.free] = model.solve_linear(load.ravel()[model.free])
+            force = np.ascontiguousarray((mesh.carrier.T @ load)[: mesh.free].T)
+            self.stencil.solve(force, RESIDUAL, own.size, step)
+            own[:, : mesh.free] = step
+            found = mesh.displacement(own).ravel()
+            both += float(found @ wanted)
+            square += float(found @ found)
+        return square / both
 
 
 class Stencil:
@@ -201,12 +221,12 @@ class Stencil:
         )  # fmt: skip
 
 
-def relax(body: Elastic, load: Array, tolerance: float) -> Rest:
+def relax(body: Relaxed, load: Array, tolerance: float) -> Rest:
     """Bring a body to rest under a dead load, from no displacement.
 
     Parameters
     ----------
-    body : Elastic
+    body : Relaxed
     load : ndarray, shape (3, m), mN
     tolerance : float
         Residual at which the body counts as at rest; see ``Rest``.
@@ -215,7 +235,7 @@ def relax(body: Elastic, load: Array, tolerance: float) -> Rest:
         return _relax(body, load, tolerance)
 
 
-def _relax(body: Elastic, load: Array, tolerance: float) -> Rest:
+def _relax(body: Relaxed, load: Array, tolerance: float) -> Rest:
     free = body.stencil.free
     u, trial, step = np.zeros_like(load), np.zeros_like(load), np.zeros((3, free))
     force, trial_force = np.zeros_like(load), np.zeros_like(load)
@@ -279,39 +299,28 @@ def _add_row(count, rows, x0, x1, x2, y):
 @njit(cache=True, nogil=True, error_model="numpy")
 def invert_diagonal(tensors, inverse):
     """Invert symmetric tensors (9, f); one that is not positive definite counts by its trace."""
-    for i in range(tensors.shape[1]):
-        a, b, c = tensors[0, i], tensors[1, i], tensors[2, i]
-        d, e, f = tensors[4, i], tensors[5, i], tensors[8, i]
-        c0, c1, c2 = d * f - e * e, c * e - b * f, b * e - c * d
-        det = a * c0 + b * c1 + c * c2
-        if a > 0.0 and a * d - b * b > 0.0 and det > 0.0:
-            inverse[0, i], inverse[1, i], inverse[2, i] = c0 / det, c1 / det, c2 / det
-            inverse[3, i], inverse[4, i] = c1 / det, (a * f - c * c) / det
-            inverse[5, i] = (b * c - a * e) / det
-            inverse[6, i], inverse[7, i], inverse[8, i] = (
-                c2 / det,
-                inverse[5, i],
-                (a * d - b * b) / det,
-            )
+    f, flat, out = tensors.shape[1], tensors.reshape(-1), inverse.reshape(-1)
+    for i in range(f):
+        T = load(flat, i, f)
+        C = cofactor(T)
+        J = det(T, C)
+        if T[0] > 0.0 and C[8] > 0.0 and J > 0.0:
+            store(scale(1.0 / J, C), out, i, f)
         else:
             inverse[:, i] = 0.0
-            inverse[0, i] = inverse[4, i] = inverse[8, i] = 3.0 / (abs(a) + abs(d) + abs(f))
+            inverse[0, i] = inverse[4, i] = inverse[8, i] = 3.0 / (
+                abs(T[0]) + abs(T[4]) + abs(T[8])
+            )
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def _precondition(inverse, r, z):
     """Write ``z = inverse r`` and return ``r . z``; ``inverse`` (9, f), the others (3, f)."""
-    total = np.float32(0.0)
-    r0, r1, r2, z0, z1, z2 = r[0], r[1], r[2], z[0], z[1], z[2]
-    t0, t1, t2, t4, t5, t8 = inverse[0], inverse[1], inverse[2], inverse[4], inverse[5], inverse[8]
-    for i in range(r.shape[1]):
-        a, b, c = r0[i], r1[i], r2[i]
-        x = t0[i] * a + t1[i] * b + t2[i] * c
-        y = t1[i] * a + t4[i] * b + t5[i] * c
-        z_ = t2[i] * a + t5[i] * b + t8[i] * c
-        z0[i], z1[i], z2[i] = x, y, z_
-        total += a * x + b * y + c * z_
-    return total
+    z[:] = 0.0
+    for axis in range(3):
+        rows = inverse[3 * axis], inverse[3 * axis + 1], inverse[3 * axis + 2]
+        _add_row(r.shape[1], rows, r[0], r[1], r[2], z[axis])
+    return np.dot(r.reshape(-1), z.reshape(-1))
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix, diags
+from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.sparse.linalg import splu
 
 from palpate.offline.fem.mesh import Mesh
@@ -31,6 +31,7 @@ from palpate.offline.methods.method import Case
 from palpate.offline.run.workshop import Workshop
 from palpate.shared.errors import PalpateError
 from palpate.shared.geometry.elements import gauss, quadrilateral, shape
+from palpate.shared.mechanics.tissue import lame
 
 Array = NDArray[np.float64]
 Cut = tuple[tuple[int, int, int, int], ...]
@@ -146,6 +147,22 @@ def volumes(nodes: Array, elements: Ints) -> Array:
     corners = nodes[elements]
     determinants: Array = np.linalg.det(corners[:, 1:] - corners[:, :1])
     return determinants / 6.0
+
+
+def stiffness(nodes: Array, elements: Ints, young: float, poisson: float) -> csr_matrix:
+    """Stiffness matrix (3 m, 3 m) mN/mm of linear elastic tetrahedra.
+
+    A pair of nodes has ``V (lambda g_a g_b^T + mu g_b g_a^T + mu (g_a . g_b) I)``, summed over the
+    tetrahedra; ``g_a`` are the gradients of the shape functions.
+    """
+    mu, lam = lame(young, poisson)
+    g, volume = gradients(nodes, elements)
+    outer = np.einsum("t,tai,tbj->taibj", volume, g, g)
+    blocks = lam * outer + mu * outer.transpose(0, 1, 4, 3, 2)
+    blocks += mu * np.einsum("taibi,kl->takbl", outer, np.eye(3))
+    dofs = (3 * elements[:, :, None] + np.arange(3)).reshape(len(elements), 12)
+    rows, columns = np.repeat(dofs, 12, axis=1).ravel(), np.tile(dofs, (1, 12)).ravel()
+    return coo_matrix((blocks.ravel(), (rows, columns)), (nodes.size, nodes.size)).tocsr()
 
 
 def _cut(divisions: Divisions, even: Cut, odd: Cut) -> Ints:

@@ -26,7 +26,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,25 +35,32 @@ from numpy.typing import NDArray
 
 from palpate.offline.methods.catalogue import Training, build
 from palpate.offline.methods.full import Remeshed
-from palpate.offline.methods.method import Case, Method, Snapshots
-from palpate.offline.methods.shipped import Shipped, Warm
+from palpate.offline.methods.method import Method, Snapshots, Steps
+from palpate.offline.methods.shipped import Shipped
 from palpate.offline.run.checkpoint import Checkpoint, content_key
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.workers import resume, worker_pool
 from palpate.offline.run.workshop import Workshop, open_artifact
-from palpate.offline.studies.chart_drawing import IN_TIME, OF_LOADS, Layout, draw, write_page
-from palpate.offline.studies.chart_points import FIELDS, SHIPPED, STATISTICS, TWIN, Point, pareto
+from palpate.offline.studies.chart_drawing import (
+    FIELDS,
+    IN_TIME,
+    OF_LOADS,
+    SHIPPED,
+    STATISTICS,
+    TWIN,
+    Row,
+    draw,
+    pareto,
+    write_page,
+)
 from palpate.offline.studies.references import (
     Fields,
-    Steps,
     full_histories,
-    full_solutions,
     random_steps,
     refined,
+    snapshots,
 )
 from palpate.offline.studies.tables import write_csv
-from palpate.offline.validate.histories import NONE_FOLLOWED
-from palpate.offline.validate.loads import random_loads, unseen_loads
 from palpate.offline.validate.norms import relative
 from palpate.shared.artifact import read_artifact
 from palpate.shared.errors import PalpateError, QueryError
@@ -81,8 +88,7 @@ PLAN: Plan = {
     "linear": (*MODES, 160),
     "regression": MODES,
     "mass-spring": (0.5, 1, 2),
-    "tensor-mass linear": (0.5, 1, 2),
-    "tensor-mass nonlinear": (0.5, 1, 2),
+    "tensor-mass": (0.5, 1, 2),
     "full": (0.5, 0.75, 1, 1.5),
 }
 PLAN_IN_TIME: Plan = {
@@ -93,7 +99,6 @@ PLAN_IN_TIME: Plan = {
     "modal": MODES,
     "ritz": MODES,
 }
-
 
 REFINEMENT = 2
 """Factor on the divisions of the reference mesh: eight times the elements."""
@@ -107,194 +112,116 @@ SLOW = 100e-3
 
 
 @dataclass(frozen=True)
-class Query:
-    """What methods are asked, and the full model's answers."""
-
-    steps: Steps
-    exact: Fields
-
-
-@dataclass(frozen=True)
 class References:
     """Full solutions to learn from, to compare with, and of the first queries in a refined mesh."""
 
     snapshots: Snapshots
-    queries: list[Query]
+    queries: list[tuple[Steps, Fields]]
     refined: Array  # (j, n, 3) mm, nan where there is no equilibrium
 
 
 def chart(
-    scene: Scene, artifact: Path, snapshots: int, queries: int, seed: int, plan: Plan = PLAN
+    artifact: Path,
+    scene: Scene | None,
+    snapshots: int,
+    queries: int,
+    seed: int,
+    plan: Plan | None = None,
 ) -> dict[str, Any]:
-    """Measure and draw speed and accuracy of every method under random loads.
+    """Measure and draw speed and accuracy of every method.
 
     Parameters
     ----------
-    scene : Scene
-        That the artifact was trained on.
     artifact : Path
-        ``chart.csv``, ``chart.png`` and ``chart.html`` go to ``NAME/report/`` beside it.
+        ``chart.csv``, ``chart.png`` and ``chart.html``, or ``chart_in_time.*``, go to
+        ``NAME/report/`` beside it.
+    scene : Scene or None
+        That the artifact was trained on, with its files, for queries that are loads.  None for
+        histories of visco-elastic tissue.
     snapshots : int
-        Full solutions that methods learn from.
+        Full solutions, or histories, that methods learn from.
     queries, seed : int
-        Loads to answer, the same as ``validate.loads.validate`` takes.
-    plan : mapping
-        Sizes of every method; those of the artifact and the full model are needed.  POD is
-        measured with as many modes as the artifact has unknowns, too.
+        Loads or histories to answer, the same as ``palpate validate`` takes.
+    plan : mapping, optional
+        Sizes of every method; those of the artifact and the full model are needed.  Under loads POD
+        is measured with as many modes as the artifact has unknowns, too.
 
     Returns
     -------
     dict
         ``points``: times and errors by key; ``pareto``: keys of those that no other beats in both
         time and p95 of displacement; ``speed_of_next``: time of the fastest other point that is at
-        least as accurate, over the artifact's.
+        least as accurate, over the artifact's; ``without_equilibrium``: queries that the full model
+        has no answer to; over histories ``step_over_elastic``: time of the artifact's step over
+        that of its elastic twin.
     """
-    atlas = ReducedModel.load(artifact)
-    if atlas.scene.text != scene.text:
-        raise PalpateError(f"{artifact}: trained on another scene than {scene.name!r}")
-    checkpoint = Checkpoint(
-        artifact.parent / f".{artifact.stem}.chart", _key(scene, artifact, seed)
-    )
-    references = _loads(scene, atlas, artifact, snapshots, queries, seed, checkpoint)
-    context = scene, artifact, references, seed, False
-    plan = {**plan, "pod": sorted({*plan["pod"], Shipped(atlas).unknowns})}
-    return _measured(atlas, plan, context, checkpoint, "chart", OF_LOADS)
-
-
-def chart_in_time(
-    artifact: Path, histories: int, snapshots: int, seed: int, plan: Plan = PLAN_IN_TIME
-) -> dict[str, Any]:
-    """Measure and draw speed and accuracy of methods over random histories.
-
-    Parameters
-    ----------
-    artifact : Path
-        Of visco-elastic tissue; ``chart_in_time.csv``, ``.png`` and ``.html`` go to its report.
-    histories, snapshots : int
-        Random histories that methods answer, and that POD learns from.
-    seed : int
-        Of both; the former are those of ``palpate validate --histories``.
-    plan : mapping
-        As of ``chart``.
-
-    Returns
-    -------
-    dict
-        As of ``chart``; ``step_over_elastic``: time of the artifact's step over that of its elastic
-        twin; ``without_equilibrium``: histories that the full model could not follow.
-    """
-    atlas = ReducedModel.load(artifact)
-    if atlas.models.viscous is None:
+    atlas, layout = ReducedModel.load(artifact), IN_TIME if scene is None else OF_LOADS
+    if scene is None and atlas.models.viscous is None:
         raise QueryError("scene", f"{atlas.name!r} is elastic: it has no histories")
-    checkpoint = Checkpoint(
-        artifact.parent / f".{artifact.stem}.chart_in_time", _key(atlas.scene, artifact, seed)
-    )
-    references = _histories(atlas, artifact, histories, snapshots, seed, checkpoint)
-    context = None, artifact, references, seed, True
-    report = _measured(atlas, plan, context, checkpoint, "chart_in_time", IN_TIME)
-    times = {key: report["points"][key]["time_us"] for key in (SHIPPED, TWIN)}
-    return report | {
-        "step_over_elastic": times[SHIPPED] / times[TWIN],
-        "without_equilibrium": histories - len(references.queries),
-    }
-
-
-def _key(scene: Scene, artifact: Path, seed: int) -> str:
-    """Hash of everything that results depend on."""
-    sha = hashlib.sha256(artifact.read_bytes() + b"%d" % seed)
-    return f"{content_key(scene)}-{sha.hexdigest()[:16]}"
-
-
-def _measured(
-    atlas: ReducedModel,
-    plan: Plan,
-    context: tuple[Any, ...],
-    checkpoint: Checkpoint,
-    name: str,
-    layout: Layout,
-) -> dict[str, Any]:
-    """Measure the methods of a plan, publish the chart and report it."""
+    if scene is not None and atlas.scene.text != scene.text:
+        raise PalpateError(f"{artifact}: trained on another scene than {scene.name!r}")
+    sha = hashlib.sha256(artifact.read_bytes() + b"%d" % seed).hexdigest()[:16]
+    key = f"{content_key(scene or atlas.scene)}-{sha}"
+    checkpoint = Checkpoint(artifact.parent / f".{artifact.stem}.{layout.name}", key)
+    workshop = Workshop.of_artifact(read_artifact(artifact))
+    plan = plan or (PLAN_IN_TIME if scene is None else PLAN)
+    if scene is not None:
+        plan = {**plan, "pod": sorted({*plan["pod"], Shipped(workshop, atlas).unknowns})}
+    references = _solved(atlas, workshop, artifact, scene, (snapshots, queries, seed), checkpoint)
     tasks = {
         f"{method} {size:g}": (measure, method, size)
         for method, sizes in plan.items()
         for size in sizes
     }
     # one process: times are those of one core, and methods share what they learn from
-    with worker_pool(open_bench, *context, count=1) as worker:
+    with worker_pool(open_bench, artifact, scene, references, seed, count=1) as worker:
         measured = resume("methods", worker, checkpoint, tasks, dict)
     usual = float(np.median([np.median(found["beside"]) for found in measured.values()]))
-    points = [_point(key, found, usual) for key, found in measured.items()]
-    artifact: Path = context[1]
-    folder = artifact.parent / atlas.name / "report"
-    write_csv(folder / f"{name}.csv", [asdict(point) for point in points])
-    draw(folder / f"{name}.png", points, atlas.scene, layout)
-    write_page(folder / f"{name}.html", points, atlas.scene, layout)
+    rows = [_row(key, found, usual) for key, found in measured.items()]
+    report = artifact.parent / atlas.name / "report"
+    write_csv(report / f"{layout.name}.csv", rows)
+    draw(report / f"{layout.name}.png", rows, atlas.scene, layout)
+    write_page(report / f"{layout.name}.html", rows, atlas.scene, layout)
     checkpoint.remove()
-    return _report(points)
+    return _summary(rows) | {"without_equilibrium": queries - len(references.queries)}
 
 
-# --- full solutions ------------------------------------------------------------------------------
-
-
-def _loads(
-    scene: Scene,
+def _solved(
     atlas: ReducedModel,
+    workshop: Workshop,
     artifact: Path,
-    snapshots: int,
-    queries: int,
-    seed: int,
+    scene: Scene | None,
+    settings: tuple[int, int, int],
     checkpoint: Checkpoint,
 ) -> References:
-    """Full solutions of random loads."""
-    rng = stream(scene.seed, Stage.SNAPSHOTS, seed)
-    loads = random_loads(atlas.surface, atlas.limits, atlas.scene, snapshots, rng)
-    with worker_pool(open_artifact, artifact) as pool:
-        training = full_solutions("snapshots", loads, pool, checkpoint)
-        solved = full_solutions("queries", unseen_loads(atlas, queries, seed), pool, checkpoint)
-        tasks = {
-            f"refined-{queries}-{i}": (refined, scene, REFINEMENT, load)
-            for i, load in enumerate(solved.loads[:REFINED_LOADS])
-        }
-        found = resume("refined mesh", pool, checkpoint, tasks, lambda u: {"u": u})
-    workshop = Workshop.of_artifact(read_artifact(artifact))
-    displacements = solved.displacements.reshape(len(solved.loads), -1, 3)
-    unseen = [
-        Query([(Case.of(workshop, load), 0.0)], Fields(u[None], workshop.von_mises(u)[None]))
-        for load, u in zip(solved.loads, displacements, strict=True)
-    ]
-    return References(training, unseen, np.stack([found[name]["u"] for name in tasks]))
-
-
-def _histories(
-    atlas: ReducedModel,
-    artifact: Path,
-    queries: int,
-    snapshots: int,
-    seed: int,
-    checkpoint: Checkpoint,
-) -> References:
-    """Full solutions of random histories."""
-    workshop = Workshop.of_artifact(read_artifact(artifact))
-    stages = {
-        "query": (Stage.UNSEEN, queries),
-        "snapshot": (Stage.CHART_IN_TIME_SNAPSHOTS, snapshots),
-    }
+    """Full solutions of as many snapshots and queries as the settings say, with their seed."""
+    *counts, seed = settings
     histories = {
-        f"{name} {i}": steps
-        for name, (stage, count) in stages.items()
+        f"{stage.name} {i}": steps
+        for stage, count in zip((Stage.SNAPSHOTS, Stage.UNSEEN), counts, strict=True)
         for i, steps in enumerate(
-            random_steps(atlas, workshop, count, stream(atlas.scene.seed, stage, seed))
+            random_steps(
+                atlas, workshop, count, stream(atlas.scene.seed, stage, seed), scene is None
+            )
         )
     }
     with worker_pool(open_artifact, artifact) as pool:
-        found = full_histories(histories, set(), pool, checkpoint)
-    unseen = [Query(histories[name], own) for name, own in found.items() if name[0] == "q"]
-    training = [own.displacements for name, own in found.items() if name[0] == "s"]
-    if not unseen or not training:
-        raise PalpateError(f"{artifact}: {NONE_FOLLOWED}")
-    rows = np.concatenate(training).astype(float)
-    nothing = np.empty((0, *workshop.mesh.nodes.shape))
-    return References(Snapshots((), rows.reshape(len(rows), -1)), unseen, nothing)
+        found = full_histories(histories, pool, checkpoint)
+        learnt = {name: own for name, own in found.items() if name.startswith("SNAPSHOTS")}
+        queries = [(histories[name], own) for name, own in found.items() if name not in learnt]
+        if not queries:
+            raise PalpateError(f"{artifact}: the full model could follow none of the queries")
+        tasks = {
+            f"refined-{len(queries)}-{i}": (refined, scene, REFINEMENT, steps[0][0].contacts[0])
+            for i, (steps, _) in enumerate(queries[:REFINED_LOADS])
+            if scene is not None
+        }
+        finer = resume("refined mesh", pool, checkpoint, tasks, lambda u: {"u": u})
+    return References(
+        snapshots([histories[name] for name in learnt], list(learnt.values())),
+        queries,
+        np.array([finer[name]["u"] for name in tasks]).reshape(-1, *workshop.mesh.nodes.shape),
+    )
 
 
 # --- in the worker that measures -----------------------------------------------------------------
@@ -303,15 +230,14 @@ def _histories(
 _bench: tuple[Training, References] | None = None
 
 
-def open_bench(
-    scene: Scene | None, artifact: Path, references: References, seed: int, in_time: bool
-) -> None:
+def open_bench(artifact: Path, scene: Scene | None, references: References, seed: int) -> None:
     """Initialize the process that measures."""
     global _bench
     open_artifact(artifact)
     workshop = Workshop.of_artifact(read_artifact(artifact))
     atlas = ReducedModel.load(artifact)
-    _bench = Training(workshop, references.snapshots, atlas, seed, scene, in_time), references
+    training = Training(workshop, references.snapshots, atlas, seed, scene, in_time=scene is None)
+    _bench = training, references
 
 
 def measure(workshop: Workshop, name: str, size: float) -> dict[str, Any]:
@@ -330,17 +256,17 @@ def measure(workshop: Workshop, name: str, size: float) -> dict[str, Any]:
     if isinstance(method, Remeshed):
         queries = queries[: len(finer)]
     for one in (method, yardstick):  # compiled code comes in from disk
-        one.step(one.at_rest(), *queries[0].steps[0])
+        one.step(one.at_rest(), *queries[0][0][0])
     errors, converged = np.ones((len(queries), 2)), np.ones(len(queries), dtype=bool)
     from_finer, times = np.ones(len(finer)), []
-    for i, query in enumerate(queries):
-        states, seconds = play(method, query.steps)
+    for i, (steps, exact) in enumerate(queries):
+        states, seconds = play(method, steps)
         times.append(seconds)
         converged[i] = states is not None
         if states is not None:
             fields = Fields.of(method, states)
-            exact = at_once(workshop, query.steps) if isinstance(method, Warm) else query.exact
-            errors[i] = fields.errors(workshop, exact)
+            twin = training.in_time and name == "artifact, warm"
+            errors[i] = fields.errors(workshop, at_once(workshop, steps) if twin else exact)
             if i < len(finer):
                 from_finer[i] = relative(fields.displacements[-1], finer[i])
     from_finer[np.isnan(finer).any(axis=(1, 2))] = np.nan
@@ -380,16 +306,16 @@ def at_once(workshop: Workshop, steps: Steps) -> Fields:
     for case, _ in steps:
         load = case.load(len(workshop.mesh.nodes))
         u.append(workshop.model.solve(load, u[-1] if u else None).displacement)
-    return Fields(np.array(u), np.array([workshop.von_mises(x) for x in u]))
+    return Fields.at_once(workshop, u)
 
 
 def _times(
-    method: Method, yardstick: Method, queries: Sequence[Query], first: Array
+    method: Method, yardstick: Method, queries: Sequence[tuple[Steps, Fields]], first: Array
 ) -> tuple[Array, Array]:
     """Seconds that a method needs for each step, and the yardstick in turns with it."""
 
     def run(one: Method) -> Array:
-        return np.concatenate([play(one, query.steps)[1] for query in queries])
+        return np.concatenate([play(one, steps)[1] for steps, _ in queries])
 
     times, beside = first, run(yardstick)
     repeats = 1 if np.median(first) > SLOW else REPEATS - 1
@@ -403,37 +329,37 @@ def _times(
 # --- results -------------------------------------------------------------------------------------
 
 
-def _point(key: str, found: Mapping[str, Any], usual: float) -> Point:
+def _row(key: str, found: Mapping[str, Any], usual: float) -> dict[str, Any]:
     """A point of the chart, its times scaled to the artifact's usual speed."""
-    figures: dict[str, float] = {}
+    row: dict[str, Any] = {
+        "key": key,
+        "family": key.rsplit(" ", 1)[0],
+        "label": found["label"].item().decode(),
+        "unknowns": int(found["unknowns"]),
+        "time_us": float(1e6 * np.median(found["times"]) / np.median(found["beside"]) * usual),
+    }
     for name in FIELDS:
         errors = found[name][~np.isnan(found[name])]
         quantiles = np.percentile(errors, [50, 95, 100]) if errors.size else np.full(3, np.nan)
         for statistic, error in zip(STATISTICS, quantiles.tolist(), strict=True):
-            figures[f"{name}_{statistic}"] = error
-    return Point(
-        key=key,
-        family=key.rsplit(" ", 1)[0],
-        label=found["label"].item().decode(),
-        unknowns=int(found["unknowns"]),
-        time_us=float(1e6 * np.median(found["times"]) / np.median(found["beside"]) * usual),
-        unconverged=int((~found["converged"]).sum()),
-        **figures,
-    )
+            row[f"{name}_{statistic}"] = error
+    return row | {"unconverged": int((~found["converged"]).sum())}
 
 
-def _report(points: Sequence[Point]) -> dict[str, Any]:
-    shipped = next(point for point in points if point.key == SHIPPED)
+def _summary(rows: Sequence[Row]) -> dict[str, Any]:
+    points = {row["key"]: row for row in rows}
+    shipped, twin = points[SHIPPED], points.get(TWIN)
     as_good = [
-        point.time_us
-        for point in points
-        if point.key not in (SHIPPED, TWIN) and point.displacement_p95 <= shipped.displacement_p95
+        row["time_us"]
+        for key, row in points.items()
+        if key not in (SHIPPED, TWIN) and row["displacement_p95"] <= shipped["displacement_p95"]
     ]
-    rows = {point.key: asdict(point) for point in points}
-    for row in rows.values():
-        del row["key"], row["family"]
-    return {
-        "points": rows,
-        "pareto": [point.key for point in pareto(points)],
-        "speed_of_next": min(as_good) / shipped.time_us,
+    summary = {
+        "points": {
+            key: {name: value for name, value in row.items() if name not in ("key", "family")}
+            for key, row in points.items()
+        },
+        "pareto": [row["key"] for row in pareto(rows)],
+        "speed_of_next": min(as_good) / shipped["time_us"],
     }
+    return summary | ({"step_over_elastic": shipped["time_us"] / twin["time_us"]} if twin else {})

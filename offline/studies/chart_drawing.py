@@ -6,42 +6,37 @@ for the methods of a group; a line joins the sizes of one method.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-
-from palpate.offline.studies.chart_points import FULL, SHIPPED, STATISTICS, TWIN, Point, pareto
 from palpate.shared.scene import Scene
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.lines import Line2D
 
+Row = Mapping[str, Any]
+"""A method of one size: ``key``, ``family``, ``label``, ``unknowns``, ``time_us``, ``unconverged``
+and ``FIELD_STATISTIC`` for all of those; errors are fractions, nan where there is nothing to
+compare: another mesh has no error of reduction."""
 
-@dataclass(frozen=True)
-class Group:
-    """Methods of one kind, by family; a marker each, in the order of ``MARKERS``."""
+SHIPPED, TWIN, FULL = "artifact 1", "artifact, warm 1", "full 1"
+"""Keys of the artifact, of the artifact without memory, and of the full model on its own mesh."""
 
-    title: str
-    colour: str
-    methods: dict[str, str]
+FIELDS = ("displacement", "von_mises", "refined")
+"""Errors: of two fields on the scene's mesh, and of displacement against a refined one."""
 
+STATISTICS = ("median", "p95", "max")
 
 ACCENT, DARK_ACCENT = "#D55E00", "#A34700"
 """Of what is Palpate's; the second for letters."""
 
-GROUPS = (
-    Group(
-        "Palpate",
-        ACCENT,
-        {"artifact": "this artifact", "artifact, warm": "the same without memory"},
-    ),
-    Group("Finite elements", "#000000", {"full": "full model, several meshes"}),
-    Group(
-        "Modes of the body at rest",
+GROUPS: dict[str, tuple[str, dict[str, str]]] = {
+    "Palpate": (ACCENT, {"artifact": "this artifact", "artifact, warm": "the same without memory"}),
+    "Finite elements": ("#000000", {"full": "full model, several meshes"}),
+    "Modes of the body at rest": (
         "#0072B2",
         {
             "modal": "vibration modes",
@@ -49,18 +44,15 @@ GROUPS = (
             "krylov": "load-dependent vectors (Krylov)",
         },
     ),
-    Group(
-        "Modes made for each load",
+    "Modes made for each load": (
         "#56B4E9",
         {"ritz-at-hand": "Ritz vectors", "derivatives": "static derivatives"},
     ),
-    Group(
-        "POD of full solutions",
+    "POD of full solutions": (
         "#009E73",
         {"pod": "energy norm", "pod-euclidean": "Euclidean norm"},
     ),
-    Group(
-        "POD, hyper-reduced",
+    "POD, hyper-reduced": (
         "#E69F00",
         {
             "pod-ecm": "cubature of points (ECM)",
@@ -69,57 +61,80 @@ GROUPS = (
             "pod-gappy": "least squares (gappy POD)",
         },
     ),
-    Group(
-        "No equilibrium solved",
+    "No equilibrium solved": (
         "#CC79A7",
         {"linear": "linear response", "regression": "regression (RBF)"},
     ),
-    Group(
-        "Springs and tetrahedra",
+    "Springs and tetrahedra": (
         "#7A7A7A",
-        {
-            "mass-spring": "mass-spring",
-            "tensor-mass linear": "tensor-mass, linear",
-            "tensor-mass nonlinear": "tensor-mass, St. Venant-Kirchhoff",
-        },
+        {"mass-spring": "mass-spring", "tensor-mass": "tensor-mass"},
     ),
-)
+}
+"""Colour of a group, and the names of its methods by family; a marker each, in this order."""
 
-MARKERS = ("o", "s", "^", "D")
-PAGE_MARKERS = ("circle", "square", "triangle-up", "diamond")
+MARKERS, OUR_MARKERS = ("o", "s", "^", "D"), ("*", "P")
+PAGE_MARKERS = {
+    "o": "circle", "s": "square", "^": "triangle-up", "D": "diamond", "*": "star", "P": "cross",
+}  # fmt: skip
+"""Plotly's names of Matplotlib's markers."""
+
+NAMES = {
+    "linear 160": ("linear\nresponse", (-4, -26), "left"),
+    "regression 20": ("regression", (-4, 14), "left"),
+    "pod-ecm 80": ("POD, hyper-reduced", (-8, -14), "right"),
+    "pod 80": ("POD", (8, -4), "left"),
+    "modal 80": ("linear modes", (0, 10), "left"),
+    "mass-spring 1": ("mass-spring", (8, 3), "left"),
+    "tensor-mass 2": ("tensor-mass", (8, -3), "left"),
+    "derivatives 9": ("static\nderivatives", (-8, -28), "right"),
+    "full 0.75": ("coarser mesh", (-8, -4), "right"),
+    "full 1.5": ("finer mesh", (8, -16), "right"),
+}
+"""What is written beside points: text, offset in points and alignment."""
+
+
+def pareto(rows: Sequence[Row], error: str = "displacement_p95") -> list[Row]:
+    """The points, fastest first, that no other beats in both time and an error.
+
+    The artifact without memory is no competitor: it answers another question.
+    """
+    front: list[Row] = []
+    least = math.inf
+    for row in sorted(rows, key=lambda row: (row["time_us"], row[error])):
+        if row["key"] != TWIN and row[error] < least:
+            front.append(row)
+            least = row[error]
+    return front
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One pair of axes: a statistic of an error of ``chart_points.FIELDS``."""
+    """One pair of axes: a statistic of an error, and what the error is of."""
 
     title: str
-    error: str
+    axis: str
     field: str
     statistic: str = "p95"
 
-    def of(self, point: Point) -> float:
-        """The error of a point that its marker shows."""
-        return point.error(self.field, self.statistic)
+    @property
+    def error(self) -> str:
+        """The column that is drawn."""
+        return f"{self.field}_{self.statistic}"
 
-    def front(self, points: Sequence[Point]) -> list[Point]:
-        """The points that no other beats."""
-        return pareto(points, self.field, self.statistic)
-
-    def plotted(self, points: Sequence[Point]) -> list[Point]:
+    def plotted(self, rows: Sequence[Row]) -> list[Row]:
         """Points that have this error; the full model on its own mesh has none but rounding."""
-        known = [point for point in points if not np.isnan(self.of(point))]
-        return [point for point in known if self.field == "refined" or point.key != FULL]
+        known = [row for row in rows if not math.isnan(row[self.error])]
+        return [row for row in known if self.field == "refined" or row["key"] != FULL]
 
 
 @dataclass(frozen=True)
 class Layout:
-    """A chart: title with a place for the scene's name, what a time is of, panels, and a note."""
+    """A chart: its file, title with a place for the scene's name, what a time is of, panels."""
 
+    name: str
     title: str
     per: str
     panels: tuple[Panel, ...]
-    note: str
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -128,6 +143,7 @@ class Layout:
 
 
 OF_LOADS = Layout(
+    "chart",
     "Speed and accuracy of methods on the scene {!r}: lower left is better",
     "query",
     (
@@ -140,75 +156,48 @@ OF_LOADS = Layout(
             "median",
         ),
     ),
-    """\
-A point is a method of one size; a line joins its sizes. Errors are
-relative L2 norms over random loads that no method has seen: markers
-show the 95th percentile (lower left: the median), whiskers the worst.
-At 100 % an answer is no better than none. Dashed: the Pareto front;
-nothing is both faster and more accurate than what lies on it.""",
 )
 IN_TIME = Layout(
+    "chart_in_time",
     "Speed and accuracy over histories of the scene {!r}: lower left is better",
     "step",
     (
         Panel("Displacement", "error over a history, 95th percentile", "displacement"),
         Panel("Von Mises stress", "error over a history, 95th percentile", "von_mises"),
     ),
-    """\
-A point is a method of one size; a line joins its sizes. Errors are
-relative L2 norms over random histories that no method has seen:
-markers show the 95th percentile, whiskers the worst. Dashed: the
-Pareto front; nothing is both faster and more accurate than what
-lies on it.""",
 )
-
-NAMES = {
-    "linear 160": ("linear\nresponse", (-4, -26), "left"),
-    "regression 20": ("regression", (-4, 14), "left"),
-    "pod-ecm 80": ("POD, hyper-reduced", (-8, -14), "right"),
-    "pod 80": ("POD", (8, -4), "left"),
-    "modal 80": ("linear modes", (0, 10), "left"),
-    "mass-spring 1": ("mass-spring", (8, 3), "left"),
-    "tensor-mass linear 2": ("tensor-mass", (8, -3), "left"),
-    "derivatives 9": ("static\nderivatives", (-8, -28), "right"),
-    "full 0.75": ("coarser mesh", (-8, -4), "right"),
-    "full 1.5": ("finer mesh", (8, -16), "right"),
-}
-"""What is written beside points: text, offset in points and alignment."""
+NOTE = """\
+A point is a method of one size; a line joins its sizes.
+Errors are relative L2 norms over random queries that no
+method has seen; whiskers show the worst. At 100 % an
+answer is no better than none. Dashed: the Pareto front;
+nothing is both faster and more accurate than what lies
+on it."""
 
 
-@dataclass(frozen=True)
-class Look:
+class Look(NamedTuple):
     """How a method is drawn."""
 
     family: str
     name: str
-    group: Group
-    index: int
+    group: str
+    colour: str
+    marker: str
 
     @property
     def ours(self) -> bool:
         """Whether it is Palpate's, which stands out."""
-        return self.group is GROUPS[0]
-
-    @property
-    def marker(self) -> str:
-        """Matplotlib's."""
-        return "*P"[self.index] if self.ours else MARKERS[self.index]
-
-    @property
-    def page_marker(self) -> str:
-        """Plotly's."""
-        return ("star", "cross")[self.index] if self.ours else PAGE_MARKERS[self.index]
+        return self.marker in OUR_MARKERS
 
 
-def looks(points: Sequence[Point]) -> Iterator[Look]:
-    """Every method that has points, Palpate's last so that they lie on top."""
-    families = {point.family for point in points}
-    for group in (*GROUPS[1:], GROUPS[0]):
-        for index, (family, name) in enumerate(group.methods.items()):
-            if family in families:
-                yield Look(family, name, group, index)
+def looks(rows: Sequence[Row]) -> Iterator[tuple[Look, list[Row]]]:
+    """Every method that has points, with these; Palpate's last so that they lie on top."""
+    for title in (*list(GROUPS)[1:], "Palpate"):
+        colour, methods = GROUPS[title]
+        markers = OUR_MARKERS if title == "Palpate" else MARKERS
+        for (family, name), marker in zip(methods.items(), markers, strict=False):
+            if own := [row for row in rows if row["family"] == family]:
+                yield Look(family, name, title, colour, marker), own
 
 
 def duration(microseconds: float) -> str:
@@ -227,73 +216,54 @@ def percent(error: float) -> str:
 # --- picture -------------------------------------------------------------------------------------
 
 
-def draw(path: Path, points: Sequence[Point], scene: Scene, layout: Layout) -> None:
+def draw(path: Path, rows: Sequence[Row], scene: Scene, layout: Layout) -> None:
     """Draw the chart; its legend takes the place of a last panel."""
     from matplotlib.figure import Figure
 
-    rows, columns = layout.grid
-    figure = Figure(figsize=(6.25 * columns, 5.4 * rows), layout="constrained")
-    grid = figure.subplots(rows, columns).ravel()
+    down, across = layout.grid
+    figure = Figure(figsize=(6.25 * across, 5.4 * down), layout="constrained")
+    grid = figure.subplots(down, across).ravel()
     figure.suptitle(layout.title.format(scene.name), fontsize=15, fontweight="bold")
     for axes, panel in zip(grid, layout.panels, strict=False):
-        _draw_panel(axes, panel, points, scene, layout.per)
-    _draw_legend(grid[-1], points, layout.note)
+        _draw_panel(axes, panel, rows, scene, layout.per)
+    _draw_legend(grid[-1], rows)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)
 
 
-def _draw_panel(axes: Axes, panel: Panel, points: Sequence[Point], scene: Scene, per: str) -> None:
-    kept = panel.plotted(points)
-    axes.set(xscale="log", yscale="log")
+def _draw_panel(axes: Axes, panel: Panel, rows: Sequence[Row], scene: Scene, per: str) -> None:
+    kept, error = panel.plotted(rows), panel.error
+    axes.set(xscale="log", yscale="log", xlabel=f"time per {per} on one core", ylabel=panel.axis)
     axes.set_title(panel.title, fontsize=12.5, fontweight="bold", loc="left")
-    axes.set_xlabel(f"time per {per} on one core")
-    axes.set_ylabel(panel.error)
     axes.xaxis.set_major_formatter(lambda x, _: duration(x))
     axes.yaxis.set_major_formatter(lambda y, _: f"{100 * y:g} %")
     axes.grid(color="0.9", linewidth=0.7)
     axes.tick_params(labelbottom=True)
-    for look in looks(kept):
-        _draw_method(axes, look, [p for p in kept if p.family == look.family], panel)
-    times, errors = [p.time_us for p in points], [panel.of(p) for p in kept]
+    for look, own in looks(kept):
+        times, errors = [row["time_us"] for row in own], [row[error] for row in own]
+        largest = [row[f"{panel.field}_max"] for row in own]
+        axes.vlines(times, errors, largest, look.colour, lw=0.8, alpha=0.3)
+        size, order = {"*": 17.0, "P": 11.0}.get(look.marker, 5.5), 5 if look.ours else 3
+        axes.plot(
+            times, errors, look.marker, ls="-", lw=0.9, color=look.colour, markersize=size,
+            markeredgecolor="white", markeredgewidth=0.6, zorder=order,
+        )  # fmt: skip
+    times = [row["time_us"] for row in rows]
+    errors = [row[error] for row in kept]
     axes.set_xlim(min(times) / 1.8, max(times) * 2)
     axes.set_ylim(min(errors) / 3, max(2 * max(errors), 1.5))
-    _draw_front(axes, kept, panel)
-    _draw_aim(axes, panel, scene, per)
-    _draw_full(axes, panel, points)
-    _draw_names(axes, panel, kept)
-
-
-def _draw_method(axes: Axes, look: Look, points: Sequence[Point], panel: Panel) -> None:
-    times = [point.time_us for point in points]
-    errors = [panel.of(point) for point in points]
-    largest = [point.error(panel.field, "max") for point in points]
-    axes.vlines(times, errors, largest, look.group.colour, lw=0.8, alpha=0.3)
-    axes.plot(
-        times,
-        errors,
-        look.marker,
-        linestyle="-",
-        linewidth=0.9,
-        color=look.group.colour,
-        markersize={"*": 17.0, "P": 11.0}.get(look.marker, 5.5),
-        markeredgecolor="white",
-        markeredgewidth=0.6,
-        zorder=5 if look.ours else 3,
-    )
-
-
-def _draw_front(axes: Axes, kept: Sequence[Point], panel: Panel) -> None:
-    front = panel.front(kept)
-    times = [*(point.time_us for point in front), axes.get_xlim()[1]]
-    errors = [panel.of(point) for point in front]
-    dashes = (0, (4, 2))
-    axes.step(times, [*errors, errors[-1]], where="post", color="0.25", lw=1.3, ls=dashes, zorder=2)
+    front = pareto(kept, error)
+    times = [*(row["time_us"] for row in front), axes.get_xlim()[1]]
+    errors = [row[error] for row in (*front, front[-1])]
+    axes.step(times, errors, where="post", color="0.25", lw=1.3, ls=(0, (4, 2)), zorder=2)
+    _draw_full(axes, panel, rows)
+    if panel.field != "refined":
+        _draw_aim(axes, panel, scene, per)
+    _draw_names(axes, error, kept)
 
 
 def _draw_aim(axes: Axes, panel: Panel, scene: Scene, per: str) -> None:
     """Box of the scene's tolerance, which is one of reduction, and of its budget for a query."""
-    if panel.field == "refined":
-        return
     tolerance = getattr(scene.tolerance, panel.field)
     (left, right), (bottom, _) = axes.get_xlim(), axes.get_ylim()
     text = f"aim: {percent(tolerance)}"
@@ -304,36 +274,33 @@ def _draw_aim(axes: Axes, panel: Panel, scene: Scene, per: str) -> None:
     _write(axes, text, (left, bottom), (8, 8), color=DARK_ACCENT)
 
 
-def _draw_full(axes: Axes, panel: Panel, points: Sequence[Point]) -> None:
+def _draw_full(axes: Axes, panel: Panel, rows: Sequence[Row]) -> None:
     """Where the full model on the scene's mesh is: a time without error, or the mesh's error."""
-    full = next(point for point in points if point.key == FULL)
+    full = next(row for row in rows if row["key"] == FULL)
+    (bottom, top), time, error = axes.get_ylim(), full["time_us"], full[panel.error]
     if panel.field == "refined":
-        axes.axhline(panel.of(full), color="0.4", lw=0.9, ls=":")
-        text = f"error of the\nscene's mesh: {percent(panel.of(full))}"
-        _write(axes, text, (axes.get_xlim()[0], panel.of(full)), (8, -28))
+        axes.axhline(error, color="0.4", lw=0.9, ls=":")
+        text = f"error of the\nscene's mesh: {percent(error)}"
+        _write(axes, text, (axes.get_xlim()[0], error), (8, -28))
         return
-    axes.axvline(full.time_us, color="black", lw=0.9, ls=":")
-    text = f"full model:\n{duration(full.time_us)},\nno error"
-    (bottom, top) = axes.get_ylim()
-    _write(axes, text, (full.time_us, bottom ** (2 / 3) * top ** (1 / 3)), (6, 0))
+    axes.axvline(time, color="black", lw=0.9, ls=":")
+    text = f"full model:\n{duration(time)},\nno error"
+    _write(axes, text, (time, bottom ** (2 / 3) * top ** (1 / 3)), (6, 0))
 
 
-def _draw_names(axes: Axes, panel: Panel, kept: Sequence[Point]) -> None:
-    colours = {look.family: look.group.colour for look in looks(kept)}
-    without_memory = [point.time_us for point in kept if point.key == TWIN]
-    for point in kept:
-        if point.key in NAMES:
-            text, offset, side = NAMES[point.key]
-            where = point.time_us, panel.of(point)
-            _write(axes, text, where, offset, ha=side, color=colours[point.family])
-        elif point.key == SHIPPED:
-            text = f"Palpate: {percent(panel.of(point))}\nin {duration(point.time_us)}"
-            for time in without_memory:
-                text += f",\n{point.time_us / time:.1f} x that without memory"
-            _write(
-                axes, text, (point.time_us, panel.of(point)), (12, -32),
-                color=DARK_ACCENT, fontweight="bold", fontsize=11,
-            )  # fmt: skip
+def _draw_names(axes: Axes, error: str, kept: Sequence[Row]) -> None:
+    twin = [row["time_us"] for row in kept if row["key"] == TWIN]
+    for look, own in looks(kept):
+        for row in own:
+            time, at = row["time_us"], (row["time_us"], row[error])
+            if row["key"] in NAMES:
+                text, offset, side = NAMES[row["key"]]
+                _write(axes, text, at, offset, ha=side, color=look.colour)
+            elif row["key"] == SHIPPED:
+                text = f"Palpate: {percent(row[error])}\nin {duration(time)}"
+                text += "".join(f",\n{time / x:.1f} x that without memory" for x in twin)
+                bold = {"fontweight": "bold", "fontsize": 11}
+                _write(axes, text, at, (12, -32), color=DARK_ACCENT, **bold)
 
 
 def _write(
@@ -352,130 +319,103 @@ def _write(
     axes.annotate(text, where, offset, textcoords="offset points", **style)
 
 
-def _draw_legend(axes: Axes, points: Sequence[Point], note: str) -> None:
-    from matplotlib.legend import Legend
+def _draw_legend(axes: Axes, rows: Sequence[Row]) -> None:
+    """Groups with their methods in two columns, and what the chart shows."""
+    from matplotlib.lines import Line2D
 
     axes.axis("off")
-    known = list(looks(points))
-    for column, left in ((GROUPS[:5], -0.05), (GROUPS[5:], 0.48)):
-        handles = [handle for group in column for handle in _handles(group, known)]
-        legend = Legend(
-            axes,
-            handles,
-            [str(handle.get_label()) for handle in handles],
-            loc="upper left",
-            bbox_to_anchor=(left, 1.03),
-            frameon=False,
+    columns: tuple[list[Line2D], list[Line2D]] = [], []
+    known, titles = [look for look, _ in looks(rows)], list(GROUPS)
+    for title in titles:
+        if own := [look for look in known if look.group == title]:
+            column = columns[titles.index(title) > 4]
+            column.append(Line2D([], [], linestyle="", label=title))
+            for look in own:
+                entry = Line2D(
+                    [], [], color=look.colour, marker=look.marker, label=look.name, lw=0.9
+                )
+                entry.set_markersize(12.0 if look.ours else 5.5)
+                column.append(entry)
+    for handles, left in zip(columns, (-0.05, 0.48), strict=True):
+        legend = axes.legend(
+            handles=handles, loc="upper left", bbox_to_anchor=(left, 1.03), frameon=False,
             fontsize=9.5,
-        )
+        )  # fmt: skip
         legend.set_in_layout(False)
         axes.add_artist(legend)
         for text in legend.get_texts():
-            if any(text.get_text() == group.title for group in GROUPS):
+            if text.get_text() in GROUPS:
                 text.set_fontweight("bold")
-    words = axes.text(0, 0, note, transform=axes.transAxes, fontsize=9.5, linespacing=1.4)
+    words = axes.text(0, 0, NOTE, transform=axes.transAxes, fontsize=9.5, linespacing=1.4)
     words.set_in_layout(False)
-
-
-def _handles(group: Group, known: Sequence[Look]) -> list[Line2D]:
-    """Entries of a group in the legend: its title and its methods."""
-    from matplotlib.lines import Line2D
-
-    own = [look for look in known if look.group is group]
-    methods = [
-        Line2D(
-            [], [], color=group.colour, marker=look.marker, markersize=12.0 if look.ours else 5.5,
-            linewidth=0.9, label=look.name,
-        )
-        for look in own
-    ]  # fmt: skip
-    return [Line2D([], [], linestyle="", label=group.title), *methods] if own else []
 
 
 # --- page ----------------------------------------------------------------------------------------
 
 
-def write_page(path: Path, points: Sequence[Point], scene: Scene, layout: Layout) -> None:
+def write_page(path: Path, rows: Sequence[Row], scene: Scene, layout: Layout) -> None:
     """Write the chart as a page that needs no network: every point tells its figures."""
     from plotly.subplots import make_subplots
 
-    rows, columns = layout.grid
+    down, across = layout.grid
     titles = [f"<b>{panel.title}</b>" for panel in layout.panels]
-    figure = make_subplots(rows, columns, subplot_titles=titles)
+    figure = make_subplots(down, across, subplot_titles=titles)
     for number, panel in enumerate(layout.panels):
-        where = {"row": 1 + number // columns, "col": 1 + number % columns}
-        kept, last = panel.plotted(points), panel is layout.panels[-1]
-        for look in looks(points):
-            own = [point for point in kept if point.family == look.family]
-            figure.add_trace(_trace(look, own, panel) | {"showlegend": last}, **where)
-        figure.add_trace(_front(kept, panel) | {"showlegend": last}, **where)
+        where = {"row": 1 + number // across, "col": 1 + number % across}
+        kept, last = panel.plotted(rows), {"showlegend": panel is layout.panels[-1]}
+        for look, _ in looks(rows):
+            own = [row for row in kept if row["family"] == look.family]
+            figure.add_trace(_trace(look, own, panel) | last, **where)
+        front = _line(pareto(kept, panel.error), panel, "#404040")
+        front["line"] |= {"dash": "dash", "shape": "hv"}
+        named = {"mode": "lines", "name": "Pareto front", "hoverinfo": "skip"}
+        figure.add_trace(front | named | last, **where)
         title = f"time per {layout.per} on one core"
         figure.update_xaxes(type="log", title=title, tickformat="~s", ticksuffix="s", **where)
-        figure.update_yaxes(type="log", title=panel.error, tickformat="~%", **where)
+        figure.update_yaxes(type="log", title=panel.axis, tickformat="~%", **where)
         if panel.field != "refined":
-            _aim(figure, panel, kept, scene, where)
-    figure.update_layout(
-        title=layout.title.format(scene.name), template="plotly_white", height=500 * rows
-    )
+            left, bottom = (min(row[x] for row in kept) / 2 for x in ("time_us", panel.error))
+            tolerance = getattr(scene.tolerance, panel.field)
+            figure.add_shape(
+                type="rect", x0=1e-6 * left, x1=scene.budget.query, y0=bottom, y1=tolerance,
+                fillcolor=ACCENT, opacity=0.12, line_width=0, **where,
+            )  # fmt: skip
+    title = layout.title.format(scene.name)
+    figure.update_layout(title=title, template="plotly_white", height=500 * down)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.write_html(path, include_plotlyjs=True)
 
 
-def _trace(look: Look, points: Sequence[Point], panel: Panel) -> dict[str, Any]:
-    errors = np.array([panel.of(point) for point in points])
-    above = np.array([point.error(panel.field, "max") for point in points]) - errors
-    colour, size = look.group.colour, 18 if look.ours else 9
+def _line(rows: Sequence[Row], panel: Panel, colour: str) -> dict[str, Any]:
     return {
         "type": "scatter",
-        "mode": "lines+markers",
-        "x": [1e-6 * point.time_us for point in points],
-        "y": errors,
-        "error_y": {"array": above, "arrayminus": 0 * errors, "thickness": 0.6, "width": 0},
-        "name": look.name,
-        "text": [_hover(point, panel.field) for point in points],
-        "hovertemplate": f"<b>{look.name}</b><br>%{{text}}<extra></extra>",
-        "marker": {"color": colour, "symbol": look.page_marker, "size": size},
+        "x": [1e-6 * row["time_us"] for row in rows],
+        "y": [row[panel.error] for row in rows],
         "line": {"color": colour, "width": 1},
-        "legendgroup": look.group.title,
-        "legendgrouptitle": {"text": look.group.title},
     }
 
 
-def _hover(point: Point, field: str) -> str:
-    errors = [f"{percent(point.error(field, name))} ({name})" for name in STATISTICS]
-    lines = (
-        f"{point.label}; {point.unknowns} unknowns",
-        duration(point.time_us),
-        "error " + ", ".join(errors),
-        f"{point.unconverged} queries without an answer",
-    )
-    return "<br>".join(lines)
-
-
-def _front(kept: Sequence[Point], panel: Panel) -> dict[str, Any]:
-    front = panel.front(kept)
-    return {
-        "type": "scatter",
-        "mode": "lines",
-        "x": [1e-6 * point.time_us for point in front],
-        "y": [panel.of(point) for point in front],
-        "line": {"color": "#404040", "dash": "dash", "shape": "hv"},
-        "name": "Pareto front",
-        "hoverinfo": "skip",
+def _trace(look: Look, rows: Sequence[Row], panel: Panel) -> dict[str, Any]:
+    above = [row[f"{panel.field}_max"] - row[panel.error] for row in rows]
+    return _line(rows, panel, look.colour) | {
+        "mode": "lines+markers",
+        "error_y": {"array": above, "arrayminus": [0.0] * len(above), "thickness": 0.6, "width": 0},
+        "name": look.name,
+        "text": [_hover(row, panel.field) for row in rows],
+        "hovertemplate": f"<b>{look.name}</b><br>%{{text}}<extra></extra>",
+        "marker": {"symbol": PAGE_MARKERS[look.marker], "size": 18 if look.ours else 9},
+        "legendgroup": look.group,
+        "legendgrouptitle": {"text": look.group},
     }
 
 
-def _aim(
-    figure: Any, panel: Panel, kept: Sequence[Point], scene: Scene, where: dict[str, int]
-) -> None:
-    figure.add_shape(
-        type="rect",
-        x0=1e-6 * min(point.time_us for point in kept) / 2,
-        x1=scene.budget.query,
-        y0=min(panel.of(point) for point in kept) / 2,
-        y1=getattr(scene.tolerance, panel.field),
-        fillcolor=ACCENT,
-        opacity=0.12,
-        line_width=0,
-        **where,
+def _hover(row: Row, field: str) -> str:
+    errors = [f"{percent(row[f'{field}_{name}'])} ({name})" for name in STATISTICS]
+    return "<br>".join(
+        (
+            f"{row['label']}; {row['unknowns']} unknowns",
+            duration(row["time_us"]),
+            "error " + ", ".join(errors),
+            f"{row['unconverged']} queries without an answer",
+        )
     )

@@ -20,6 +20,8 @@ from palpate.shared.model import ReducedModel
 
 Array = NDArray[np.float64]
 
+STATISTICS = {"median": 50, "p95": 95, "max": 100}
+
 
 def continuity(
     artifact: Path, paths: int, steps: int, seed: int, tip: bool = False
@@ -47,25 +49,19 @@ def continuity(
     atlas = ReducedModel.load(artifact)
     workshop = Workshop.of_artifact(read_artifact(artifact))
     rng = np.random.default_rng([seed, 8 if tip else 7])
-    excess, change = [], []
+    found = []
     for start in tqdm(unseen_loads(atlas, paths, seed), desc="paths"):
         loads = walk(atlas, start, steps + 1, rng)
-        answers = (_forces if tip else _displacements)(atlas, workshop, loads)
-        full, reduced = np.diff(answers, axis=1)
-        change.append(np.linalg.norm(full, axis=2).max(axis=1))
-        excess.append(np.linalg.norm(reduced - full, axis=2).max(axis=1))
-    kept = ~np.isnan(np.concatenate(excess))
-    named = {"median": 50, "p95": 95, "max": 100}
-    return {
-        "step_mm": STEP,
-        "steps": int(kept.sum()),
-        "left_out": int((~kept).sum()),
-        **{
-            name: {
-                key: float(np.percentile(np.concatenate(x)[kept], q)) for key, q in named.items()
-            }
-            for name, x in (("excess", excess), ("change", change))
-        },
+        full, reduced = np.diff(
+            (_forces if tip else _displacements)(atlas, workshop, loads), axis=1
+        )
+        found.append([np.linalg.norm(x, axis=2).max(axis=1) for x in (reduced - full, full)])
+    excess, change = np.hstack(found)
+    kept = ~np.isnan(excess)
+    report = {"step_mm": STEP, "steps": int(kept.sum()), "left_out": int((~kept).sum())}
+    return report | {
+        name: {key: float(np.percentile(x[kept], q)) for key, q in STATISTICS.items()}
+        for name, x in (("excess", excess), ("change", change))
     }
 
 

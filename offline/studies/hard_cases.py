@@ -17,18 +17,18 @@ from functools import lru_cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.offline.bench import limit_at, walk
 from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.surface import accessible_surface
 from palpate.offline.methods.method import Case
-from palpate.offline.reduce.sampling import cone, random_points, tangents
+from palpate.offline.reduce.sampling import cone, random_points
 from palpate.offline.run.checkpoint import Checkpoint
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.workers import resume
 from palpate.offline.run.workshop import Load, Workshop
 from palpate.offline.validate.loads import random_loads
 from palpate.offline.validate.norms import relative
-from palpate.shared.geometry.surface import Surface
-from palpate.shared.mechanics.footprint import footprint, pressure_limit
+from palpate.shared.mechanics.footprint import footprint
 from palpate.shared.model import ReducedModel
 
 Array = NDArray[np.float64]
@@ -61,9 +61,6 @@ TELEPORT = "tool teleports"
 
 WARM_UP = 4
 """Queries along the path of a moving tool before the one that counts."""
-
-TURNS = 20
-"""Headings tried where the surface ends; if none leads on, the last is taken."""
 
 OFF = 0.5
 """Distance (mm) from the accessible surface at which a point counts as off it."""
@@ -165,8 +162,8 @@ class HardLoads:
         radius = self._scene.endoscope.radius
         return {
             CONTROL: partial(self._in_tissue, self._poisson),
-            **{f"load x {factor:g}": partial(self._jumps, factor) for factor in FACTORS},
-            SEVERAL: self._extreme,
+            **{f"load x {x:g}": partial(self._raised, (x, x)) for x in FACTORS},
+            SEVERAL: partial(self._raised, (FACTORS[0], FACTORS[-1])),
             **{f"tilt {tilt:g}°": partial(self._tilted, tilt) for tilt in TILTS},
             "off surface, in reach": partial(self._elsewhere, True),
             "off surface, out of reach": partial(self._elsewhere, False),
@@ -191,81 +188,66 @@ class HardLoads:
         atlas, count = self._atlas, self._count if count is None else count
         return random_loads(atlas.surface, atlas.limits, atlas.scene, count, rng)
 
-    def _limit(self, position: Array, direction: Array) -> float:
-        _, normal, _, fields = self._atlas.surface.locate(position, self._atlas.limits)
-        return float(pressure_limit(fields, normal, direction))
-
-    def _case(self, *loads: Load) -> Case:
-        return Case.of(self._workshop, *loads)
-
-    def _through(self, *cases: Case) -> HardCase:
+    def _through(self, *cases: Case, follow: bool = False) -> HardCase:
         """A case that is reached through others, all at once."""
-        return HardCase(tuple((case, 0.0) for case in cases), self._poisson, end_only=True)
+        steps = tuple((case, 0.0) for case in cases)
+        return HardCase(steps, self._poisson, follow, end_only=True)
+
+    def _path(self, loads: Sequence[Load], follow: bool = False) -> HardCase:
+        return self._through(*(Case.of(self._workshop, load) for load in loads), follow=follow)
 
     def _in_tissue(self, poisson: float, rng: np.random.Generator) -> list[HardCase]:
-        loads = self._loads(rng)
-        return [replace(self._through(self._case(load)), poisson=poisson) for load in loads]
+        return [replace(self._path([load]), poisson=poisson) for load in self._loads(rng)]
 
-    def _raised(self, load: Load, factor: float) -> HardCase:
-        pressure = factor * self._limit(load.position, load.direction)
-        return replace(self._through(self._case(replace(load, pressure=pressure))), follow=True)
+    def _raised(self, factors: tuple[float, float], rng: np.random.Generator) -> list[HardCase]:
+        return [
+            self._path([replace(load, pressure=self._peak(load, factors, rng))], follow=True)
+            for load in self._loads(rng)
+        ]
 
-    def _jumps(self, factor: float, rng: np.random.Generator) -> list[HardCase]:
-        return [self._raised(load, factor) for load in self._loads(rng)]
-
-    def _extreme(self, rng: np.random.Generator) -> list[HardCase]:
-        loads = self._loads(rng)
-        return [self._raised(load, rng.uniform(FACTORS[0], FACTORS[-1])) for load in loads]
+    def _peak(self, load: Load, factors: tuple[float, float], rng: np.random.Generator) -> float:
+        return rng.uniform(*factors) * limit_at(self._atlas, load.position, load.direction)
 
     def _lowered(
         self, peaks: tuple[float, float], count: int, rng: np.random.Generator
     ) -> list[HardCase]:
-        loads = self._loads(rng, count)
-        return [self._up_and_down(load, rng.uniform(*peaks)) for load in loads]
-
-    def _up_and_down(self, load: Load, factor: float) -> HardCase:
-        """A load in range that comes down from a multiple of the limit."""
-        peak, half = factor * self._limit(load.position, load.direction), PATH_STEPS // 2
-        turns = np.interp(
-            np.arange(1, PATH_STEPS + 1), (0, half, PATH_STEPS), (0, peak, load.pressure)
-        )
-        path = [self._case(replace(load, pressure=float(pressure))) for pressure in turns]
-        return replace(self._through(*path), follow=True)
+        """Loads in range that come down from a multiple of the limit."""
+        found, turns = [], np.arange(1, PATH_STEPS + 1)
+        for load in self._loads(rng, count):
+            corners = (0.0, self._peak(load, peaks, rng), load.pressure)
+            pressures = np.interp(turns, (0, PATH_STEPS // 2, PATH_STEPS), corners)
+            path = [replace(load, pressure=float(pressure)) for pressure in pressures]
+            found.append(self._path(path, follow=True))
+        return found
 
     def _tilted(self, tilt: float, rng: np.random.Generator) -> list[HardCase]:
         cases = []
         for load in self._loads(rng):
             normal = self._atlas.surface.project(load.position)[1]
             direction = cone(normal, tilt, 1, rng, border=True)[0]
-            pressure = self._limit(load.position, direction) * np.sqrt(rng.random())
-            tilted = Load(load.position, direction, float(pressure))
-            cases.append(self._through(self._case(tilted)))
+            pressure = limit_at(self._atlas, load.position, direction) * np.sqrt(rng.random())
+            cases.append(self._path([Load(load.position, direction, float(pressure))]))
         return cases
 
     def _elsewhere(self, within: bool, rng: np.random.Generator) -> list[HardCase]:
-        """Presses other parts of the boundary, straight in."""
-        surface, reach = self._boundary(), self._scene.endoscope.reach
-        cases: list[HardCase] = []
+        """Presses other parts of the free boundary, straight in."""
+        mesh, reach = self._workshop.mesh, self._scene.endoscope.reach
+        free = np.asarray(~mesh.clamped[mesh.faces].all(axis=1))
+        surface, cases = accessible_surface(replace(mesh, accessible=free)), list[HardCase]()
         while len(cases) < self._count:
             point = random_points(surface, 1, rng)[0]
             _, _, distance = self._atlas.surface.project(point)
             if not (OFF < distance <= reach if within else distance > reach):
                 continue
             x, normal, _ = surface.project(point)
-            pressure = self._limit(point, -normal) * np.sqrt(rng.random())
+            pressure = limit_at(self._atlas, point, -normal) * np.sqrt(rng.random())
             load = Load(x, -normal, float(pressure))
             cases.append(self._pressed(load, normal, self._scene.endoscope.radius))
         return cases
 
-    def _boundary(self) -> Surface:
-        """All of the boundary that is free."""
-        mesh = self._workshop.mesh
-        free = np.asarray(~mesh.clamped[mesh.faces].all(axis=1))
-        return accessible_surface(replace(mesh, accessible=free))
-
     def _footprints(self, radius: float, rng: np.random.Generator) -> list[HardCase]:
-        normals = self._atlas.surface.project
-        return [self._pressed(x, normals(x.position)[1], radius) for x in self._loads(rng)]
+        project = self._atlas.surface.project
+        return [self._pressed(x, project(x.position)[1], radius) for x in self._loads(rng)]
 
     def _pressed(self, load: Load, normal: Array, radius: float) -> HardCase:
         nodal = np.zeros(len(self._workshop.mesh.nodes))
@@ -275,42 +257,14 @@ class HardLoads:
 
     def _pairs(self, rng: np.random.Generator) -> list[HardCase]:
         pairs = zip(self._loads(rng), self._loads(rng), strict=True)
-        return [self._through(self._case(*pair)) for pair in pairs]
+        return [self._through(Case.of(self._workshop, *pair)) for pair in pairs]
 
     def _moves(self, step: float, rng: np.random.Generator) -> list[HardCase]:
-        return [self._moved(self._glide(load, step, rng)) for load in self._loads(rng)]
-
-    def _glide(self, start: Load, step: float, rng: np.random.Generator) -> list[Load]:
-        """Contacts a step apart along the surface, turning where it ends."""
-        surface, path = self._atlas.surface, [start]
-        share = start.pressure / self._limit(start.position, start.direction)
-        cosine = min(1.0, float(-start.direction @ surface.project(start.position)[1]))
-        heading = rng.standard_normal(3)
-        while len(path) <= WARM_UP:
-            x = path[-1].position
-            for wanted in (heading, *rng.standard_normal((TURNS, 3))):
-                reached, normal, _ = surface.project(
-                    x + step * _along(surface.project(x)[1], wanted)
-                )
-                if np.linalg.norm(reached - x) > 0.8 * step:
-                    break
-            heading = _along(normal, reached - x)
-            direction = np.sqrt(1 - cosine**2) * heading - cosine * normal
-            path.append(Load(reached, direction, share * self._limit(reached, direction)))
-        return path
+        loads = self._loads(rng)
+        return [self._path([x, *walk(self._atlas, x, WARM_UP, rng, step)]) for x in loads]
 
     def _teleports(self, rng: np.random.Generator) -> list[HardCase]:
-        return [self._moved(self._loads(rng, WARM_UP + 1)) for _ in range(self._count)]
-
-    def _moved(self, loads: list[Load]) -> HardCase:
-        return self._through(*(self._case(load) for load in loads))
-
-
-def _along(normal: Array, heading: Array) -> Array:
-    """Unit tangent nearest to a heading."""
-    t, b = tangents(normal)
-    tangent = heading @ t * t + heading @ b * b
-    return tangent / np.linalg.norm(tangent)
+        return [self._path(self._loads(rng, WARM_UP + 1)) for _ in range(self._count)]
 
 
 @lru_cache(maxsize=1 + len(RATIOS))
@@ -337,12 +291,11 @@ def several(pairs: Mapping[str, Sequence[Followed]], most: int) -> dict[str, lis
 def equilibria(workshop: Workshop, case: HardCase) -> Equilibria:
     """Full solutions of a hard case; a task for ``run.workers``."""
     own = tissue(workshop, case.poisson)
-    nodes = len(own.mesh.nodes)
-    load = case.last.load(nodes)
+    path = [step.load(len(own.mesh.nodes)) for step, _ in case.steps]
+    load = path[-1]
     if not case.follow:
         jump = _lead(own, [load], FINEST)
         return Equilibria(jump, jump)
-    path = [step.load(nodes) for step, _ in case.steps]
     if len(path) == 1:
         path = [(i + 1) / PATH_STEPS * load for i in range(PATH_STEPS)]
     return Equilibria(_lead(own, path, 1.0), _lead(own, [load], 1.0))
@@ -353,17 +306,16 @@ def _lead(workshop: Workshop, loads: Sequence[Array], finest: float) -> Array | 
     u = None
     for load in loads:
         try:
-            found = workshop.model.solve(load, u, smallest_step=finest)
+            u = workshop.model.solve(load, u, smallest_step=finest).displacement
         except NoEquilibrium:
             return None
-        u = found.displacement
     return None if u is None else u.ravel()
 
 
 def all_equilibria(
     cases: Mapping[str, Sequence[HardCase]], pool: Executor, checkpoint: Checkpoint
-) -> dict[str, list[Equilibria]]:
-    """Full solutions of the cases of each kind."""
+) -> dict[str, list[Followed]]:
+    """Cases of each kind with their full solutions."""
     tasks = {
         f"{name}-{i}": (equilibria, x) for name, own in cases.items() for i, x in enumerate(own)
     }
@@ -374,8 +326,8 @@ def all_equilibria(
     found = resume("full solutions", pool, checkpoint, tasks, pack)
     return {
         name: [
-            Equilibria(*(found[f"{name}-{i}"].get(key) for key in ("path", "jump")))
-            for i in range(len(own))
+            (case, Equilibria(*(found[f"{name}-{i}"].get(key) for key in ("path", "jump"))))
+            for i, case in enumerate(own)
         ]
         for name, own in cases.items()
     }

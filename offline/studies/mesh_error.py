@@ -137,15 +137,13 @@ def mesh_error(report: Path) -> dict[str, Any]:
     """
     reference = REFERENCE.body()
     loads = contacts(reference, PROBE.body())
-    exact = np.empty(0)
     rows: dict[str, dict[str, Any]] = {}
-    errors: dict[str, Array] = {}
+    moved: dict[str, Array] = {}
     for how in tqdm((REFERENCE, *SECOND_OPINIONS, *CANDIDATES), desc="meshes"):
-        body = how.body()
-        moved = np.array([press(body, x.position, x.normal, x.pressure)[:2] for x in loads])
-        exact = moved if how is REFERENCE else exact
-        error = errors[str(how)] = moved / exact - 1
-        rows[str(how)] = {
+        body, name = how.body(), str(how)
+        moved[name] = np.array([press(body, x.position, x.normal, x.pressure)[:2] for x in loads])
+        error = moved[name] / moved[str(REFERENCE)] - 1
+        rows[name] = {
             "dofs": body.mesh.nodes.size,
             "points": 8 * len(body.mesh.elements),
             "values": VALUES[how.element],
@@ -155,16 +153,18 @@ def mesh_error(report: Path) -> dict[str, Any]:
             for key, of in (("least", np.min), ("mean", np.mean), ("greatest", np.max))
         }
     write_csv(report / "mesh_error.csv", [{"mesh": name} | row for name, row in rows.items()])
-    points = [
-        dict(zip(("x_mm", "y_mm", "z_mm"), load.position.tolist(), strict=True))
-        | {"thickness_mm": load.thickness, "pressure_kPa": load.pressure}
-        | {"largest_mm": exact[i, 0], "under_footprint_mm": exact[i, 1]}
-        | {name: error[i, 0] for name, error in errors.items()}
-        for i, load in enumerate(loads)
+    exact = moved[str(REFERENCE)]
+    errors = {name: own[:, 0] / exact[:, 0] - 1 for name, own in moved.items()}
+    names = "x_mm", "y_mm", "z_mm", "thickness_mm", "pressure_kPa", "largest_mm"
+    table = [
+        dict(zip(names, (*x.position.tolist(), x.thickness, x.pressure, exact[i, 0]), strict=True))
+        | {"under_footprint_mm": exact[i, 1]}
+        | {name: error[i] for name, error in errors.items()}
+        for i, x in enumerate(loads)
     ]
-    write_csv(report / "mesh_error_points.csv", points)
+    write_csv(report / "mesh_error_points.csv", table)
     _draw(report / "mesh_error.png", errors)
-    return dict(rows)
+    return rows
 
 
 def _draw(path: Path, errors: dict[str, Array]) -> None:
@@ -176,7 +176,7 @@ def _draw(path: Path, errors: dict[str, Array]) -> None:
     axes.axvspan(-5, 5, color="0.92")
     axes.axvline(0, color="0.5", linewidth=0.8)
     for row, error in enumerate(errors.values()):
-        percent = 100 * error[:, 0]
+        percent = 100 * error
         axes.barh(row, np.ptp(percent), left=percent.min(), height=0.5, color="tab:blue", alpha=0.5)
         axes.plot(percent, np.full(len(percent), row), ".", color="tab:blue")
     axes.set_yticks(range(len(errors)), list(errors))

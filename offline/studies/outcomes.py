@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from palpate.offline.run.workshop import Workshop
+from palpate.offline.studies.hard_cases import CONTROL
 from palpate.offline.studies.references import Fields
 from palpate.offline.studies.tables import write_csv
 
@@ -65,9 +66,8 @@ class Result:
     inverted, nan, crashed : bool
         Whether the answer turns an element inside out, is vouched for but not finite, is missing
         because the method raised.
-    details : dict
-        What else is known: of a silent error of the artifact what it says of its answer, of a long
-        history how far its end drifts.
+    drift : float, optional
+        Of a long history, how far its end is from the method's answer to a brief one.
     """
 
     outcome: str
@@ -76,7 +76,7 @@ class Result:
     inverted: bool = False
     nan: bool = False
     crashed: bool = False
-    details: dict[str, Any] = field(default_factory=dict)
+    drift: float | None = None
 
 
 Table = Mapping[str, Mapping[str, Sequence[Result]]]
@@ -164,22 +164,35 @@ def _row(method: str, kind: str, results: Sequence[Result]) -> dict[str, Any]:
     return row
 
 
-def summary(results: Sequence[Result]) -> dict[str, Any]:
-    """How often a method failed, and how far its trust can be relied on."""
-    counts = Counter(result.outcome for result in results)
-    return {
-        "cases": len(results),
-        "silently_wrong": sum(counts[outcome] for outcome in SILENT_OUTCOMES),
-        "of_these_another_equilibrium": counts[ANOTHER],
-        "nan": sum(result.nan for result in results),
-        "crashes": sum(result.crashed for result in results),
-        "right_but_flagged": flagged(results),
-        "outcomes": {outcome: counts[outcome] for outcome in OUTCOMES if counts[outcome]},
-    }
+def summaries(table: Table) -> dict[str, Any]:
+    """By method how often it failed, and how far its trust can be relied on.
+
+    ``right_but_flagged`` is the share of its right answers that it flagged, of all cases and in
+    range; ``drift`` of long histories by kind.
+    """
+    report: dict[str, Any] = {}
+    for method, results in table.items():
+        every = [result for own in results.values() for result in own]
+        counts = Counter(result.outcome for result in every)
+        report[method] = {
+            "cases": len(every),
+            "silently_wrong": sum(counts[outcome] for outcome in SILENT_OUTCOMES),
+            "of_these_another_equilibrium": counts[ANOTHER],
+            "nan": sum(result.nan for result in every),
+            "crashes": sum(result.crashed for result in every),
+            "right_but_flagged": _flagged(every),
+            "outcomes": {outcome: counts[outcome] for outcome in OUTCOMES if counts[outcome]},
+        }
+        if CONTROL in results:
+            report[method]["right_but_flagged_in_range"] = _flagged(results[CONTROL])
+        drifts = {
+            kind: own[0].drift for kind, own in results.items() if own and own[0].drift is not None
+        }
+        report[method] |= {"drift": drifts} if drifts else {}
+    return report
 
 
-def flagged(results: Sequence[Result]) -> float:
-    """Share of the right answers that are flagged."""
+def _flagged(results: Sequence[Result]) -> float:
     counts = Counter(result.outcome for result in results)
     right = counts[RIGHT] + counts[RIGHT_FLAGGED]
     return counts[RIGHT_FLAGGED] / right if right else 0.0

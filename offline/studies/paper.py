@@ -19,7 +19,7 @@ from the paper:
   clamped column); the load ends well before, at 13 % of its height.  P is the top's centre.
 - The turbinate: our own section and mesh; the pressure is a round footprint's.  P lies under it.
 - Elastic tissue follows a curve in one parameter, and a handful of POD bases hold it to within the
-  reduced solver's tolerance.
+  reduced solver's tolerance; where fields are looked at, that is as small as can be.
 
 Tissue that knows time is pressed, held, let go, and rests.  Full and reduced models take the same
 time steps, each from its own past, and times are those of steps.  POD learns from one history and
@@ -42,9 +42,10 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from palpate.offline.methods.full import Full
-from palpate.offline.methods.galerkin import Galerkin, GalerkinInTime
-from palpate.offline.methods.method import Case, Method
+from palpate.offline.methods.galerkin import Galerkin
+from palpate.offline.methods.method import Case, Method, Steps
 from palpate.offline.methods.spaces import krylov, mass, modal, pod
+from palpate.offline.pictures import require_pyvista
 from palpate.offline.run.workshop import Workshop
 from palpate.offline.scenes import find_scene
 from palpate.offline.studies import paper_pictures
@@ -71,9 +72,6 @@ SIZES = (1, 2, 3, 4, 5, 7, 10, 15, 20, 30)
 CONTOUR_BASES = 5
 """Of the paper's figures 2c and 2d."""
 
-POLISH = 4
-"""Newton steps after the reduced solver's answer: enough to reach round-off."""
-
 CUBE_PRESSURE = 2.5  # kPa
 MEDIAL = (10.0, 20.0, 11.0)
 """In the middle of the turbinate's medial side, mm."""
@@ -86,7 +84,7 @@ HELD = 23
 """Step of both at whose end the load has been held."""
 
 EXACT = 1e-6
-"""Tolerance of the reduced solver in time where fields are looked at."""
+"""Tolerance of the reduced solver where fields are looked at."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +93,6 @@ class Example:
 
     Attributes
     ----------
-    name : str
     workshop : Workshop
     load : ndarray, shape (n, 3), mN
         At its greatest.
@@ -103,53 +100,43 @@ class Example:
         The same.
     at : ndarray, shape (3,), mm
         Where the load's centre is.
-    point : int
-        The node P, nearest to that.
     """
 
-    name: str
     workshop: Workshop
     load: Array
     pressure: float
     at: Array
-    point: int
 
-    @classmethod
-    def pressed(
-        cls, workshop: Workshop, areas: Array, normal: Array, pressure: float, at: Array
-    ) -> Example:
-        """Pressure on nodal areas (n,) mm^2 about ``at``, against a normal."""
-        nodes = workshop.mesh.nodes
-        point = int(np.argmin(np.linalg.norm(nodes - at, axis=1)))
-        load = -pressure * areas[:, None] * normal
-        return cls(workshop.scene.name, workshop, load, pressure, at, point)
+    @property
+    def name(self) -> str:
+        """The scene's."""
+        return self.workshop.scene.name
 
-    def case(self, share: float) -> Case:
-        """A share of the load, for a method to answer."""
-        nodes = np.flatnonzero(self.load.any(axis=1))
-        return Case((), nodes, share * self.load[nodes])
+    @property
+    def point(self) -> int:
+        """The node P, nearest to the load's centre."""
+        return int(np.argmin(np.linalg.norm(self.workshop.mesh.nodes - self.at, axis=1)))
 
     @property
     def in_time(self) -> bool:
         """Whether the tissue knows time."""
         return bool(self.workshop.model.prony)
 
-    def training(self) -> list[tuple[Case, float]]:
-        """The history that POD learns from, cases with times (s)."""
-        if self.in_time:
-            return [(self.case(share), dt) for dt, share in load_steps(TRAINING)]
-        return [(self.case(i / SNAPSHOTS), 0.0) for i in range(1, SNAPSHOTS + 1)]
+    def steps(self, levels: Sequence[tuple[float, float]]) -> Steps:
+        """History of time steps (s) and shares of the load at their ends."""
+        nodes = np.flatnonzero(self.load.any(axis=1))
+        return [(Case((), nodes, share * self.load[nodes]), dt) for dt, share in levels]
 
-    def queries(self) -> list[list[tuple[Case, float]]]:
-        """The histories that methods are asked; of elastic tissue single loads."""
-        if self.in_time:
-            return [[(self.case(share), dt) for dt, share in load_steps(QUERY)]]
-        return [[(self.case(share), 0.0)] for share in self.shares()]
+    def training(self) -> Steps:
+        """The history that POD learns from."""
+        rising = [(0.0, i / SNAPSHOTS) for i in range(1, SNAPSHOTS + 1)]
+        return self.steps(load_steps(TRAINING) if self.in_time else rising)
 
-    @staticmethod
-    def shares() -> list[float]:
-        """Shares of the load at which elastic tissue is asked, half-way between snapshots."""
-        return [(i - 0.5) / SNAPSHOTS for i in range(1, SNAPSHOTS + 1)]
+    def queries(self) -> list[Steps]:
+        """The histories that methods are asked; of elastic tissue single loads, rising."""
+        if self.in_time:
+            return [self.steps(load_steps(QUERY))]
+        return [self.steps([(0.0, (i - 0.5) / SNAPSHOTS)]) for i in range(1, SNAPSHOTS + 1)]
 
 
 def cube(scene: str, report: Path) -> dict[str, Any]:
@@ -165,7 +152,8 @@ def covered(workshop: Workshop, pressure: float) -> Example:
     top = surface_quadrature(mesh.nodes, mesh.faces[mesh.accessible])
     areas = np.zeros(len(mesh.nodes))
     np.add.at(areas, top.nodes, top.areas[:, None] * top.shape)
-    return Example.pressed(workshop, areas, top.normals[0], pressure, top.points.mean(axis=0))
+    load = -pressure * areas[:, None] * top.normals[0]
+    return Example(workshop, load, pressure, top.points.mean(axis=0))
 
 
 def turbinate(scene: str, report: Path) -> dict[str, Any]:
@@ -173,7 +161,7 @@ def turbinate(scene: str, report: Path) -> dict[str, Any]:
     found = find_scene(scene)
     contours = not found.tissue.prony
     if contours:
-        paper_pictures.require_pyvista()
+        require_pyvista()
     return compare(footprint(Workshop(found), MEDIAL), report, contours=contours)
 
 
@@ -181,10 +169,8 @@ def footprint(workshop: Workshop, position: Sequence[float]) -> Example:
     """A footprint pressed straight in, up to the pressure that is trained for there."""
     at, *_ = workshop.surface.project(np.array(position))
     areas, normal = workshop.unit_load(at)
-    return Example.pressed(workshop, areas, normal, float(workshop.load_range(at)[0]), at)
-
-
-# --- figure 1 ------------------------------------------------------------------------------------
+    pressure = float(workshop.load_range(at)[0])
+    return Example(workshop, -pressure * areas[:, None] * normal, pressure, at)
 
 
 def compare(
@@ -221,7 +207,7 @@ def compare(
     paper_pictures.chart(report / f"paper_{example.name}.png", rows, title)
     if contours:
         path = report / f"paper_{example.name}_contours.png"
-        errors = fields[CONTOUR_BASES].contours
+        errors = fields[CONTOUR_BASES].errors
         radius = example.workshop.scene.endoscope.radius
         paper_pictures.contours(path, example.workshop.mesh, errors, example.at, radius)
     claims = {size: claims_of_figure_2(own) for size, own in fields.items()}
@@ -257,12 +243,13 @@ def spaces(example: Example, training: Array, size: int) -> dict[str, Array]:
 
 def measure(example: Example, training: Array, sizes: Sequence[int]) -> list[dict[str, Any]]:
     """Rows of the table: a method and number of bases each."""
-    kind = GalerkinInTime if example.in_time else Galerkin
-    methods: dict[tuple[str, int], Method] = {("full", 0): Full(example.workshop)}
+    workshop = example.workshop
+    methods: dict[tuple[str, int], Method] = {("full", 0): Full(workshop)}
     for name, basis in spaces(example, training, max(sizes)).items():
         for size in sizes:
             if size <= basis.shape[1]:
-                methods[name, size] = kind(example.workshop, basis[:, :size].copy())
+                own = basis[:, :size].copy()
+                methods[name, size] = Galerkin(workshop, own, in_time=example.in_time)
     full, *others = _in_turns(example, list(methods.values()))
     return [
         {"method": name, "bases": size} | _errors(example, found, full)
@@ -331,38 +318,10 @@ def _errors(example: Example, found: Timed, full: Timed) -> dict[str, Any]:
 
 
 def field_errors(example: Example, training: Array, bases: int) -> FieldErrors:
-    """Errors in POD bases: when the load has been held, or at the greatest load that is asked.
-
-    They are those of the bases and not of the reduced solver, whose answer is polished.
-    """
-    workshop = example.workshop
+    """Errors in POD bases: when the load has been held, or at the greatest load that is asked."""
+    workshop, in_time = example.workshop, example.in_time
     basis = pod(workshop.model, training.reshape(len(training), -1), bases)
-    full = Full(workshop)
-    if example.in_time:
-        steps = example.queries()[0][: HELD + 1]
-        fields = [
-            Fields.of(method, method.follow(steps)[-1:])
-            for method in (GalerkinInTime(workshop, basis, EXACT), full)
-        ]
-    else:
-        share = example.shares()[-1]
-        found, exact = (x.solve(example.case(share)) for x in (Galerkin(workshop, basis), full))
-        u = polished(example, basis, found.state[: basis.shape[1]], share)
-        stress = workshop.von_mises(u)
-        fields = [Fields(u[None], stress[None]), Fields.of(full, [exact.state])]
+    steps = example.queries()[-1][: HELD + 1]
+    methods = Galerkin(workshop, basis, in_time=in_time, accurate=EXACT), Full(workshop)
+    fields = [Fields.of(method, method.follow(steps)[-1:]) for method in methods]
     return FieldErrors.of(workshop, *fields)
-
-
-def polished(example: Example, basis: Array, q: Array, share: float) -> Array:
-    """Displacement (n, 3) mm, ``POLISH`` Newton steps (the paper's equation 2) after ``q``."""
-    model = example.workshop.model
-    load = share * example.load.ravel()[model.free]
-    u, force = np.zeros(example.load.size), np.zeros(example.load.size)
-    for _ in range(POLISH):
-        u[model.free] = basis @ q
-        model.internal(u, force)
-        residual = basis.T @ (force[model.free] - load)
-        tangent = basis.T @ (model.stiffness(u) @ basis)
-        q = q - np.linalg.solve(tangent, residual)
-    u[model.free] = basis @ q
-    return u.reshape(-1, 3)

@@ -90,40 +90,33 @@ def _ratio_at_accuracy(rows: list[dict[str, Any]], method: str, accuracy: float)
 
 @dataclass(frozen=True)
 class FieldErrors:
-    """Values (n,) of the full model and relative errors (n,) of a reduced one, node by node.
+    """A reduced model beside the full one, node by node.
 
     Attributes
     ----------
-    displacement, von_mises : tuple of ndarray
-        Value (mm, kPa) and relative error; nan where the value is zero.
+    values : dict of ndarray, shape (n,)
+        The full model's displacement (mm) and von Mises stress (kPa).
+    errors : dict of ndarray, shape (n,)
+        Relative errors of both; nan where there is nothing to approximate.
     near_support : ndarray, bool
         Nodes of an element that touches it.
     """
 
-    displacement: tuple[Array, Array]
-    von_mises: tuple[Array, Array]
+    values: dict[str, Array]
+    errors: dict[str, Array]
     near_support: NDArray[np.bool_]
 
     @classmethod
     def of(cls, workshop: Workshop, reduced: Fields, full: Fields) -> FieldErrors:
         """Compare the fields of one moment."""
         (u, found), (exact, stress) = ((field[0] for field in fields) for fields in (reduced, full))
-        moved = np.linalg.norm(exact, axis=1)
-        return cls(
-            (moved, _over(np.linalg.norm(u - exact, axis=1), moved)),
-            (stress, _over(np.abs(found - stress), stress)),
-            ~workshop.beyond_clamped_layer,
-        )
-
-    @property
-    def contours(self) -> dict[str, Array]:
-        """Errors by what the pictures call them."""
-        return {"displacement": self.displacement[1], "von Mises stress": self.von_mises[1]}
-
-
-def _over(error: Array, value: Array) -> Array:
-    """Relative error, nan where there is nothing to approximate."""
-    return np.divide(error, value, out=np.full_like(value, np.nan), where=value > 0)
+        values = {"displacement": np.linalg.norm(exact, axis=1), "von Mises stress": stress}
+        off = np.linalg.norm(u - exact, axis=1), np.abs(found - stress)
+        errors = {
+            name: np.divide(error, value, out=np.full_like(value, np.nan), where=value > 0)
+            for (name, value), error in zip(values.items(), off, strict=True)
+        }
+        return cls(values, errors, ~workshop.beyond_clamped_layer)
 
 
 def claims_of_figure_2(errors: FieldErrors) -> dict[str, dict[str, Any]]:
@@ -138,11 +131,12 @@ def claims_of_figure_2(errors: FieldErrors) -> dict[str, dict[str, Any]]:
         ``stress_best_near_support``: medians near the support and elsewhere, and whether the
         largest stress is near it, as the paper says too.
     """
+    displacement, stress = errors.values.values()
+    error_of_displacement, error = errors.errors.values()
     smallest = {
-        name: _tenths(*pair)
-        for name, pair in (("displacement", errors.displacement), ("von_mises", errors.von_mises))
+        "displacement": _tenths(displacement, error_of_displacement),
+        "von_mises": _tenths(stress, error),
     }
-    stress, error = errors.von_mises
     near, elsewhere = (
         float(np.nanmedian(error[where])) for where in (errors.near_support, ~errors.near_support)
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,7 @@ from numpy.typing import NDArray
 
 from palpate.offline.fem.mesh import Mesh
 from palpate.offline.methods.galerkin import TOLERANCE
-from palpate.offline.vtu import CELL_TYPES
-from palpate.shared.errors import PalpateError
+from palpate.offline.pictures import INK, body, new_plotter, ring, save
 
 Array = NDArray[np.float64]
 
@@ -23,8 +21,6 @@ NO_ANSWER = 0.99
 """Error at P from which on bases do not answer the load at all: there is nothing to time."""
 
 SIZE = (1200, 940)
-COLOURS, INK, RING = "viridis", "#202428", "#ffffff"
-SUBDIVISIONS = 2
 VIEWS = {
     "medial side, pressed in the ring": (1.0, -0.7, 0.35),
     "lateral side (grey: value is zero)": (-1.0, 0.7, 0.35),
@@ -46,40 +42,32 @@ def chart(path: Path, rows: list[dict[str, Any]], title: str) -> None:
     errors, ratios = figure.subplots(1, 2)
     for name, (colour, mark) in STYLES.items():
         own = [row for row in rows if row["method"] == name]
-        style = {"color": colour, "marker": mark, "label": name}
-        errors.plot(
-            [row["bases"] for row in own], [100 * row["error_at_P_mean"] for row in own], **style
-        )
         timed = [row for row in own if row["error_at_P_mean"] < NO_ANSWER]
-        ratios.plot([row["bases"] for row in timed], [row["cpu_ratio"] for row in timed], **style)
+        for axes, kept, key, factor in (
+            (errors, own, "error_at_P_mean", 100),
+            (ratios, timed, "cpu_ratio", 1),
+        ):
+            x, y = [row["bases"] for row in kept], [factor * row[key] for row in kept]
+            axes.plot(x, y, color=colour, marker=mark, label=name)
     errors.axhline(100 * TOLERANCE, color="0.4", linestyle=":")
     ticks = sorted({row["bases"] for row in rows})
     words = {"va": "top", "color": "0.3", "fontsize": 9}
     errors.text(ticks[0], 80 * TOLERANCE, "tolerance of the solver", **words)
     plain = FuncFormatter(lambda value, _: f"{value:g}")
     for axes in (errors, ratios):
-        axes.set_xscale("log")
-        axes.set_yscale("log")
+        axes.set(xscale="log", yscale="log", xlim=(0.9 * ticks[0], 1.1 * ticks[-1]))
         axes.set_xticks(ticks, [str(tick) for tick in ticks])
-        axes.set_xlim(0.9 * ticks[0], 1.1 * ticks[-1])
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.yaxis.set_major_formatter(plain)
         axes.set_xlabel("number of bases", fontsize=12)
         axes.grid(color="0.9")
-        axes.tick_params(labelsize=11)
     ratios.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
     ratios.yaxis.set_minor_formatter(plain)
-    ratios.tick_params(which="minor", labelsize=11)
     errors.set_ylabel("(a) relative error of displacement at P, %", fontsize=12)
     ratios.set_ylabel("(b) CPU time, full model / reduced", fontsize=12)
     ratios.legend(fontsize=11, loc="lower left")
+    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
-
-
-def require_pyvista() -> None:
-    """Raise ``PalpateError`` if PyVista is not installed: before the work, not after."""
-    if find_spec("pyvista") is None:
-        raise PalpateError("contours need PyVista: pip install -e '.[pictures]'")
 
 
 def contours(path: Path, mesh: Mesh, errors: dict[str, Array], at: Array, radius: float) -> None:
@@ -96,29 +84,16 @@ def contours(path: Path, mesh: Mesh, errors: dict[str, Array], at: Array, radius
     radius : float, mm
         Centre and radius of the footprint, which is ringed.
     """
-    import pyvista as pv
-
-    grid = pv.UnstructuredGrid({CELL_TYPES[mesh.elements.shape[1]]: mesh.elements}, mesh.nodes)
-    for name, error in errors.items():
-        grid[name] = error
-    body = grid.extract_surface(algorithm="dataset_surface", nonlinear_subdivision=SUBDIVISIONS)
-    body["from_contact"] = np.linalg.norm(body.points - at, axis=1)
-    ring = body.contour([radius], scalars="from_contact")
-    ring = ring.connectivity("closest", closest_point=at).tube(radius=0.05 * radius)
-    # VTK reports every way to a window that it tries in vain
-    with pv.vtk_verbosity("off"):
-        plotter = pv.Plotter(
-            off_screen=True, shape=(len(VIEWS), len(errors)), window_size=SIZE, border=False
-        )
-    plotter.set_background("white")
+    _, surface = body(mesh.nodes, mesh.elements, at, errors)
+    rim, plotter = ring(surface, at, radius, 0.05), new_plotter((len(VIEWS), len(errors)), SIZE)
     for column, (name, error) in enumerate(errors.items()):
         for row, (title, towards) in enumerate(VIEWS.items()):
             plotter.subplot(row, column)
             painted = plotter.add_mesh(
-                body.copy(), scalars=name, cmap=COLOURS, clim=_scale(error), log_scale=True,
+                surface.copy(), scalars=name, cmap="viridis", clim=_scale(error), log_scale=True,
                 nan_color="lightgrey", show_scalar_bar=False, lighting=False,
             )  # fmt: skip
-            plotter.add_mesh(ring, color=RING, lighting=False)
+            plotter.add_mesh(rim, color="white", lighting=False)
             plotter.add_text(title, position=(0.04, 0.92), viewport=True, font_size=11, color=INK)
             plotter.view_vector(towards, viewup=(0, 0, 1))
             plotter.camera.parallel_projection = True
@@ -128,9 +103,7 @@ def contours(path: Path, mesh: Mesh, errors: dict[str, Array], at: Array, radius
             position_x=0.15, width=0.7, position_y=0.03, height=0.13,
             n_labels=3, title_font_size=20, label_font_size=18,
         )  # fmt: skip
-    path.parent.mkdir(parents=True, exist_ok=True)
-    plotter.screenshot(str(path))
-    plotter.close()
+    save(plotter, path)
 
 
 def _scale(error: Array) -> tuple[float, float]:

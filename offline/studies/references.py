@@ -10,20 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.offline.methods.full import Remeshed
-from palpate.offline.methods.method import Case, Method, Snapshots
+from palpate.offline.methods.method import Case, Method, Snapshots, Steps
 from palpate.offline.run.checkpoint import Checkpoint
 from palpate.offline.run.workers import resume
 from palpate.offline.run.workshop import Load, Workshop
 from palpate.offline.validate.histories import loads_of, random_histories
+from palpate.offline.validate.loads import random_loads
 from palpate.offline.validate.norms import relative
 from palpate.shared.errors import PalpateError
 from palpate.shared.model import ReducedModel
 from palpate.shared.scene import Scene
 
 Array = NDArray[np.float64]
-
-Steps = Sequence[tuple[Case, float]]
-"""A history: cases, and the time (s) in which each is reached from the one before."""
 
 
 class Fields(NamedTuple):
@@ -40,6 +38,12 @@ class Fields(NamedTuple):
             np.array([method.von_mises(state) for state in states]),
         )
 
+    @classmethod
+    def at_once(cls, workshop: Workshop, displacements: Sequence[Array]) -> Fields:
+        """Fields of tissue that remembers nothing, with displacements (3 n,) or (n, 3) mm."""
+        u = np.reshape(displacements, (len(displacements), -1, 3))
+        return cls(u, np.array([workshop.von_mises(x) for x in u]))
+
     def errors(self, workshop: Workshop, exact: Fields) -> tuple[float, float]:
         """Relative L2 errors over the moments and all nodes, or those beyond the clamped layer."""
         kept = workshop.beyond_clamped_layer
@@ -47,33 +51,26 @@ class Fields(NamedTuple):
         return relative(self.displacements, u), relative(self.stresses[:, kept], s[:, kept])
 
 
-def full_solutions(
-    title: str, loads: Sequence[Load], pool: Executor, checkpoint: Checkpoint
-) -> Snapshots:
-    """The loads that have an equilibrium, and their displacements."""
-    tasks = {f"{title}-{len(loads)}-{i}": (Workshop.sample, load) for i, load in enumerate(loads)}
-    found = resume(
-        title, pool, checkpoint, tasks, lambda u: {"u": np.empty(0) if u is None else u.ravel()}
-    )
-    pairs = [(load, found[name]["u"]) for name, load in zip(tasks, loads, strict=True)]
-    solved = [(load, u.astype(float)) for load, u in pairs if u.size]
-    if not solved:
-        raise PalpateError(f"{title}: no load has an equilibrium")
-    return Snapshots([load for load, _ in solved], np.stack([u for _, u in solved]))
-
-
 def random_steps(
-    atlas: ReducedModel, workshop: Workshop, count: int, rng: np.random.Generator
+    atlas: ReducedModel, workshop: Workshop, count: int, rng: np.random.Generator, in_time: bool
 ) -> list[Steps]:
-    """Random histories of footprints over the whole surface and range."""
+    """Random histories of footprints, or single loads, over the whole surface and range."""
+    if in_time:
+        histories = [loads_of(presses) for presses in random_histories(atlas, count, rng)]
+    else:
+        loads = random_loads(atlas.surface, atlas.limits, atlas.scene, count, rng)
+        histories = [([load], [0.0]) for load in loads]
     return [
-        [(Case.of(workshop, load), dt) for load, dt in zip(*loads_of(presses), strict=True)]
-        for presses in random_histories(atlas, count, rng)
+        [(Case.of(workshop, load), dt) for load, dt in zip(*history, strict=True)]
+        for history in histories
     ]
 
 
 def full_histories(
-    histories: Mapping[str, Steps], tips: set[str], pool: Executor, checkpoint: Checkpoint
+    histories: Mapping[str, Steps],
+    pool: Executor,
+    checkpoint: Checkpoint,
+    tips: frozenset[str] = frozenset(),
 ) -> dict[str, Fields]:
     """Full solutions of the histories that the full model can follow.
 
@@ -98,6 +95,15 @@ def full_histories(
     tasks = {name: task(name) for name in histories}
     found = resume("full histories", pool, checkpoint, tasks, pack)
     return {name: Fields(own["u"], own["s"]) for name, own in found.items() if own}
+
+
+def snapshots(histories: Sequence[Steps], found: Sequence[Fields]) -> Snapshots:
+    """What methods learn from full solutions of histories; an error if there are none."""
+    if not found:
+        raise PalpateError("snapshots: the full model could follow none of the histories")
+    loads = [case.contacts[0] for steps in histories for case, _ in steps]
+    rows = np.concatenate([own.displacements for own in found]).astype(float)
+    return Snapshots(loads, rows.reshape(len(rows), -1))
 
 
 _kept: dict[float, Remeshed] = {}

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from palpate.offline.methods.full import Full
 from palpate.offline.methods.method import Case
-from palpate.offline.methods.shipped import ShippedInTime
+from palpate.offline.methods.shipped import Shipped
 from palpate.offline.run.workshop import Load, Workshop
 from palpate.offline.studies.tables import write_csv
 from palpate.shared.artifact import read_artifact
@@ -31,7 +31,7 @@ PHASES = ((0.2, 10, 1.0), (4.0, 40, 1.0), (0.1, 5, 0.0), (4.0, 40, 0.0))
 """Press, hold, release, rest."""
 
 
-def relaxation(artifact: Path, position: Array | None = None) -> dict[str, Any]:
+def relaxation(artifact: Path, position: Sequence[float] | None = None) -> dict[str, Any]:
     """Press one place of an artifact's surface, hold, release, wait.
 
     Writes ``relaxation.csv`` and ``relaxation.png`` to the report beside the artifact.
@@ -39,7 +39,7 @@ def relaxation(artifact: Path, position: Array | None = None) -> dict[str, Any]:
     Parameters
     ----------
     artifact : Path
-    position : ndarray, shape (3,), mm, optional
+    position : sequence of 3 floats, mm, optional
         The middle of the surface if absent.
 
     Returns
@@ -53,22 +53,19 @@ def relaxation(artifact: Path, position: Array | None = None) -> dict[str, Any]:
         raise QueryError("scene", f"{atlas.name!r} is elastic: nothing relaxes")
     workshop = Workshop.of_artifact(read_artifact(artifact))
     vertices = atlas.surface.vertices
-    if position is None:
-        position = vertices[((vertices - vertices.mean(axis=0)) ** 2).sum(axis=1).argmin()]
-    x, normal, _, fields = atlas.surface.locate(position, atlas.limits)
+    middle = vertices[np.linalg.norm(vertices - vertices.mean(axis=0), axis=1).argmin()]
+    at = middle if position is None else np.array(position)
+    x, normal, _, fields = atlas.surface.locate(at, atlas.limits)
     pressure = PRESSED * float(fields[0])
     steps = [
         (Case.of(workshop, Load(x, -normal, share * pressure)), dt)
         for dt, share in load_steps(PHASES)
     ]
-    reduced, full = ShippedInTime(atlas), Full(workshop)
+    reduced, full = Shipped(workshop, atlas, "in time"), Full(workshop)
     reduced.solve(steps[0][0])  # compiles
-    answers = list(reduced.follow(steps))
-    histories = full.follow(tqdm(steps, "full model"))
-    moved = [
-        (workshop.under(x, history.displacement), answer.contact_displacement)
-        for history, answer in zip(histories, answers, strict=True)
-    ]
+    answers = reduced.follow(steps)
+    exact = [workshop.under(x, state.displacement) for state in full.follow(tqdm(steps, "full"))]
+    moved = list(zip(exact, [answer.contact_displacement for answer in answers], strict=True))
     times, depth = np.cumsum([dt for _, dt in steps]), -np.array(moved) @ normal
     force = np.array([np.linalg.norm(answer.force) for answer in answers])
     report = artifact.parent / atlas.name / "report"
@@ -104,19 +101,18 @@ def _draw(path: Path, times: Array, force: Array, full: Array, reduced: Array) -
 
     figure = Figure(figsize=(8, 4.8), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1, 2))
-    ends = np.concatenate([[0.0], np.cumsum([seconds for seconds, _, _ in PHASES])])
+    ends = np.cumsum([seconds for seconds, _, _ in PHASES])
     for axes in (above, below):
-        for end in ends[1:-1]:
-            axes.axvline(end, color="0.85", linewidth=0.8)
         axes.spines[["top", "right"]].set_visible(False)
-    t = np.append(0.0, times)
-    above.plot(t, np.append(0.0, force), color="0.3")
+        for end in ends[:-1]:
+            axes.axvline(end, color="0.85", linewidth=0.8)
+    t, force, full = (np.append(0.0, x) for x in (times, force, full))
+    above.plot(t, force, color="0.3")
     above.set_ylabel("force, mN")
-    below.plot(t, np.append(0.0, full), color="tab:blue", label="full model")
+    below.plot(t, full, color="tab:blue", label="full model")
     below.plot(times[::2], reduced[::2], ".", color="tab:orange", label="reduced model")
-    below.set_ylabel("depth of the dent, mm")
-    below.set_xlabel("time, s")
+    below.set(ylabel="depth of the dent, mm", xlabel="time, s")
     below.legend(frameon=False)
-    for name, left, right in (("hold", ends[1], ends[2]), ("released", ends[3], ends[4])):
+    for name, left, right in (("hold", *ends[:2]), ("released", *ends[2:])):
         above.text((left + right) / 2, 0.5 * force.max(), name, ha="center", color="0.4")
     figure.savefig(path, dpi=110)

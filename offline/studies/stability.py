@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -26,17 +26,15 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from palpate.offline.methods.catalogue import Training, build
-from palpate.offline.methods.method import Case, Method, Snapshots
+from palpate.offline.methods.method import Case, Method, Snapshots, Steps
 from palpate.offline.run.checkpoint import Checkpoint, content_key
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.workers import worker_pool
 from palpate.offline.run.workshop import Workshop, open_artifact
-from palpate.offline.studies import trajectories
 from palpate.offline.studies.hard_cases import (
-    CONTROL,
     HYSTERESIS,
     SEVERAL,
-    Equilibria,
+    Followed,
     HardCase,
     HardLoads,
     all_equilibria,
@@ -50,18 +48,18 @@ from palpate.offline.studies.outcomes import (
     SILENT_OUTCOMES,
     WRONG_FLAGGED,
     Result,
+    Table,
     classify,
-    flagged,
     publish,
-    summary,
+    summaries,
 )
-from palpate.offline.studies.references import Fields, Steps, full_histories, random_steps
+from palpate.offline.studies.references import Fields, full_histories, random_steps, snapshots
 from palpate.offline.studies.tables import write_csv
+from palpate.offline.studies.trajectories import histories
 from palpate.offline.validate.loads import random_loads
 from palpate.offline.validate.norms import relative
-from palpate.shared.answer import Answer as Found
 from palpate.shared.artifact import read_artifact
-from palpate.shared.errors import PalpateError, QueryError
+from palpate.shared.errors import QueryError
 from palpate.shared.model import ReducedModel
 
 SNAPSHOTS, SNAPSHOTS_IN_TIME = 150, 12
@@ -90,7 +88,7 @@ METHODS: dict[str, tuple[str, float] | None] = {
         )
     },
     "mass-spring": ("mass-spring", 1),
-    "tensor-mass": ("tensor-mass linear", 1),
+    "tensor-mass": ("tensor-mass", 1),
 }  # fmt: skip
 """Rows of the map of loads: names and sizes in the catalogue.  The full model's jump is known."""
 
@@ -123,7 +121,7 @@ def stability(
     seed: int,
     methods: Sequence[str] | None = None,
     kinds: Sequence[str] | None = None,
-    snapshots: int = SNAPSHOTS,
+    learnt: int = SNAPSHOTS,
 ) -> dict[str, Any]:
     """Map what becomes of the answers of methods under hard loads.
 
@@ -137,37 +135,36 @@ def stability(
     seed : int
     methods, kinds : sequence of str, optional
         Only these of ``METHODS``, and only these kinds; all if absent.
-    snapshots : int
+    learnt : int
         Full solutions that the methods learn from.
 
     Returns
     -------
     dict
-        By method what ``outcomes.summary`` tells, of the artifact also ``right_but_flagged`` in
-        range; ``without_equilibrium``: cases of each kind that the full model has no answer to;
-        ``with_several_equilibria``, ``with_hysteresis``: cases whose path and jump end apart, of
-        loads that are raised and that are lowered again, a kind each if there are any.
+        See ``outcomes.summaries``; ``without_equilibrium``: cases of each kind that the full model
+        has no answer to; ``with_several_equilibria``, ``with_hysteresis``: cases whose path and
+        jump end apart, of loads that are raised and that are lowered again, a kind each if there
+        are any.
     """
-    atlas = ReducedModel.load(artifact)
-    workshop = Workshop.of_artifact(read_artifact(artifact))
+    atlas, workshop = ReducedModel.load(artifact), Workshop.of_artifact(read_artifact(artifact))
     everything = HardLoads(atlas, workshop, cases, seed).cases()
     chosen = {name: everything[name] for name in kinds or everything}
     tissues = sorted({case.poisson for own in chosen.values() for case in own})
-    learning = _learning(atlas, workshop, tissues, snapshots)
-    key = _key(artifact, f"{cases} {seed} {snapshots}")
-    solved = Checkpoint(artifact.parent / f".{artifact.stem}.stability-solved", key)
-    answered = Checkpoint(
-        artifact.parent / f".{artifact.stem}.stability-answered",
-        _key(artifact, f"{cases} {seed} {snapshots} {list(chosen)}"),
-    )
+    loads = random_loads(
+        atlas.surface, atlas.limits, atlas.scene, learnt,
+        stream(atlas.scene.seed, Stage.STABILITY_SNAPSHOTS),
+    )  # fmt: skip
+    given = [Case.of(workshop, load) for load in loads]
+    learning = {f"snapshots {p:g}": [HardCase(((x, 0.0),), p) for x in given] for p in tissues}
+    checkpoint = _checkpoint(artifact, atlas, "stability", cases, seed, learnt, list(chosen))
     with worker_pool(open_artifact, artifact) as pool:
-        found = all_equilibria({**chosen, **learning}, pool, solved)
-    pairs = {name: list(zip(own, found[name], strict=True)) for name, own in chosen.items()}
+        found = all_equilibria({**chosen, **learning}, pool, checkpoint)
+    pairs = {name: found[name] for name in chosen}
     pairs |= several(pairs, cases)
     table: dict[str, dict[str, list[Result]]] = {}
-    for poisson in tissues:
-        own_tissue, own_learning = tissue(workshop, poisson), _learning_of(poisson)
-        training = _training(own_tissue, atlas, learning[own_learning], found[own_learning])
+    for poisson, solutions in zip(tissues, learning, strict=True):
+        own_tissue = tissue(workshop, poisson)
+        training = _training(own_tissue, atlas, found[solutions])
         questions = {
             name: [_question(own_tissue, *pair) for pair in own]
             for name, own in pairs.items()
@@ -178,14 +175,13 @@ def stability(
             if asked:
                 answers = partial(_answers, METHODS[name], training)
                 label = f"{name} {poisson:g}"
-                table.setdefault(name, {}).update(_kept(label, answers, asked, answered))
+                table.setdefault(name, {}).update(_kept(label, answers, asked, checkpoint))
     report = artifact.parent / atlas.name / "report"
     publish(report, "stability", table, [name for name, own in pairs.items() if own], "loads")
-    write_csv(report / "stability_silent.csv", list(_silent(table)))
-    for checkpoint in (solved, answered):
-        checkpoint.remove()
+    write_csv(report / "stability_silent.csv", _silent(table))
+    checkpoint.remove()
     missing = {name: sum(truth.path is None for _, truth in own) for name, own in pairs.items()}
-    return _summaries(table) | {
+    return summaries(table) | {
         "without_equilibrium": {name: count for name, count in missing.items() if count},
         "with_several_equilibria": len(pairs.get(SEVERAL, ())),
         "with_hysteresis": len(pairs.get(HYSTERESIS, ())),
@@ -199,7 +195,7 @@ def stability_in_time(
     many: int = MANY,
     methods: Sequence[str] | None = None,
     kinds: Sequence[str] | None = None,
-    snapshots: int = SNAPSHOTS_IN_TIME,
+    learnt: int = SNAPSHOTS_IN_TIME,
 ) -> dict[str, Any]:
     """Map what becomes of histories that strain methods.
 
@@ -218,14 +214,13 @@ def stability_in_time(
         Steps of the longest history.
     methods, kinds : sequence of str, optional
         Only these of ``METHODS_IN_TIME``, and only these kinds; all if absent.
-    snapshots : int
+    learnt : int
         Histories that POD learns from.
 
     Returns
     -------
     dict
-        By method what ``outcomes.summary`` tells; ``drift``: how far the ends of long histories are
-        from the method's own answers to the brief ones that lead there too.
+        See ``outcomes.summaries``.
     """
     atlas = ReducedModel.load(artifact)
     if atlas.models.viscous is None:
@@ -233,71 +228,65 @@ def stability_in_time(
     workshop = Workshop.of_artifact(read_artifact(artifact))
     with_tip = atlas.models.viscous_tips is not None
     wanted = [name for name in methods or METHODS_IN_TIME if with_tip or name != TIP]
-    hard = {}
-    for tip in {name == TIP for name in wanted}:
-        found = trajectories.histories(atlas, workshop, tip, cases, seed, many)
-        hard[tip] = {name: own for name, own in found.items() if kinds is None or name in kinds}
-    key = _key(artifact, f"{cases} {seed} {many} {snapshots} {kinds}")
-    folder = artifact.parent / f".{artifact.stem}.stability-in-time"
-    checkpoint = Checkpoint(folder, key)
-    questions, training = _followed(artifact, atlas, workshop, hard, snapshots, checkpoint)
+    hard = {
+        (tip, name): own
+        for tip in sorted({name == TIP for name in wanted})
+        for name, own in histories(atlas, workshop, tip, cases, seed, many).items()
+        if kinds is None or name in kinds
+    }
+    checkpoint = _checkpoint(
+        artifact, atlas, "stability_in_time", cases, seed, many, learnt, kinds, with_tip
+    )
+    tasks: dict[str, Steps] = {
+        f"{tip} {name} {i}": case.brief or case.steps
+        for (tip, name), own in hard.items()
+        for i, case in enumerate(own)
+        if not case.nonsense
+    }
+    rng = stream(atlas.scene.seed, Stage.STABILITY_IN_TIME_SNAPSHOTS)
+    made = random_steps(atlas, workshop, learnt, rng, in_time=True)
+    learning = {f"snapshots {i}": steps for i, steps in enumerate(made)}
+    tips = frozenset(name for name in tasks if name.startswith("True"))
+    with worker_pool(open_artifact, artifact) as pool:
+        found = full_histories(tasks | learning, pool, checkpoint, tips)
+    questions: dict[bool, dict[str, list[Question]]] = {False: {}, True: {}}
+    for (tip, name), own in hard.items():
+        answers = [found.get(f"{tip} {name} {i}") for i in range(len(own))]
+        questions[tip][name] = [Question(*pair) for pair in zip(own, answers, strict=True)]
+    solved = snapshots(made, [found[name] for name in learning if name in found])
+    training = Training(workshop, solved, atlas, in_time=True)
     table = {}
     for name in tqdm(wanted, "methods"):
-        answers = partial(
-            _answers, METHODS_IN_TIME[name], training, every=LARGER if name == STEPS else 1
-        )
-        table[name] = _kept(name, answers, questions[name == TIP], checkpoint)
-    report = artifact.parent / atlas.name / "report"
-    names = list(dict.fromkeys(name for own in questions.values() for name in own))
+        every = LARGER if name == STEPS else 1
+        ask = partial(_answers, METHODS_IN_TIME[name], training, every=every)
+        table[name] = _kept(name, ask, questions[name == TIP], checkpoint)
+    names = list(dict.fromkeys(name for _, name in hard))
     asked = "histories (one of those of many steps)"
-    publish(report, "stability_in_time", table, names, asked)
+    publish(artifact.parent / atlas.name / "report", "stability_in_time", table, names, asked)
     checkpoint.remove()
-    return _summaries(table)
+    return summaries(table)
 
 
-def _key(artifact: Path, settings: str) -> str:
-    """Hash of everything that results depend on."""
-    own = hashlib.sha256(artifact.read_bytes() + settings.encode()).hexdigest()[:16]
-    return f"{content_key(ReducedModel.load(artifact).scene)}-{own}"
+def _checkpoint(artifact: Path, atlas: ReducedModel, name: str, *settings: object) -> Checkpoint:
+    """What a killed run goes on from: named by all that results depend on."""
+    sha = hashlib.sha256(artifact.read_bytes() + str(settings).encode()).hexdigest()[:16]
+    folder = artifact.parent / f".{artifact.stem}.{name}"
+    return Checkpoint(folder, f"{content_key(atlas.scene)}-{sha}")
 
 
 # --- what is asked -------------------------------------------------------------------------------
 
 
-def _learning(
-    atlas: ReducedModel, workshop: Workshop, tissues: Iterable[float], count: int
-) -> dict[str, list[HardCase]]:
-    """What methods learn from in each tissue: random loads in range."""
-    rng = stream(atlas.scene.seed, Stage.STABILITY_SNAPSHOTS)
-    loads = random_loads(atlas.surface, atlas.limits, atlas.scene, count, rng)
-    cases = [Case.of(workshop, load) for load in loads]
-    return {_learning_of(p): [HardCase(((case, 0.0),), p) for case in cases] for p in tissues}
+def _training(workshop: Workshop, atlas: ReducedModel, found: Sequence[Followed]) -> Training:
+    solved = [(case.last.contacts[0], u.jump) for case, u in found if u.jump is not None]
+    loads, displacements = zip(*solved, strict=True)
+    return Training(workshop, Snapshots(loads, np.stack(displacements)), atlas)
 
 
-def _learning_of(poisson: float) -> str:
-    return f"snapshots {poisson:g}"
-
-
-def _training(
-    workshop: Workshop,
-    atlas: ReducedModel,
-    cases: Sequence[HardCase],
-    found: Sequence[Equilibria],
-) -> Training:
-    pairs = [(case.last.contacts[0], own.jump) for case, own in zip(cases, found, strict=True)]
-    solved = [(load, jump) for load, jump in pairs if jump is not None]
-    displacements = np.stack([jump for _, jump in solved])
-    return Training(workshop, Snapshots([load for load, _ in solved], displacements), atlas)
-
-
-def _question(workshop: Workshop, case: HardCase, truth: Equilibria) -> Question:
-    def fields(u: NDArray[np.float64] | None) -> Fields | None:
-        if u is None:
-            return None
-        u = u.reshape(-1, 3)
-        return Fields(u[None], workshop.von_mises(u)[None])
-
-    return Question(case, *map(fields, (truth.path, truth.jump, truth.other)))
+def _question(workshop: Workshop, case: HardCase, truth: Any) -> Question:
+    found = truth.path, truth.jump, truth.other
+    fields = [None if u is None else Fields.at_once(workshop, [u]) for u in found]
+    return Question(case, *fields)
 
 
 def _applies(method: str, case: HardCase, atlas: ReducedModel) -> bool:
@@ -307,46 +296,6 @@ def _applies(method: str, case: HardCase, atlas: ReducedModel) -> bool:
     if len(case.steps) > 1:
         return method in (ARTIFACT, WARM) or (method == FULL and case.follow)
     return method != WARM
-
-
-def _followed(
-    artifact: Path,
-    atlas: ReducedModel,
-    workshop: Workshop,
-    hard: Mapping[bool, Mapping[str, Sequence[HardCase]]],
-    snapshots: int,
-    checkpoint: Checkpoint,
-) -> tuple[dict[bool, dict[str, list[Question]]], Training]:
-    """Histories with the full model's answers, and what methods learn from."""
-    tasks: dict[str, Steps] = {
-        f"{'tip' if tip else 'load'} {name} {i}": case.brief or case.steps
-        for tip, kinds in hard.items()
-        for name, own in kinds.items()
-        for i, case in enumerate(own)
-        if not case.nonsense
-    }
-    tips = {name for name in tasks if name.startswith("tip")}
-    rng = stream(atlas.scene.seed, Stage.STABILITY_IN_TIME_SNAPSHOTS)
-    for i, steps in enumerate(random_steps(atlas, workshop, snapshots, rng)):
-        tasks[f"snapshots {i}"] = steps
-    with worker_pool(open_artifact, artifact) as pool:
-        found = full_histories(tasks, tips, pool, checkpoint)
-    solved = [own.displacements for name, own in found.items() if name.startswith("snapshots")]
-    if not solved:
-        raise PalpateError("snapshots: the full model could follow none of the histories")
-    displacements = np.concatenate(solved).astype(float)
-    rows = Snapshots((), displacements.reshape(len(displacements), -1))
-    questions = {
-        tip: {
-            name: [
-                Question(case, found.get(f"{'tip' if tip else 'load'} {name} {i}"))
-                for i, case in enumerate(own)
-            ]
-            for name, own in kinds.items()
-        }
-        for tip, kinds in hard.items()
-    }
-    return questions, Training(workshop, rows, atlas, in_time=True)
 
 
 # --- answers -------------------------------------------------------------------------------------
@@ -401,7 +350,9 @@ def _answer(method: Method, workshop: Workshop, question: Question, every: int) 
                 exact = Fields(*(field[counted] for field in exact))
             found = Fields.of(method, states) if states else None
             result = classify(workshop, found, trusted, exact, question.other)
-            return replace(result, details=_details(method, case, result, states))
+            if states and case.brief:
+                result = replace(result, drift=_drift(method, case, states[-1]))
+            return result
     except ValueError:  # time that makes no sense
         return Result(REFUSED if exact is None else DIVERGED)
     except Exception:  # whatever it is, a method must not raise
@@ -427,56 +378,19 @@ def _play(
     return states, trusted, False
 
 
-SAID = (
-    "contact_point", "direction", "pressure", "pressure_limit", "distance", "tilt", "iterations",
-    "departure", "residual", "min_jacobian", "error_displacement", "error_von_mises", "features",
-)  # fmt: skip
-"""What an answer of the artifact tells of itself."""
+def _drift(method: Method, case: HardCase, end: Any) -> float:
+    """How far the end of a long history is from the method's own answer to the brief one."""
+    brief, *_ = _play(method, case.brief, np.arange(len(case.brief)), 1)
+    return relative(*(method.displacement(x) for x in (end, *brief))) if brief else float("nan")
 
 
-def _details(
-    method: Method, case: HardCase, result: Result, states: Sequence[Any]
-) -> dict[str, Any]:
-    """What an artifact says of a silent error, or how far the end of a long history drifts."""
-    if states and case.brief:
-        brief, *_ = _play(method, case.brief, np.arange(len(case.brief)), 1)
-        ends = [method.displacement(state) for state in (states[-1], *brief)]
-        return {"drift": relative(*ends) if brief else float("nan")}
-    said = states[-1] if states else None
-    if not isinstance(said, Found) or result.outcome not in SILENT_OUTCOMES:
-        return {}
-    return {name: np.asarray(getattr(said, name)).tolist() for name in SAID}
-
-
-# --- report --------------------------------------------------------------------------------------
-
-
-def _silent(table: Mapping[str, Mapping[str, Sequence[Result]]]) -> Iterable[dict[str, Any]]:
-    """Rows of the silent errors that say something of themselves."""
-    for method, results in table.items():
-        for kind, own in results.items():
-            for i, result in enumerate(own):
-                if result.details:
-                    yield {
-                        "method": method,
-                        "stressor": kind,
-                        "case": i,
-                        "displacement": result.displacement,
-                        "von_mises": result.von_mises,
-                    } | result.details
-
-
-def _summaries(table: Mapping[str, Mapping[str, Sequence[Result]]]) -> dict[str, Any]:
-    report: dict[str, Any] = {}
-    for method, results in table.items():
-        report[method] = summary([result for own in results.values() for result in own])
-        if CONTROL in results:
-            report[method]["right_but_flagged_in_range"] = flagged(results[CONTROL])
-        drift = {
-            kind: own[0].details["drift"]
-            for kind, own in results.items()
-            if own and "drift" in own[0].details
-        }
-        if drift:
-            report[method]["drift"] = drift
-    return report
+def _silent(table: Table) -> list[dict[str, Any]]:
+    """Rows of the artifact's silent errors."""
+    return [
+        {"method": method, "stressor": kind, "case": i}
+        | {"displacement": result.displacement, "von_mises": result.von_mises}
+        for method in (ARTIFACT, WARM)
+        for kind, own in table.get(method, {}).items()
+        for i, result in enumerate(own)
+        if result.outcome in SILENT_OUTCOMES
+    ]

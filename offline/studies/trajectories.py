@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.offline.bench import limit_at
 from palpate.offline.methods.method import Case
 from palpate.offline.reduce.sampling import random_points_and_rim, tangents
 from palpate.offline.run.streams import Stage, stream
@@ -21,7 +22,7 @@ from palpate.offline.run.workshop import Load, Workshop
 from palpate.offline.studies.hard_cases import HardCase
 from palpate.offline.studies.relaxation import load_steps
 from palpate.offline.validate.tip_histories import OFF
-from palpate.shared.mechanics.footprint import TIP_DEPTH, pressure_limit
+from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.model import ReducedModel
 from palpate.shared.scene import Tissue
 
@@ -50,16 +51,7 @@ Maker = Callable[[Array], HardCase]
 
 
 class Presser:
-    """Turns levels of a load at places into steps.
-
-    Parameters
-    ----------
-    atlas : ReducedModel
-    workshop : Workshop
-        Of the artifact's mesh.
-    tip : bool
-        Whether by the rigid tip.
-    """
+    """Turns levels of a load at places into steps, by footprints or by the rigid tip."""
 
     def __init__(self, atlas: ReducedModel, workshop: Workshop, tip: bool) -> None:
         self._atlas, self._workshop, self.tip = atlas, workshop, tip
@@ -80,8 +72,7 @@ class Presser:
             return Case.of_tip(x + (atlas.scene.endoscope.radius - depth) * normal, -normal)
         lean = np.radians(tilt)
         direction = np.sin(lean) * tangents(normal)[0] - np.cos(lean) * normal
-        limit = pressure_limit(fields, normal, direction)
-        return Case.of(self._workshop, Load(x, direction, float(level * limit)))
+        return Case.of(self._workshop, Load(x, direction, level * limit_at(atlas, x, direction)))
 
     def aside(self, at: Array, distance: float) -> Array:
         """The place (3,) at a distance (mm) over the surface, always the same way."""
@@ -177,33 +168,29 @@ def _makers(
 
     lengths = np.random.default_rng(1)
     sudden = np.tile([DEEP, 0.0, DEEP, 0.5 * DEEP], 4)
+    small, large = np.append(np.full(39, SMALL), 1.0), SHORT * slowest
+    series: dict[str, tuple[Array, float | Array]] = {
+        "steps of 0.01 ms": (np.linspace(0.1, 1.0, 20) * DEEP, SMALL),
+        "steps of 100 time constants": (np.tile([DEEP, 0.3, 0.0], 4), large),
+        "steps of 0.01 ms, held": (np.full(40, DEEP), small),
+        "steps of a day": (np.tile([DEEP, 0.3], 5), 86400.0),
+        "steps of all lengths": (lengths.uniform(0.2, 0.9, 40), 10 ** lengths.uniform(-6, 3, 40)),
+        "taps at 20 Hz": (np.tile([0.4, DEEP, 0.4, 0.0], 12), 0.0125),
+        "steps of no time": (np.append(sudden, DEEP), 0.0),
+        "press, lift, press at once": (sudden, np.tile([0.0, 0.0, 0.0, 0.05], 4)),
+        "1.5 x the limit": (np.linspace(0.2, 1.5, 10), 0.05),
+        "3 x the limit": (np.linspace(0.2, 3.0, 16), 0.05),
+    }
     return {
         CONTROL: of(simple),
-        "steps of 0.01 ms": of(partial(levels, np.linspace(0.1, 1.0, 20) * DEEP, SMALL)),
-        "steps of 100 time constants": of(
-            partial(levels, np.tile([DEEP, 0.3, 0.0], 4), SHORT * slowest)
-        ),
-        "steps of 0.01 ms, held": of(
-            partial(levels, np.full(40, DEEP), np.append(np.full(39, SMALL), 1.0))
-        ),
-        "steps of a day": of(partial(levels, np.tile([DEEP, 0.3], 5), 86400.0)),
-        "steps of all lengths": of(
-            partial(levels, lengths.uniform(0.2, 0.9, 40), 10 ** lengths.uniform(-6.0, 3.0, 40))
-        ),
-        "taps at 20 Hz": of(partial(levels, np.tile([0.4, DEEP, 0.4, 0.0], 12), 0.0125)),
+        **{name: of(partial(levels, *own)) for name, own in series.items()},
         "slides at 300 mm per s": of(slides),
-        "steps of no time": of(partial(levels, np.append(sudden, DEEP), 0.0)),
-        "press, lift, press at once": of(
-            partial(levels, sudden, np.tile([0.0, 0.0, 0.0, 0.05], 4))
-        ),
         "direction flipped at once": of(flipped),
         "contact teleports": of(teleports),
         "held for 10 000 s": of(partial(growing, LONG)),
         f"held for 10 000 s, {many // 10} steps": partial(even, LONG, many // 10),
-        f"held for {SHORT * slowest:g} s, {many} steps": partial(even, SHORT * slowest, many),
+        f"held for {large:g} s, {many} steps": partial(even, large, many),
         f"moves periodically, {many} steps": partial(periodic, many),
-        "1.5 x the limit": of(partial(levels, np.linspace(0.2, 1.5, 10), 0.05)),
-        "3 x the limit": of(partial(levels, np.linspace(0.2, 3.0, 16), 0.05)),
         "time runs back": of(partial(goes, -0.1), nonsense=True),
         "time is not a number": of(partial(goes, np.nan), nonsense=True),
     }

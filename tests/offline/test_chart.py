@@ -1,26 +1,28 @@
+"""The speed-accuracy charts of loads and of histories, at toy size."""
+
 import csv
 
 import numpy as np
 import pytest
 
-from palpate.offline.methods.shipped import Shipped
 from palpate.offline.scenes import find_scene
 from palpate.offline.studies import chart as study
-from palpate.offline.studies.chart_points import Point, pareto
+from palpate.offline.studies.chart_drawing import FULL, SHIPPED, TWIN, pareto
 from palpate.offline.validate.loads import validate
-from palpate.shared.errors import PalpateError
+from palpate.shared.errors import PalpateError, QueryError
 from palpate.shared.model import ReducedModel
 
 PLAN = {"artifact": (1,), "pod": (5,), "linear": (10, 20), "mass-spring": (0.5,), "full": (0.5, 1)}
 QUERIES = 6
+SIZES = (5, 40)
 
 
 class Killed(Exception):
     pass
 
 
-def run(artifact, **how):
-    return study.chart(find_scene("quick"), artifact, 20, QUERIES, 1, PLAN, **how)
+def run(artifact):
+    return study.chart(artifact, find_scene("quick"), 20, QUERIES, 1, PLAN)
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +46,12 @@ def report(artifact, killed):
     return run(artifact)
 
 
+@pytest.fixture(scope="module")
+def in_time(visco_artifact):
+    plan = {name: sizes if sizes == (1,) else SIZES for name, sizes in study.PLAN_IN_TIME.items()}
+    return study.chart(visco_artifact, None, 1, 2, 1, plan)
+
+
 def test_a_killed_run_goes_on_where_it_stopped(killed, report):
     # no time is measured twice alike
     times = {key: row["time_us"] for key, row in killed.items()}
@@ -52,57 +60,91 @@ def test_a_killed_run_goes_on_where_it_stopped(killed, report):
 
 def test_the_artifact_is_on_the_front_and_linear_elasticity_below_it(report, artifact):
     points = report["points"]
-    own = Shipped(ReducedModel.load(artifact)).unknowns
+    own = ReducedModel.load(artifact).models.mix.shape[-1]
     plan = PLAN | {"pod": (5, own)}  # as many modes as the artifact has unknowns
     assert list(points) == [f"{name} {size:g}" for name, sizes in plan.items() for size in sizes]
-    assert points[f"pod {own}"]["displacement_p95"] > points["artifact 1"]["displacement_p95"]
+    assert points[f"pod {own}"]["displacement_p95"] > points[SHIPPED]["displacement_p95"]
     assert all(row["time_us"] > 0 and row["unconverged"] == 0 for row in points.values())
-    assert "artifact 1" in report["pareto"]
-    assert report["pareto"][-1] == "full 1"
+    assert SHIPPED in report["pareto"]
+    assert report["pareto"][-1] == FULL
     assert report["speed_of_next"] > 10
     for field in ("displacement", "von_mises", "refined"):
-        shipped = points["artifact 1"][f"{field}_p95"]
-        assert 0 < shipped <= points["artifact 1"][f"{field}_max"]
+        shipped = points[SHIPPED][f"{field}_p95"]
+        assert 0 < shipped <= points[SHIPPED][f"{field}_max"]
         assert shipped < points["linear 20"][f"{field}_p95"]
 
 
 def test_the_mesh_s_error_shows_only_against_the_refined_one(report):
-    scene, coarse = report["points"]["full 1"], report["points"]["full 0.5"]
+    scene, coarse = report["points"][FULL], report["points"]["full 0.5"]
     assert scene["displacement_max"] < 1e-6
     assert 1e-3 < scene["refined_p95"] < coarse["refined_p95"]
     assert np.isnan(coarse["displacement_p95"])
 
 
 def test_the_artifact_s_errors_are_those_of_validate(report, artifact):
-    validated = validate(artifact, QUERIES, 1)
+    validated, found = validate(artifact, QUERIES, 1), report["points"][SHIPPED]
     for field in ("displacement", "von_mises"):
-        found = report["points"]["artifact 1"]
         for statistic in ("p95", "max"):
-            assert found[f"{field}_{statistic}"] == pytest.approx(
-                validated[field][statistic], rel=1e-4
-            )
+            expected = pytest.approx(validated[field][statistic], rel=1e-4)
+            assert found[f"{field}_{statistic}"] == expected
 
 
-def test_table_picture_and_page_are_on_disk_and_nothing_else(report, artifact):
-    folder = artifact.parent / "quick" / "report"
-    with (folder / "chart.csv").open() as file:
-        rows = {row["key"]: row for row in csv.DictReader(file)}
-    assert list(rows) == list(report["points"])
+def test_over_histories_every_method_has_a_point_and_the_artifact_is_accurate(in_time):
+    points = in_time["points"]
+    galerkin = {f"{name} {size}" for name in ("pod", "modal", "ritz") for size in SIZES}
+    assert set(points) == {SHIPPED, TWIN, FULL} | galerkin
+    for row in points.values():
+        assert row["unconverged"] == 0
+        assert row["time_us"] > 0.0
+        assert 0.0 < row["displacement_p95"] <= row["displacement_max"]
+    for key in (SHIPPED, TWIN):
+        assert points[key]["displacement_p95"] < min(0.02, points["modal 40"]["displacement_p95"])
+        assert points[key]["von_mises_p95"] < 0.04
+    assert points[SHIPPED]["unknowns"] == points[TWIN]["unknowns"]
+    # references are kept in single precision
+    assert points[FULL]["displacement_max"] < 1e-6
+    assert points["modal 40"]["displacement_p95"] < points["modal 5"]["displacement_p95"]
+
+
+def test_what_memory_costs_is_told(in_time):
+    points, shipped = in_time["points"], in_time["points"][SHIPPED]
+    ratio = shipped["time_us"] / points[TWIN]["time_us"]
+    assert in_time["step_over_elastic"] == pytest.approx(ratio)
+    as_good = [row["time_us"] for key, row in points.items() if key not in (SHIPPED, TWIN)
+               and row["displacement_p95"] <= shipped["displacement_p95"]]  # fmt: skip
+    assert in_time["speed_of_next"] == pytest.approx(min(as_good) / shipped["time_us"])
+
+
+@pytest.mark.parametrize(
+    ("fixture", "trained", "name", "words"),
+    [
+        ("report", "artifact", "chart", "linear response"),
+        ("in_time", "visco_artifact", "chart_in_time", "the same without memory"),
+    ],
+)
+def test_table_picture_and_page_are_on_disk_and_nothing_else(
+    request, fixture, trained, name, words
+):
+    found, path = request.getfixturevalue(fixture), request.getfixturevalue(trained)
+    file = path.parent / path.stem / "report" / name
+    with file.with_suffix(".csv").open() as table:
+        rows = {row["key"]: row for row in csv.DictReader(table)}
+    assert list(rows) == list(found["points"])
     for key, row in rows.items():
-        assert float(row["time_us"]) == pytest.approx(report["points"][key]["time_us"], rel=1e-3)
-    assert (folder / "chart.png").stat().st_size > 50_000
-    assert "linear response" in (folder / "chart.html").read_text(encoding="utf-8")
-    assert not list(artifact.parent.glob(".*"))
+        assert float(row["time_us"]) == pytest.approx(found["points"][key]["time_us"], rel=1e-3)
+    assert file.with_suffix(".png").stat().st_size > 20_000
+    assert words in file.with_suffix(".html").read_text(encoding="utf-8")
+    assert not list(path.parent.glob(".*chart*"))
 
 
-def test_another_scene_s_artifact_is_refused(artifact):
+def test_artifacts_that_do_not_fit_are_refused(artifact):
     with pytest.raises(PalpateError, match="another scene"):
-        study.chart(find_scene("turbinate"), artifact, 20, 1, 0)
+        study.chart(artifact, find_scene("turbinate"), 20, 1, 0)
+    with pytest.raises(QueryError, match="elastic"):
+        study.chart(artifact, None, 1, 1, 0)
 
 
 def test_the_front_is_what_nothing_beats_in_both():
-    def point(key, time, error):
-        return Point(key, "", "", 1, time, *9 * [error], 0)
-
-    points = [point("a", 3, 0.1), point("b", 1, 0.5), point("c", 2, 0.6), point("d", 3, 0.2)]
-    assert [p.key for p in pareto(points)] == ["b", "a"]
+    points = [("a", 3, 0.1), ("b", 1, 0.5), ("c", 2, 0.6), ("d", 3, 0.2)]
+    rows = [{"key": key, "time_us": t, "displacement_p95": error} for key, t, error in points]
+    assert [row["key"] for row in pareto(rows)] == ["b", "a"]

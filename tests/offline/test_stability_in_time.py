@@ -25,7 +25,7 @@ METHODS = (LOADS, TIP, "modal 40", STEPS)
 
 @pytest.fixture(scope="module")
 def report(visco_artifact):
-    return stability_in_time(visco_artifact, CASES, SEED, MANY, METHODS, KINDS, snapshots=1)
+    return stability_in_time(visco_artifact, CASES, SEED, MANY, METHODS, KINDS, learnt=1)
 
 
 @pytest.fixture(scope="module")

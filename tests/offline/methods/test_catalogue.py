@@ -31,8 +31,7 @@ ERRORS = {
     "regression": 0.6,
     "full": 1e-6,
     "mass-spring": 0.5,
-    "tensor-mass linear": 0.5,
-    "tensor-mass nonlinear": 0.5,
+    "tensor-mass": 0.5,
     "artifact": 0.01,
     "artifact, warm": 0.01,
 }

@@ -6,10 +6,11 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from palpate.offline.fem.model import FullModel
 from palpate.offline.methods.catalogue import build
-from palpate.offline.methods.galerkin import Galerkin, GalerkinAtHand
-from palpate.offline.methods.galerkin_model import (
+from palpate.offline.methods.galerkin import (
     TOLERANCE,
     Cubature,
+    Galerkin,
+    GalerkinAtHand,
     GalerkinModel,
     point_gradients,
 )

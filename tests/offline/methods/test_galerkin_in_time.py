@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from palpate.offline.methods.full import Full
-from palpate.offline.methods.galerkin import GalerkinInTime
+from palpate.offline.methods.galerkin import Galerkin
 from palpate.offline.methods.method import Case
 from palpate.offline.methods.spaces import modal, pod
 from palpate.offline.run.workshop import Load, Workshop
@@ -46,32 +46,31 @@ def exact(workshop, cases):
 @pytest.fixture(scope="module")
 def in_its_own_modes(workshop, exact):
     known = np.array([state.displacement.ravel() for state in exact])
-    return GalerkinInTime(workshop, pod(workshop.model, known, 8), accurate=1e-6)
+    return Galerkin(workshop, pod(workshop.model, known, 8), in_time=True, accurate=1e-6)
 
 
 def test_a_basis_that_holds_the_history_finds_it(workshop, cases, exact, in_its_own_modes):
-    full = Full(workshop)
-    for found, true in zip(states(in_its_own_modes, cases), exact, strict=True):
-        largest = np.abs(exact[3].displacement).max()
-        u = in_its_own_modes.displacement(found)
-        np.testing.assert_allclose(u, true.displacement, atol=1e-4 * largest)
-        stress = full.von_mises(true)
-        largest = full.von_mises(exact[3]).max()
-        np.testing.assert_allclose(in_its_own_modes.von_mises(found), stress, atol=1e-3 * largest)
+    method, full = in_its_own_modes, Full(workshop)
+    found = states(method, cases)
+    for name, off in (("displacement", 1e-4), ("von_mises", 1e-3)):
+        ours, true = (
+            [getattr(m, name)(x) for x in own] for m, own in ((method, found), (full, exact))
+        )
+        np.testing.assert_allclose(ours, true, atol=off * np.abs(true[3]).max())
 
 
 def test_it_remembers_at_the_points_what_the_full_model_does(cases, exact, in_its_own_modes):
-    found = in_its_own_modes.history(states(in_its_own_modes, cases)[4]).points[..., :6]
+    found = in_its_own_modes.reduced.history(states(in_its_own_modes, cases)[4]).points[..., :6]
     true = exact[4].points[..., :6]
     np.testing.assert_allclose(found, true, atol=1e-3 * np.abs(true).max())
 
 
 def test_few_modes_are_stiffer_and_a_step_changes_no_state(workshop, cases, exact):
-    method = GalerkinInTime(workshop, modal(workshop.model, 6))
+    method = Galerkin(workshop, modal(workshop.model, 6), in_time=True)
     first = method.at_rest()
     second = method.step(first, cases[0], 0.02).state
-    assert not method.opened(first).q.any()
-    assert method.opened(second).q.any()
+    assert not method.reduced.opened(first).q.any()
+    assert method.reduced.opened(second).q.any()
     held, true = states(method, cases)[3], exact[3]
     work = [np.vdot(u[cases[3].nodes], cases[3].forces) for u in
             (method.displacement(held), true.displacement)]  # fmt: skip
