@@ -39,10 +39,6 @@ TURNS = 20
 def bench(artifact: Path) -> dict[str, Any]:
     """Time queries of every kind on random loads over the whole range.
 
-    Parameters
-    ----------
-    artifact : Path
-
     Returns
     -------
     dict

@@ -98,7 +98,6 @@ def picture(
 
     Parameters
     ----------
-    artifact : Path
     position : sequence of 3 floats, mm
     pressure : float, kPa
     direction : sequence of 3 floats, optional

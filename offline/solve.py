@@ -34,7 +34,6 @@ def solve(
 
     Parameters
     ----------
-    artifact : Path
     position : sequence of 3 floats, mm
         Projected onto the accessible surface.
     pressure : float, kPa

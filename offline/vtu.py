@@ -31,7 +31,6 @@ def write_vtu(
 
     Parameters
     ----------
-    path : Path
     nodes : ndarray, shape (n, 3), mm
     elements : ndarray, shape (e, 8) or (e, 20)
         In VTK's order.

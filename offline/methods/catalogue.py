@@ -18,7 +18,7 @@ from palpate.offline.fem.model import FullModel
 from palpate.offline.methods.cubatures import PointForces, point_forces
 from palpate.offline.methods.deim import Deim, PlainNewton, force_modes, sample
 from palpate.offline.methods.full import Full, Remeshed
-from palpate.offline.methods.galerkin import Cubature, Galerkin, GalerkinAtHand, GalerkinModel
+from palpate.offline.methods.galerkin import Galerkin, GalerkinAtHand
 from palpate.offline.methods.lattice import scaled
 from palpate.offline.methods.mass_spring import MassSpring
 from palpate.offline.methods.method import Case, Method, Snapshots
@@ -57,11 +57,8 @@ class Training:
 
     Attributes
     ----------
-    workshop : Workshop
-    snapshots : Snapshots
     atlas : ReducedModel, optional
         The artifact of the same mesh, for the methods that query it.
-    seed : int
     scene : Scene, optional
         With its files, for the full model on other meshes.
     in_time : bool
@@ -114,11 +111,8 @@ class Training:
 
     def point_forces(self, basis: Array) -> PointForces:
         """What a cubature of a basis is fitted to."""
-        size, per_element = basis.shape[1], self.model.weights.shape[1]
-        reduced = GalerkinModel(self.model, size, Cubature.full(self.model))
-        reduced.adopt(basis)
         cases = [Case.of(self.workshop, load) for load in self.snapshots.loads[:CASES]]
-        return point_forces(reduced, per_element, cases, self.rng(size))
+        return point_forces(Galerkin(self.workshop, basis), cases, self.rng(basis.shape[1]))
 
 
 def build(name: str, size: float, training: Training) -> Method:
@@ -228,7 +222,7 @@ BUILDERS: dict[str, Callable[[int, Training], Method]] = {
     "krylov": _krylov,
     "pod": lambda size, t: _every_point(t, t.pod(size)),
     "pod-euclidean": lambda size, t: _every_point(t, t.pod(size, "euclidean")),
-    "pod, no line search": lambda size, t: PlainNewton.galerkin(t.workshop, t.pod(size)),
+    "pod, no line search": lambda size, t: PlainNewton(t.workshop, t.pod(size)),
     "pod-ecm": _pod_ecm,
     "pod-ecm, 1 point a mode": partial(_pod_ecm, points=1),
     "pod-ecsw": _pod_ecsw,

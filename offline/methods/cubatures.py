@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.methods.galerkin import Cubature, GalerkinModel, stress_points
+from palpate.offline.methods.galerkin import Cubature, Galerkin, stress_points
 from palpate.offline.methods.method import Case
 from palpate.offline.reduce.cubature import compress, nonnegative
 from palpate.shared.reduced.points import LANES
@@ -44,7 +44,6 @@ class PointForces:
     contributions : ndarray, shape (points, sums), float32
         Of the reduced model's full cubature.
     weights : ndarray, shape (points,), mm^3
-    per_element : int
     """
 
     contributions: NDArray[np.float32]
@@ -64,29 +63,19 @@ class PointForces:
         return Cubature(points, np.repeat(factors, self.per_element) * self.weights[points])
 
 
-def point_forces(
-    reduced: GalerkinModel, per_element: int, cases: Iterable[Case], rng: np.random.Generator
-) -> PointForces:
-    """Forces at every point in and off the equilibria of cases.
+def point_forces(reduced: Galerkin, cases: Iterable[Case], rng: np.random.Generator) -> PointForces:
+    """Forces at every point of a model with the full cubature, in and off equilibria of cases.
 
     They are weighted with the square root of the compliance at equilibrium, relative to the
     answer: an error of their sum is then a relative error of displacement in the energy norm.
-
-    Parameters
-    ----------
-    reduced : GalerkinModel
-        With its basis and the full cubature.
-    per_element : int
-        Quadrature points of an element.
-    cases : iterable of Case
-        Those without an equilibrium are skipped.
-    rng : numpy.random.Generator
+    Cases without an equilibrium are skipped.
     """
     columns = []
     for case in cases:
-        if not reduced.solve(case)[0]:
+        answer = reduced.solve(case)
+        if not answer.converged:
             continue
-        q = reduced.state
+        q = answer.state
         L = np.linalg.cholesky(reduced.tangent(q))
         departure = OFF_EQUILIBRIUM * np.abs(q) * rng.standard_normal(len(q))
         for state in (q, q + departure):
@@ -94,12 +83,12 @@ def point_forces(
             looks /= np.sqrt(LOOKS) * np.linalg.norm(q)
             if stress_points(reduced.content, state) > 0.0:
                 columns.append(_contributions(reduced, looks))
-    count = len(reduced.points)
-    weights = reduced.content.points.weights[:count]
-    return PointForces(np.hstack(columns)[:count], weights, per_element)
+    weights = reduced.workshop.model.weights
+    contributions = np.hstack(columns)[: weights.size]
+    return PointForces(contributions, weights.ravel(), weights.shape[1])
 
 
-def _contributions(reduced: GalerkinModel, looks: Array) -> NDArray[np.float32]:
+def _contributions(reduced: Galerkin, looks: Array) -> NDArray[np.float32]:
     """Nonlinear forces (c, k) of the points' stress along ``looks`` (m, k)."""
     content = reduced.content
     work = (looks.T.astype(np.float32) @ content.points.gradients) * content.work.P

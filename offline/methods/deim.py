@@ -31,13 +31,12 @@ from palpate.offline.methods.galerkin import (
     TOLERANCE,
     Content,
     Cubature,
-    GalerkinModel,
+    Galerkin,
     linearise_points,
-    point_gradients,
     reduce_load,
     stress_points,
 )
-from palpate.offline.methods.method import Answer, Case, Method
+from palpate.offline.methods.method import Answer, Case
 from palpate.offline.run.workshop import Workshop
 from palpate.shared.compiled import bind
 from palpate.shared.reduced.points import STATE, project
@@ -129,56 +128,41 @@ def _newton(content, nodes, forces):
     return False, MAX_ITERATIONS
 
 
-class PlainNewton(Method):
+class PlainNewton(Galerkin):
     """A reduced model by Newton's method without a line search: every step is taken whole.
-
-    With the trial functions as test functions it is a Galerkin method.  The state is the modes'
-    coordinates.
 
     Parameters
     ----------
-    workshop : Workshop
-    unknowns : int
-    label : str
-    reduced : GalerkinModel
-        With its basis.
-    test : ndarray, shape (>= m, 9 c), float32
-        Gradients of the test functions, in the layout of those of the modes.
+    workshop, basis, cubature
+        See ``Galerkin``.
+    functions : ndarray, shape (3 nodes, m), mm, optional
+        Test functions; those of the basis if absent, which is Galerkin's method.
     """
 
     def __init__(
         self,
         workshop: Workshop,
-        unknowns: int,
-        label: str,
-        reduced: GalerkinModel,
-        test: NDArray[np.float32],
+        basis: Array,
+        cubature: Cubature | None = None,
+        functions: Array | None = None,
     ) -> None:
-        super().__init__(workshop, unknowns, label)
-        self._reduced = reduced
-        points = len(reduced.content.points.weights)
-        scratch = np.empty(STATE * points, np.float32), np.empty_like(test)
-        self._bound = bind(_Content(reduced.content, test, *scratch))
-
-    @classmethod
-    def galerkin(cls, workshop: Workshop, basis: Array) -> PlainNewton:
-        """Galerkin's method in a basis (free dofs, m), with every quadrature point."""
-        model, m = workshop.model, basis.shape[1]
-        reduced = GalerkinModel(model, m, Cubature.full(model))
-        reduced.adopt(basis)
-        return cls(workshop, m, "no line search", reduced, reduced.content.points.gradients)
+        super().__init__(workshop, basis, cubature)
+        self.label, points = "no line search", self.content.points
+        test = np.zeros_like(points.gradients)
+        if functions is None:
+            test[:] = points.gradients
+        else:
+            self.gradients_of(functions, test)
+        scratch = np.empty(STATE * len(points.weights), np.float32), np.empty_like(test)
+        self._plain = bind(_Content(self.content, test, *scratch))
 
     def step(self, state: Array | None, case: Case, dt: float = 0.0) -> Answer:
         """See ``Method``."""
         try:
-            converged, iterations = _newton(self._bound, case.nodes, case.forces)
+            converged, iterations = _newton(self._plain, case.nodes, case.forces)
         except np.linalg.LinAlgError:  # a singular tangent, or none that is finite
             converged, iterations = False, MAX_ITERATIONS
-        return Answer(self._reduced.state if converged else state, converged, iterations)
-
-    def field(self, state: Array) -> Array:
-        """See ``Method``."""
-        return self._reduced.displacement(state)
+        return Answer(self.state if converged else state, converged, iterations)
 
 
 class Deim(PlainNewton):
@@ -186,25 +170,19 @@ class Deim(PlainNewton):
 
     Parameters
     ----------
-    workshop : Workshop
     basis : ndarray, shape (free dofs, m), mm
         Orthonormal in the energy at rest.
     modes : ndarray, shape (free dofs, k)
         Of the force.
-    samples : Samples
     """
 
     def __init__(self, workshop: Workshop, basis: Array, modes: Array, samples: Samples) -> None:
-        model, unknowns = workshop.model, basis.shape[1]
-        touched = np.isin(model.connectivity, model.free[samples.dofs] // 3).any(axis=1)
+        model, dofs = workshop.model, workshop.model.free[samples.dofs]
+        touched = np.isin(model.connectivity, dofs // 3).any(axis=1)
         own = np.arange(model.weights.shape[1])
-        self.points = (len(own) * np.flatnonzero(touched)[:, None] + own).ravel()
-        weights = model.weights.ravel()[self.points]
-        reduced = GalerkinModel(model, unknowns, Cubature(self.points, weights))
-        reduced.adopt(basis)
-        functions = np.zeros((3 * len(model.mesh.nodes), unknowns))
-        functions[model.free[samples.dofs]] = (basis.T @ modes @ samples.fit).T
-        test = np.zeros_like(reduced.content.points.gradients)
-        point_gradients(model.connectivity, model.gradients, self.points, functions, test)
-        label = f"{unknowns} modes, {len(samples.dofs)} sampled dofs"
-        super().__init__(workshop, unknowns, label, reduced, test)
+        points = (len(own) * np.flatnonzero(touched)[:, None] + own).ravel()
+        functions = np.zeros((3 * len(model.mesh.nodes), basis.shape[1]))
+        functions[dofs] = (basis.T @ modes @ samples.fit).T
+        cubature = Cubature(points, model.weights.ravel()[points])
+        super().__init__(workshop, basis, cubature, functions)
+        self.label = f"{basis.shape[1]} modes, {len(dofs)} sampled dofs"

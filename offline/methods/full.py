@@ -15,12 +15,7 @@ Array = NDArray[np.float64]
 
 
 class Full(Method):
-    """Newton's method on every free degree of freedom, from the last answer.
-
-    Parameters
-    ----------
-    workshop : Workshop
-    """
+    """Newton's method on every free degree of freedom, from the last answer."""
 
     def __init__(self, workshop: Workshop) -> None:
         super().__init__(workshop, len(workshop.model.free), "full")

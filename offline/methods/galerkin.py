@@ -8,7 +8,7 @@ secants make up, from rest on elastic tissue and from the last answer on tissue 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -49,6 +49,7 @@ from palpate.shared.reduced.terms import Dead, Elastic
 from palpate.shared.reduced.workspace import new_work
 
 Array = NDArray[np.float64]
+Field = NDArray[np.float32]
 
 TOLERANCE = 1e-4
 """Residual at equilibrium relative to load and past, in the energy norm: the solver's share of the
@@ -168,17 +169,22 @@ def _step(content, nodes, forces, accurate):
     return status, iterations
 
 
-class GalerkinModel:
-    """The full model in the span of modes that can be exchanged; not to be shared by threads.
+class Galerkin(Method):
+    """One basis for the whole surface; not to be shared by threads.
+
+    The state is the coordinates of the modes, in time the record of what the tissue remembers
+    (``reduced.past``), which starts with them.
 
     Parameters
     ----------
-    model : FullModel
-    size : int
-        Most modes.
-    cubature : Cubature
+    basis : ndarray, shape (free dofs, m), mm
+        Orthonormal in the energy at rest.
+    cubature : Cubature, optional
+        Every quadrature point if absent, which in time it must be.
     in_time : bool
-        Whether the tissue remembers, at every point of the cubature.
+        Whether the tissue remembers, at every point.
+    accurate : float
+        See ``TOLERANCE``.
 
     Raises
     ------
@@ -187,13 +193,21 @@ class GalerkinModel:
     """
 
     def __init__(
-        self, model: FullModel, size: int, cubature: Cubature, in_time: bool = False
+        self,
+        workshop: Workshop,
+        basis: Array,
+        cubature: Cubature | None = None,
+        in_time: bool = False,
+        accurate: float = TOLERANCE,
     ) -> None:
+        model, m = workshop.model, basis.shape[1]
         if model.element not in POINTWISE:
             raise ValueError(f"{model.element}: its points share a dilatation")
-        self.points, self._model = cubature.points, model
+        cubature = cubature or Cubature.full(model)
+        self.points, self._accurate = cubature.points, accurate
+        super().__init__(workshop, m, f"{m} modes, {len(self.points)} points")
         element = self.points // model.weights.shape[1]
-        rows, count = -(-size // 4) * 4, -(-len(self.points) // LANES) * LANES
+        rows, count = -(-m // 4) * 4, -(-len(self.points) // LANES) * LANES
         fill = (0, count - len(self.points))
         points = Points(
             gradients=np.zeros((rows, TILE // LANES * count), np.float32),
@@ -216,79 +230,82 @@ class GalerkinModel:
             newton=np.zeros((4, rows)),
         )
         self._bound = bind(self.content)
+        self.adopt(basis)
 
     def adopt(self, basis: Array) -> None:
-        """Take a basis (free dofs, <= size) that is orthonormal in the energy at rest."""
-        model, m, content = self._model, basis.shape[1], self.content
+        """Take another basis of no more modes."""
+        model, m, content = self.workshop.model, basis.shape[1], self.content
         content.modes[model.free, :m] = basis
         content.modes[:, m:] = 0.0
         content.points.gradients[m:] = 0.0
-        point_gradients(
-            model.connectivity, model.gradients, self.points, content.modes[:, :m].copy(),
-            content.points.gradients,
-        )  # fmt: skip
+        self.gradients_of(content.modes[:, :m].copy(), content.points.gradients)
         if isinstance(content.past, Remembering):
             soft = basis.T @ (deviatoric_stiffness(model) @ basis)
             content.past.deviatoric[0, :m, :m] = soft
 
+    def gradients_of(self, functions: Array, out: Field) -> None:
+        """Write the gradients of displacements (3 nodes, m) mm at the points."""
+        model = self.workshop.model
+        point_gradients(model.connectivity, model.gradients, self.points, functions, out)
+
     def at_rest(self) -> Array | None:
-        """Record of tissue that remembers nothing yet; the next search knows no secants."""
-        self._forget()
-        past = self.content.past
+        """See ``Method``; the next search knows no secants."""
+        secants, past = self.content.secants, self.content.past
+        forget_secants(secants.inverse, secants.origin)
         if not isinstance(past, Remembering):
             return None
         record = np.zeros_like(past.records[0])
         self.opened(record).share[-1] = 1.0
         return record
 
-    def _forget(self) -> None:
-        forget_secants(self.content.secants.inverse, self.content.secants.origin)
-
-    def solve(
-        self, case: Case, state: Array | None = None, dt: float = 0.0, accurate: float = TOLERANCE
-    ) -> tuple[bool, int]:
-        """Whether there is an equilibrium ``dt`` (s) after a state, and the iterations made."""
-        past = self.content.past
+    def step(self, state: Array | None, case: Case, dt: float = 0.0) -> Answer:
+        """See ``Method``."""
+        past, prony = self.content.past, self.workshop.model.prony
         if isinstance(past, Remembering):
-            for own, weights in zip(past.time, step_weights(self._model.prony, dt), strict=True):
+            for own, weights in zip(past.time, step_weights(prony, dt), strict=True):
                 own[:] = weights
             past.records[0] = state
         else:
-            self._forget()
-        status, iterations = _step(self._bound, case.nodes, case.forces, accurate)
-        return status == newton.CONVERGED, iterations
+            self.at_rest()
+        status, iterations = _step(self._bound, case.nodes, case.forces, self._accurate)
+        converged = status == newton.CONVERGED
+        return Answer(self.state if converged else state, converged, iterations)
 
     @property
     def state(self) -> Array:
-        """The last answer: coordinates of the modes, on tissue that remembers as its record."""
+        """The last answer."""
         past = self.content.past
-        in_time = isinstance(past, Remembering)
-        return (past.records[0] if in_time else self.content.q).copy()
+        return (past.records[0] if isinstance(past, Remembering) else self.content.q).copy()
 
-    def displacement(self, state: Array) -> Array:
-        """Nodal displacement (n, 3) mm."""
-        modes = self.content.modes  # a record starts with the coordinates
+    def field(self, state: Array) -> Array:
+        """See ``Method``."""
+        modes = self.content.modes
         return (modes @ state[: modes.shape[1]]).reshape(-1, 3)
+
+    def von_mises(self, state: Array | None) -> Array:
+        """See ``Method``."""
+        if state is None or not isinstance(self.content.past, Remembering):
+            return super().von_mises(state)
+        return self.workshop.von_mises_after(self.history(state))
 
     def opened(self, record: Array) -> Memory:
         """Views of a record."""
         points = self.content.points
-        memory: Memory = opened(
-            record, len(self._model.prony), len(points.gradients), len(points.weights)
-        )
+        sizes = len(self.workshop.model.prony), len(points.gradients), len(points.weights)
+        memory: Memory = opened(record, *sizes)
         return memory
 
     def history(self, record: Array) -> History:
         """A record as the full model's history, without the means that only energies need."""
-        elements, own = self._model.weights.shape
+        elements, own = self.workshop.model.weights.shape
         histories = self.opened(record).points
         terms = len(histories)
         tiles = histories.reshape(terms, -1, SYMMETRIC, LANES).transpose(0, 1, 3, 2)
         points = tiles.reshape(terms, -1, SYMMETRIC)[:, : elements * own].astype(float)
-        return History(self.displacement(record), points.reshape(terms, elements, own, SYMMETRIC))
+        return History(self.field(record), points.reshape(terms, elements, own, SYMMETRIC))
 
     def tangent(self, q: Array) -> Array:
-        """Tangent (r, r) at coordinates."""
+        """Tangent (r, r) of elastic tissue at coordinates."""
         points = self.content.points
         products = np.empty_like(points.gradients)
         stress_points(self._bound, q)
@@ -296,65 +313,13 @@ class GalerkinModel:
         return np.eye(len(q)) + points.gradients @ products.T
 
 
-class Galerkin(Method):
-    """One basis for the whole surface; see ``GalerkinModel.state``.
-
-    Parameters
-    ----------
-    workshop : Workshop
-    basis : ndarray, shape (free dofs, m), mm
-        Orthonormal in the energy at rest.
-    cubature : Cubature, optional
-        Every quadrature point if absent, which in time it must be.
-    in_time : bool
-        Whether the tissue remembers.
-    accurate : float
-        See ``TOLERANCE``.
-    """
-
-    def __init__(
-        self,
-        workshop: Workshop,
-        basis: Array,
-        cubature: Cubature | None = None,
-        in_time: bool = False,
-        accurate: float = TOLERANCE,
-    ) -> None:
-        model, m = workshop.model, basis.shape[1]
-        cubature = cubature or Cubature.full(model)
-        super().__init__(workshop, m, f"{m} modes, {len(cubature.points)} points")
-        self.reduced = GalerkinModel(model, m, cubature, in_time)
-        self.reduced.adopt(basis)
-        self._in_time, self._accurate = in_time, accurate
-
-    def at_rest(self) -> Array | None:
-        """See ``Method``."""
-        return self.reduced.at_rest()
-
-    def step(self, state: Array | None, case: Case, dt: float = 0.0) -> Answer:
-        """See ``Method``."""
-        converged, iterations = self.reduced.solve(case, state, dt, self._accurate)
-        return Answer(self.reduced.state if converged else state, converged, iterations)
-
-    def field(self, state: Array) -> Array:
-        """See ``Method``."""
-        return self.reduced.displacement(state)
-
-    def von_mises(self, state: Array | None) -> Array:
-        """See ``Method``."""
-        if state is None or not self._in_time:
-            return super().von_mises(state)
-        return self.workshop.von_mises_after(self.reduced.history(state))
-
-
-class GalerkinAtHand(Method):
+class GalerkinAtHand(Galerkin):
     """A basis made for each case while the user waits, with every quadrature point.
 
     The state is the basis and the coordinates in it.
 
     Parameters
     ----------
-    workshop : Workshop
     size : int
         Most vectors of a basis.
     space : callable
@@ -362,21 +327,21 @@ class GalerkinAtHand(Method):
     """
 
     def __init__(self, workshop: Workshop, size: int, space: Callable[[Case], Array]) -> None:
-        super().__init__(workshop, size, f"{size} vectors of the load at hand")
-        self._reduced = GalerkinModel(workshop.model, size, Cubature.full(workshop.model))
-        self._space, self._free = space, workshop.model.free
+        super().__init__(workshop, np.zeros((len(workshop.model.free), size)))
+        self._space, self.label = space, f"{size} vectors of the load at hand"
 
-    def step(self, state: tuple[Array, Array] | None, case: Case, dt: float = 0.0) -> Answer:
+    def step(self, state: Any, case: Case, dt: float = 0.0) -> Answer:
         """See ``Method``."""
-        basis = self._space(case) if case.forces.any() else np.empty((len(self._free), 0))
-        self._reduced.adopt(basis)
-        converged, iterations = self._reduced.solve(case)
-        found = basis, self._reduced.state[: basis.shape[1]]
-        return Answer(found if converged else state, converged, iterations)
+        free = self.workshop.model.free
+        basis = self._space(case) if case.forces.any() else np.empty((len(free), 0))
+        self.adopt(basis)
+        answer = super().step(None, case)
+        found = basis, self.state[: basis.shape[1]]
+        return replace(answer, state=found if answer.converged else state)
 
-    def field(self, state: tuple[Array, Array]) -> Array:
+    def field(self, state: Any) -> Array:
         """See ``Method``."""
         basis, q = state
         u = np.zeros(self.workshop.mesh.nodes.size)
-        u[self._free] = basis @ q
+        u[self.workshop.model.free] = basis @ q
         return u.reshape(-1, 3)

@@ -45,7 +45,6 @@ class MassSpring(Relaxed):
 
     Parameters
     ----------
-    workshop : Workshop
     divisions : tuple of 3 int
         Cells along the axes of the scene's lattice; see ``offline.methods.lattice``.
 

@@ -26,7 +26,6 @@ class Case:
 
     Attributes
     ----------
-    contacts : tuple of Load
     nodes : ndarray, shape (k,), int
         The loaded nodes.
     forces : ndarray, shape (k, 3), mN
@@ -93,7 +92,6 @@ class Answer:
         step starts from it.  Without an answer, the state before the step.
     converged : bool
         Whether the method reports an answer at all.
-    iterations : int
     doubted : bool
         Whether the method says that the answer may be wrong.  Most cannot tell.
     refused : bool

@@ -67,7 +67,6 @@ class Linear(_InModes):
 
     Parameters
     ----------
-    workshop : Workshop
     basis : ndarray, shape (free dofs, m), mm
         The leading modes of ``compliance``.
     """
@@ -156,10 +155,8 @@ class Regression(_InModes):
 
     Parameters
     ----------
-    workshop : Workshop
     basis : ndarray, shape (free dofs, m), mm
         Orthonormal in the energy at rest.
-    snapshots : Snapshots
     """
 
     def __init__(self, workshop: Workshop, basis: Array, snapshots: Snapshots) -> None:

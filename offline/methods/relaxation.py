@@ -63,11 +63,8 @@ class Relaxed(Method):
 
     Parameters
     ----------
-    workshop : Workshop
-    mesh : Tetrahedra
     elements : ndarray, shape (t, 4), int
         Tetrahedra whose edges join the points that act on each other.
-    label : str
 
     Attributes
     ----------
@@ -199,7 +196,7 @@ class Stencil:
         return 0.5 * float(np.vdot(x, y))
 
     def solve(self, load: Array, fraction: float, most: int, out: Array) -> int:
-        """Solve for a displacement by conjugate gradients.
+        """Solve for a displacement by conjugate gradients; return the iterations made.
 
         Parameters
         ----------
@@ -210,10 +207,6 @@ class Stencil:
             Iterations.
         out : ndarray, shape (3, f), mm, out
             A descent direction even where the tangent is not definite.
-
-        Returns
-        -------
-        iterations : int
         """
         return conjugate_gradients(
             self.neighbours, self.lengths, self.tensors, self._inverse, load, fraction, most, out,
@@ -221,21 +214,12 @@ class Stencil:
         )  # fmt: skip
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def relax(body: Relaxed, load: Array, tolerance: float) -> Rest:
-    """Bring a body to rest under a dead load, from no displacement.
+    """Bring a body to rest under a dead load (3, m) mN, from no displacement.
 
-    Parameters
-    ----------
-    body : Relaxed
-    load : ndarray, shape (3, m), mN
-    tolerance : float
-        Residual at which the body counts as at rest; see ``Rest``.
+    It counts as at rest with a residual of ``tolerance``; see ``Rest``.
     """
-    with np.errstate(over="ignore", invalid="ignore"):
-        return _relax(body, load, tolerance)
-
-
-def _relax(body: Relaxed, load: Array, tolerance: float) -> Rest:
     free = body.stencil.free
     u, trial, step = np.zeros_like(load), np.zeros_like(load), np.zeros((3, free))
     force, trial_force = np.zeros_like(load), np.zeros_like(load)

@@ -27,8 +27,6 @@ class Shipped(Method):
 
     Parameters
     ----------
-    workshop : Workshop
-    atlas : ReducedModel
     way : {"cold", "warm", "in time", "tip"}
         Elastic tissue, every answer from scratch or from the last one; steps in time of
         visco-elastic tissue under footprints, or under the rigid tip, whose centre a case tells.

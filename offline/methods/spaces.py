@@ -82,7 +82,6 @@ def krylov(model: FullModel, M: csr_matrix, loads: Array, size: int) -> Array:
 
     Parameters
     ----------
-    model : FullModel
     M : csr_matrix, shape (free dofs, free dofs)
     loads : ndarray, shape (free dofs, b)
     size : int
@@ -127,10 +126,8 @@ def static_derivatives(model: FullModel, loads: Array, size: int) -> Array:
 
     Parameters
     ----------
-    model : FullModel
     loads : ndarray, shape (free dofs, 3), mN
         Scaled to the loads expected.
-    size : int
     """
     return energy_pod(model, ritz_vectors(model, loads), size)[0]
 
@@ -145,9 +142,7 @@ def pod(
 
     Parameters
     ----------
-    model : FullModel
     displacements : ndarray, shape (k, 3 n), mm
-    size : int
     inner : {"energy", "euclidean"}
         Product in which the modes are best; the modes come back orthonormal in the energy anyhow.
     """

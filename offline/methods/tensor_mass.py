@@ -32,7 +32,6 @@ class TensorMass(Relaxed):
 
     Parameters
     ----------
-    workshop : Workshop
     divisions : tuple of 3 int
         Cells along the axes of the scene's lattice, five tetrahedra each; see
         ``offline.methods.lattice``.

@@ -30,10 +30,8 @@ def continuity(
 
     Parameters
     ----------
-    artifact : Path
     paths, steps : int
         Paths over the surface, and steps of 0.05 mm along each.
-    seed : int
     tip : bool
         Glide with a rigid tip instead of a footprint.
 

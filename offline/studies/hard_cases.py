@@ -143,12 +143,10 @@ class HardLoads:
 
     Parameters
     ----------
-    atlas : ReducedModel
     workshop : Workshop
         Of the artifact's mesh.
     count : int
         Cases of each kind.
-    seed : int
     """
 
     def __init__(self, atlas: ReducedModel, workshop: Workshop, count: int, seed: int) -> None:

@@ -94,7 +94,6 @@ def classify(
 
     Parameters
     ----------
-    workshop : Workshop
     found : Fields, optional
         The answer; None if the method has none.
     trusted : bool

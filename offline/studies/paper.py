@@ -93,7 +93,6 @@ class Example:
 
     Attributes
     ----------
-    workshop : Workshop
     load : ndarray, shape (n, 3), mN
         At its greatest.
     pressure : float, kPa
@@ -180,7 +179,6 @@ def compare(
 
     Parameters
     ----------
-    example : Example
     report : Path
         Folder to write ``paper_NAME.csv`` (a row per method and number of bases) and
         ``paper_NAME.png`` (figures 1a and 1b) to.

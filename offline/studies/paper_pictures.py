@@ -77,7 +77,6 @@ def contours(path: Path, mesh: Mesh, errors: dict[str, Array], at: Array, radius
     ----------
     path : Path
         PNG.
-    mesh : Mesh
     errors : dict of ndarray, shape (n,)
         Relative errors; nan is drawn grey: no displacement, or stress cut off at zero.
     at : ndarray, shape (3,), mm

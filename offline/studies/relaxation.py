@@ -38,7 +38,6 @@ def relaxation(artifact: Path, position: Sequence[float] | None = None) -> dict[
 
     Parameters
     ----------
-    artifact : Path
     position : sequence of 3 floats, mm, optional
         The middle of the surface if absent.
 

@@ -132,7 +132,6 @@ def stability(
         ``stability.png``; ``stability_silent.csv``, the artifact's silent errors.
     cases : int
         Of each kind.
-    seed : int
     methods, kinds : sequence of str, optional
         Only these of ``METHODS``, and only these kinds; all if absent.
     learnt : int
@@ -209,7 +208,6 @@ def stability_in_time(
         ``stability_in_time.csv`` and ``.png``.
     cases : int
         Places in which each kind is tried.
-    seed : int
     many : int
         Steps of the longest history.
     methods, kinds : sequence of str, optional

@@ -88,14 +88,12 @@ def histories(
 
     Parameters
     ----------
-    atlas : ReducedModel
     workshop : Workshop
         Of the artifact's mesh.
     tip : bool
         With the rigid tip instead of footprints.
     cases : int
         Places.
-    seed : int
     many : int
         Steps of the longest; these are tried in one place.
     """

@@ -60,7 +60,7 @@ def test_a_basis_that_holds_the_history_finds_it(workshop, cases, exact, in_its_
 
 
 def test_it_remembers_at_the_points_what_the_full_model_does(cases, exact, in_its_own_modes):
-    found = in_its_own_modes.reduced.history(states(in_its_own_modes, cases)[4]).points[..., :6]
+    found = in_its_own_modes.history(states(in_its_own_modes, cases)[4]).points[..., :6]
     true = exact[4].points[..., :6]
     np.testing.assert_allclose(found, true, atol=1e-3 * np.abs(true).max())
 
@@ -69,8 +69,8 @@ def test_few_modes_are_stiffer_and_a_step_changes_no_state(workshop, cases, exac
     method = Galerkin(workshop, modal(workshop.model, 6), in_time=True)
     first = method.at_rest()
     second = method.step(first, cases[0], 0.02).state
-    assert not method.reduced.opened(first).q.any()
-    assert method.reduced.opened(second).q.any()
+    assert not method.opened(first).q.any()
+    assert method.opened(second).q.any()
     held, true = states(method, cases)[3], exact[3]
     work = [np.vdot(u[cases[3].nodes], cases[3].forces) for u in
             (method.displacement(held), true.displacement)]  # fmt: skip
