@@ -23,7 +23,6 @@ answers at once, and show what memory costs.
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -32,12 +31,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from palpate.offline.methods.catalogue import Training, build
 from palpate.offline.methods.full import Remeshed
 from palpate.offline.methods.method import Method, Snapshots, Steps
 from palpate.offline.methods.shipped import Shipped
-from palpate.offline.run.checkpoint import Checkpoint, content_key
+from palpate.offline.run.checkpoint import Checkpoint
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.workers import resume, worker_pool
 from palpate.offline.run.workshop import Workshop, open_artifact
@@ -56,6 +56,7 @@ from palpate.offline.studies.chart_drawing import (
 from palpate.offline.studies.references import (
     Fields,
     full_histories,
+    kept_results,
     random_steps,
     refined,
     snapshots,
@@ -160,22 +161,24 @@ def chart(
         raise QueryError("scene", f"{atlas.name!r} is elastic: it has no histories")
     if scene is not None and atlas.scene.text != scene.text:
         raise PalpateError(f"{artifact}: trained on another scene than {scene.name!r}")
-    sha = hashlib.sha256(artifact.read_bytes() + b"%d" % seed).hexdigest()[:16]
-    key = f"{content_key(scene or atlas.scene)}-{sha}"
-    checkpoint = Checkpoint(artifact.parent / f".{artifact.stem}.{layout.name}", key)
+    settings = snapshots, queries, seed
+    checkpoint = kept_results(artifact, scene or atlas.scene, layout.name, settings)
     workshop = Workshop.of_artifact(read_artifact(artifact))
     plan = plan or (PLAN_IN_TIME if scene is None else PLAN)
     if scene is not None:
         plan = {**plan, "pod": sorted({*plan["pod"], Shipped(workshop, atlas).unknowns})}
-    references = _solved(atlas, workshop, artifact, scene, (snapshots, queries, seed), checkpoint)
-    tasks = {
-        f"{method} {size:g}": (measure, method, size)
-        for method, sizes in plan.items()
-        for size in sizes
-    }
-    # one process: times are those of one core, and methods share what they learn from
-    with worker_pool(open_bench, artifact, scene, references, seed, count=1) as worker:
-        measured = resume("methods", worker, checkpoint, tasks, dict)
+    references = _solved(atlas, workshop, artifact, scene, settings, checkpoint)
+    training = Training(workshop, references.snapshots, atlas, seed, scene, in_time=scene is None)
+    measured: dict[str, Mapping[str, Any]] = {}
+    # in this process: times are those of one core, and methods share what they learn from
+    for name, size in tqdm([(name, size) for name, sizes in plan.items() for size in sizes]):
+        key = f"{name} {size:g}"
+        kept = checkpoint.load(key)
+        if kept is None:
+            found = measure(training, references, name, size)
+            kept = {part: np.asarray(value) for part, value in found.items()}
+            checkpoint.store(key, kept)
+        measured[key] = kept
     usual = float(np.median([np.median(found["beside"]) for found in measured.values()]))
     rows = [_row(key, found, usual) for key, found in measured.items()]
     report = artifact.parent / atlas.name / "report"
@@ -196,23 +199,20 @@ def _solved(
 ) -> References:
     """Full solutions of as many snapshots and queries as the settings say, with their seed."""
     *counts, seed = settings
-    histories = {
-        f"{stage.name} {i}": steps
-        for stage, count in zip((Stage.SNAPSHOTS, Stage.UNSEEN), counts, strict=True)
-        for i, steps in enumerate(
-            random_steps(
-                atlas, workshop, count, stream(atlas.scene.seed, stage, seed), scene is None
-            )
-        )
-    }
+    stages = {"snapshot": Stage.SNAPSHOTS, "query": Stage.UNSEEN}
+    histories: dict[str, Steps] = {}
+    for (name, stage), count in zip(stages.items(), counts, strict=True):
+        rng = stream(atlas.scene.seed, stage, seed)
+        for i, steps in enumerate(random_steps(atlas, workshop, count, rng, scene is None)):
+            histories[f"{name} {i}"] = steps
     with worker_pool(open_artifact, artifact) as pool:
         found = full_histories(histories, pool, checkpoint)
-        learnt = {name: own for name, own in found.items() if name.startswith("SNAPSHOTS")}
+        learnt = {name: own for name, own in found.items() if name.startswith("snapshot")}
         queries = [(histories[name], own) for name, own in found.items() if name not in learnt]
         if not queries:
             raise PalpateError(f"{artifact}: the full model could follow none of the queries")
         tasks = {
-            f"refined-{len(queries)}-{i}": (refined, scene, REFINEMENT, steps[0][0].contacts[0])
+            f"refined {i}": (refined, scene, REFINEMENT, steps[0][0].contacts[0])
             for i, (steps, _) in enumerate(queries[:REFINED_LOADS])
             if scene is not None
         }
@@ -224,24 +224,11 @@ def _solved(
     )
 
 
-# --- in the worker that measures -----------------------------------------------------------------
+# --- measuring -----------------------------------------------------------------------------------
 
 
-_bench: tuple[Training, References] | None = None
-
-
-def open_bench(artifact: Path, scene: Scene | None, references: References, seed: int) -> None:
-    """Initialize the process that measures."""
-    global _bench
-    open_artifact(artifact)
-    workshop = Workshop.of_artifact(read_artifact(artifact))
-    atlas = ReducedModel.load(artifact)
-    training = Training(workshop, references.snapshots, atlas, seed, scene, in_time=scene is None)
-    _bench = training, references
-
-
-def measure(workshop: Workshop, name: str, size: float) -> dict[str, Any]:
-    """Build a method and have it answer the queries; a task for ``run.workers``.
+def measure(training: Training, references: References, name: str, size: float) -> dict[str, Any]:
+    """Build a method and have it answer the queries.
 
     Returns
     -------
@@ -249,8 +236,7 @@ def measure(workshop: Workshop, name: str, size: float) -> dict[str, Any]:
         ``unknowns``, ``label``; per query ``displacement``, ``von_mises``, ``refined`` (errors) and
         ``converged``; per step that presses ``times`` (s) and ``beside`` (s), the artifact's times.
     """
-    assert _bench is not None
-    training, references = _bench
+    workshop = training.workshop
     method, yardstick = build(name, size, training), build("artifact", 1, training)
     queries, finer = references.queries, references.refined
     if isinstance(method, Remeshed):

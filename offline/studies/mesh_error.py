@@ -37,6 +37,9 @@ MAX_PRESSURE = 5.0
 """kPa. Beyond it hex20 elements of the reference's size buckle inwardly between their 2x2x2 points
 (det F < 0 at 3x3x3 points), which neither mean dilatation nor full quadrature confirms."""
 
+PRESSURE_STEP = 0.5
+"""kPa, along the load path."""
+
 VALUES = {"hex8": 9, "hex8-mean-dilatation": 72, "hex8-fbar": 18, "hex20": 9}
 """Displacement gradients (9 numbers each) that one sample of a cubature needs: a point its own,
 with F-bar the element's mean beside it, with mean dilatation all eight of the element."""
@@ -78,13 +81,8 @@ CANDIDATES = (
 )
 
 
-class Contact(NamedTuple):
-    """A contact point with its outward normal, local thickness (mm) and pressure (kPa)."""
-
-    position: Array
-    normal: Array
-    thickness: float
-    pressure: float
+Contact = tuple[Array, Array, float, float]
+"""A contact point with its outward normal, local thickness (mm) and pressure (kPa)."""
 
 
 def press(
@@ -100,24 +98,16 @@ def contacts(reference: Workshop, probe: Workshop) -> list[Contact]:
     """Contact points all over the reference's surface, with the pressures that ``probe`` needs."""
     surface, found = reference.surface, []
     for point in spread_points(surface, POINTS, np.random.default_rng(reference.scene.seed)):
-        position, normal, _ = surface.project(point)
-        (thickness,) = local_thickness(reference.mesh, position[None], normal[None])
-        pressure = _pressure(probe, position, normal, INDENTATION * thickness)
-        found.append(Contact(position, normal, float(thickness), pressure))
+        x, normal, _ = surface.project(point)
+        (thickness,) = local_thickness(reference.mesh, x[None], normal[None])
+        target, before, pressure, under, u = INDENTATION * thickness, 0.0, 0.0, 0.0, None
+        while under < target and pressure < MAX_PRESSURE:
+            before, pressure = under, pressure + PRESSURE_STEP
+            _, under, u = press(probe, x, normal, pressure, u)
+        if under > target:
+            pressure -= PRESSURE_STEP * (under - target) / (under - before)
+        found.append((x, normal, float(thickness), pressure))
     return found
-
-
-def _pressure(
-    body: Workshop, position: Array, normal: Array, target: float, step: float = 0.5
-) -> float:
-    """Pressure (kPa) that first moves the footprint by ``target`` (mm), along the load path."""
-    before, pressure, under, start = 0.0, 0.0, 0.0, None
-    while under < target:
-        if pressure == MAX_PRESSURE:
-            return pressure
-        before, pressure = under, pressure + step
-        _, under, start = press(body, position, normal, pressure, start)
-    return pressure - step * (under - target) / (under - before)
 
 
 def mesh_error(report: Path) -> dict[str, Any]:
@@ -141,7 +131,7 @@ def mesh_error(report: Path) -> dict[str, Any]:
     moved: dict[str, Array] = {}
     for how in tqdm((REFERENCE, *SECOND_OPINIONS, *CANDIDATES), desc="meshes"):
         body, name = how.body(), str(how)
-        moved[name] = np.array([press(body, x.position, x.normal, x.pressure)[:2] for x in loads])
+        moved[name] = np.array([press(body, x, n, pressure)[:2] for x, n, _, pressure in loads])
         error = moved[name] / moved[str(REFERENCE)] - 1
         rows[name] = {
             "dofs": body.mesh.nodes.size,
@@ -155,12 +145,12 @@ def mesh_error(report: Path) -> dict[str, Any]:
     write_csv(report / "mesh_error.csv", [{"mesh": name} | row for name, row in rows.items()])
     exact = moved[str(REFERENCE)]
     errors = {name: own[:, 0] / exact[:, 0] - 1 for name, own in moved.items()}
-    names = "x_mm", "y_mm", "z_mm", "thickness_mm", "pressure_kPa", "largest_mm"
     table = [
-        dict(zip(names, (*x.position.tolist(), x.thickness, x.pressure, exact[i, 0]), strict=True))
-        | {"under_footprint_mm": exact[i, 1]}
+        dict(zip(("x_mm", "y_mm", "z_mm"), x.tolist(), strict=True))
+        | {"thickness_mm": thickness, "pressure_kPa": pressure}
+        | {"largest_mm": exact[i, 0], "under_footprint_mm": exact[i, 1]}
         | {name: error[i] for name, error in errors.items()}
-        for i, x in enumerate(loads)
+        for i, (x, _, thickness, pressure) in enumerate(loads)
     ]
     write_csv(report / "mesh_error_points.csv", table)
     _draw(report / "mesh_error.png", errors)

@@ -21,6 +21,9 @@ from palpate.offline.studies.hard_cases import CONTROL
 from palpate.offline.studies.references import Fields
 from palpate.offline.studies.tables import write_csv
 
+MIDDLE = -0.12
+"""Position of the bar in a cell of the map: above the middle."""
+
 ROUGHLY = 0.1
 """Displacement error up to which a wrong answer is roughly right; the artifact is nearly the only
 method within the tolerance of a scene."""
@@ -208,8 +211,16 @@ def _draw(
     size = 3.2 + 0.72 * len(columns), 2.8 + 0.44 * len(methods)
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.add_subplot()
-    for row in rows:
-        _draw_cell(axes, columns.index(row["stressor"]), methods.index(row["method"]), row)
+    left = np.array([columns.index(row["stressor"]) - 0.45 for row in rows])
+    y = np.array([methods.index(row["method"]) + MIDDLE for row in rows])
+    axes.barh(y, 0.9, 0.46, left, fill=False, edgecolor="0.4", linewidth=0.5, zorder=2)
+    for row, x, middle in zip(rows, left + 0.45, y, strict=True):
+        text = _percent(row["displacement_median"])
+        axes.text(x, middle - MIDDLE + 0.25, text, ha="center", va="center", size=8)
+    for outcome, colour in OUTCOMES.items():
+        width = np.array([0.9 * row[outcome] / row["cases"] for row in rows])
+        axes.barh(y, width, 0.46, left, color=colour, linewidth=0)
+        left += width
     axes.set_xticks(range(len(columns)), columns, rotation=40, ha="left", rotation_mode="anchor")
     axes.xaxis.tick_top()
     axes.set_yticks([y + MIDDLE for y in range(len(methods))], methods)
@@ -227,27 +238,10 @@ def _draw(
     figure.savefig(path, dpi=100)
 
 
-MIDDLE = -0.12
-"""Position of the bar in a cell: above the middle of the cell."""
-
-
-def _draw_cell(axes: Any, x: int, y: int, row: Mapping[str, Any]) -> None:
-    """One cell of the map, a unit wide."""
-    left, cases = x - 0.45, int(row["cases"])
-    for outcome, colour in OUTCOMES.items():
-        width = 0.9 * int(row[outcome]) / cases
-        axes.barh(y + MIDDLE, width, 0.46, left, color=colour, linewidth=0)
-        left += width
-    axes.barh(y + MIDDLE, 0.9, 0.46, x - 0.45, fill=False, edgecolor="0.4", linewidth=0.5)
-    axes.text(x, y + 0.25, _percent(row["displacement_median"]), ha="center", va="center", size=8)
-
-
 def _percent(error: float) -> str:
     """Two digits for people; a dash where there is no answer."""
-    percent = 100 * error
-    if np.isnan(percent):
+    if np.isnan(error):
         return "–"
-    if not 0.01 <= percent < 1000:
-        return "< 0.01 %" if percent < 0.01 else "> 999 %"
-    digits = 0 if percent > 9.95 else 1 if percent > 0.095 else 2
-    return f"{percent:.{digits}f} %"
+    if not 1e-4 < error < 10:
+        return "< 0.01 %" if error < 1 else "> 999 %"
+    return f"{100 * error:{'.0f' if error > 0.0995 else '.2g'}} %"

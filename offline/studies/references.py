@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +13,7 @@ from numpy.typing import NDArray
 
 from palpate.offline.methods.full import Remeshed
 from palpate.offline.methods.method import Case, Method, Snapshots, Steps
-from palpate.offline.run.checkpoint import Checkpoint
+from palpate.offline.run.checkpoint import Checkpoint, content_key
 from palpate.offline.run.workers import resume
 from palpate.offline.run.workshop import Load, Workshop
 from palpate.offline.validate.histories import loads_of, random_histories
@@ -49,6 +51,12 @@ class Fields(NamedTuple):
         kept = workshop.beyond_clamped_layer
         u, s = (field.astype(float) for field in exact)
         return relative(self.displacements, u), relative(self.stresses[:, kept], s[:, kept])
+
+
+def kept_results(artifact: Path, scene: Scene, name: str, settings: object) -> Checkpoint:
+    """What a killed study goes on from: named by all that its results depend on."""
+    sha = hashlib.sha256(artifact.read_bytes() + str(settings).encode()).hexdigest()[:16]
+    return Checkpoint(artifact.parent / f".{artifact.stem}.{name}", f"{content_key(scene)}-{sha}")
 
 
 def random_steps(

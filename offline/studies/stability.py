@@ -13,7 +13,6 @@ under a moving tool.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -27,7 +26,7 @@ from tqdm import tqdm
 
 from palpate.offline.methods.catalogue import Training, build
 from palpate.offline.methods.method import Case, Method, Snapshots, Steps
-from palpate.offline.run.checkpoint import Checkpoint, content_key
+from palpate.offline.run.checkpoint import Checkpoint
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.workers import worker_pool
 from palpate.offline.run.workshop import Workshop, open_artifact
@@ -53,7 +52,13 @@ from palpate.offline.studies.outcomes import (
     publish,
     summaries,
 )
-from palpate.offline.studies.references import Fields, full_histories, random_steps, snapshots
+from palpate.offline.studies.references import (
+    Fields,
+    full_histories,
+    kept_results,
+    random_steps,
+    snapshots,
+)
 from palpate.offline.studies.tables import write_csv
 from palpate.offline.studies.trajectories import histories
 from palpate.offline.validate.loads import random_loads
@@ -155,7 +160,8 @@ def stability(
     )  # fmt: skip
     given = [Case.of(workshop, load) for load in loads]
     learning = {f"snapshots {p:g}": [HardCase(((x, 0.0),), p) for x in given] for p in tissues}
-    checkpoint = _checkpoint(artifact, atlas, "stability", cases, seed, learnt, list(chosen))
+    settings = cases, seed, learnt, list(chosen)
+    checkpoint = kept_results(artifact, atlas.scene, "stability", settings)
     with worker_pool(open_artifact, artifact) as pool:
         found = all_equilibria({**chosen, **learning}, pool, checkpoint)
     pairs = {name: found[name] for name in chosen}
@@ -232,9 +238,8 @@ def stability_in_time(
         for name, own in histories(atlas, workshop, tip, cases, seed, many).items()
         if kinds is None or name in kinds
     }
-    checkpoint = _checkpoint(
-        artifact, atlas, "stability_in_time", cases, seed, many, learnt, kinds, with_tip
-    )
+    settings = cases, seed, many, learnt, list(hard)
+    checkpoint = kept_results(artifact, atlas.scene, "stability_in_time", settings)
     tasks: dict[str, Steps] = {
         f"{tip} {name} {i}": case.brief or case.steps
         for (tip, name), own in hard.items()
@@ -263,13 +268,6 @@ def stability_in_time(
     publish(artifact.parent / atlas.name / "report", "stability_in_time", table, names, asked)
     checkpoint.remove()
     return summaries(table)
-
-
-def _checkpoint(artifact: Path, atlas: ReducedModel, name: str, *settings: object) -> Checkpoint:
-    """What a killed run goes on from: named by all that results depend on."""
-    sha = hashlib.sha256(artifact.read_bytes() + str(settings).encode()).hexdigest()[:16]
-    folder = artifact.parent / f".{artifact.stem}.{name}"
-    return Checkpoint(folder, f"{content_key(atlas.scene)}-{sha}")
 
 
 # --- what is asked -------------------------------------------------------------------------------
