@@ -41,26 +41,10 @@ from palpate.offline.run.checkpoint import Checkpoint
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.workers import resume, worker_pool
 from palpate.offline.run.workshop import Workshop, open_artifact
-from palpate.offline.studies.chart_drawing import (
-    FIELDS,
-    IN_TIME,
-    OF_LOADS,
-    SHIPPED,
-    STATISTICS,
-    TWIN,
-    Row,
-    draw,
-    pareto,
-    write_page,
-)
-from palpate.offline.studies.references import (
-    Fields,
-    full_histories,
-    kept_results,
-    random_steps,
-    refined,
-    snapshots,
-)
+from palpate.offline.studies import chart_drawing as drawing
+from palpate.offline.studies import references as full
+from palpate.offline.studies.chart_drawing import SHIPPED, TWIN, Row
+from palpate.offline.studies.references import Fields
 from palpate.offline.studies.tables import write_csv
 from palpate.offline.validate.norms import relative
 from palpate.shared.artifact import read_artifact
@@ -156,13 +140,14 @@ def chart(
         has no answer to; over histories ``step_over_elastic``: time of the artifact's step over
         that of its elastic twin.
     """
-    atlas, layout = ReducedModel.load(artifact), IN_TIME if scene is None else OF_LOADS
+    layout = drawing.IN_TIME if scene is None else drawing.OF_LOADS
+    atlas = ReducedModel.load(artifact)
     if scene is None and atlas.models.viscous is None:
         raise QueryError("scene", f"{atlas.name!r} is elastic: it has no histories")
     if scene is not None and atlas.scene.text != scene.text:
         raise PalpateError(f"{artifact}: trained on another scene than {scene.name!r}")
     settings = snapshots, queries, seed
-    checkpoint = kept_results(artifact, scene or atlas.scene, layout.name, settings)
+    checkpoint = full.kept_results(artifact, scene or atlas.scene, layout.name, settings)
     workshop = Workshop.of_artifact(read_artifact(artifact))
     plan = plan or (PLAN_IN_TIME if scene is None else PLAN)
     if scene is not None:
@@ -183,8 +168,8 @@ def chart(
     rows = [_row(key, found, usual) for key, found in measured.items()]
     report = artifact.parent / atlas.name / "report"
     write_csv(report / f"{layout.name}.csv", rows)
-    draw(report / f"{layout.name}.png", rows, atlas.scene, layout)
-    write_page(report / f"{layout.name}.html", rows, atlas.scene, layout)
+    drawing.draw(report / f"{layout.name}.png", rows, atlas.scene, layout)
+    drawing.write_page(report / f"{layout.name}.html", rows, atlas.scene, layout)
     checkpoint.remove()
     return _summary(rows) | {"without_equilibrium": queries - len(references.queries)}
 
@@ -203,22 +188,22 @@ def _solved(
     histories: dict[str, Steps] = {}
     for (name, stage), count in zip(stages.items(), counts, strict=True):
         rng = stream(atlas.scene.seed, stage, seed)
-        for i, steps in enumerate(random_steps(atlas, workshop, count, rng, scene is None)):
+        for i, steps in enumerate(full.random_steps(atlas, workshop, count, rng, scene is None)):
             histories[f"{name} {i}"] = steps
     with worker_pool(open_artifact, artifact) as pool:
-        found = full_histories(histories, pool, checkpoint)
+        found = full.full_histories(histories, pool, checkpoint)
         learnt = {name: own for name, own in found.items() if name.startswith("snapshot")}
         queries = [(histories[name], own) for name, own in found.items() if name not in learnt]
         if not queries:
             raise PalpateError(f"{artifact}: the full model could follow none of the queries")
         tasks = {
-            f"refined {i}": (refined, scene, REFINEMENT, steps[0][0].contacts[0])
+            f"refined {i}": (full.refined, scene, REFINEMENT, steps[0][0].contacts[0])
             for i, (steps, _) in enumerate(queries[:REFINED_LOADS])
             if scene is not None
         }
         finer = resume("refined mesh", pool, checkpoint, tasks, lambda u: {"u": u})
     return References(
-        snapshots([histories[name] for name in learnt], list(learnt.values())),
+        full.snapshots([histories[name] for name in learnt], list(learnt.values())),
         queries,
         np.array([finer[name]["u"] for name in tasks]).reshape(-1, *workshop.mesh.nodes.shape),
     )
@@ -324,10 +309,10 @@ def _row(key: str, found: Mapping[str, Any], usual: float) -> dict[str, Any]:
         "unknowns": int(found["unknowns"]),
         "time_us": float(1e6 * np.median(found["times"]) / np.median(found["beside"]) * usual),
     }
-    for name in FIELDS:
+    for name in drawing.FIELDS:
         errors = found[name][~np.isnan(found[name])]
         quantiles = np.percentile(errors, [50, 95, 100]) if errors.size else np.full(3, np.nan)
-        for statistic, error in zip(STATISTICS, quantiles.tolist(), strict=True):
+        for statistic, error in zip(drawing.STATISTICS, quantiles.tolist(), strict=True):
             row[f"{name}_{statistic}"] = error
     return row | {"unconverged": int((~found["converged"]).sum())}
 
@@ -345,7 +330,7 @@ def _summary(rows: Sequence[Row]) -> dict[str, Any]:
             key: {name: value for name, value in row.items() if name not in ("key", "family")}
             for key, row in points.items()
         },
-        "pareto": [row["key"] for row in pareto(rows)],
+        "pareto": [row["key"] for row in drawing.pareto(rows)],
         "speed_of_next": min(as_good) / shipped["time_us"],
     }
     return summary | ({"step_over_elastic": shipped["time_us"] / twin["time_us"]} if twin else {})

@@ -30,35 +30,10 @@ from palpate.offline.run.checkpoint import Checkpoint
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.workers import worker_pool
 from palpate.offline.run.workshop import Workshop, open_artifact
-from palpate.offline.studies.hard_cases import (
-    HYSTERESIS,
-    SEVERAL,
-    Followed,
-    HardCase,
-    HardLoads,
-    all_equilibria,
-    several,
-    tissue,
-)
-from palpate.offline.studies.outcomes import (
-    DIVERGED,
-    REFUSED,
-    SILENT,
-    SILENT_OUTCOMES,
-    WRONG_FLAGGED,
-    Result,
-    Table,
-    classify,
-    publish,
-    summaries,
-)
-from palpate.offline.studies.references import (
-    Fields,
-    full_histories,
-    kept_results,
-    random_steps,
-    snapshots,
-)
+from palpate.offline.studies import hard_cases, outcomes, references
+from palpate.offline.studies.hard_cases import Followed, HardCase
+from palpate.offline.studies.outcomes import Result, Table
+from palpate.offline.studies.references import Fields
 from palpate.offline.studies.tables import write_csv
 from palpate.offline.studies.trajectories import histories
 from palpate.offline.validate.loads import random_loads
@@ -151,7 +126,7 @@ def stability(
         are any.
     """
     atlas, workshop = ReducedModel.load(artifact), Workshop.of_artifact(read_artifact(artifact))
-    everything = HardLoads(atlas, workshop, cases, seed).cases()
+    everything = hard_cases.HardLoads(atlas, workshop, cases, seed).cases()
     chosen = {name: everything[name] for name in kinds or everything}
     tissues = sorted({case.poisson for own in chosen.values() for case in own})
     loads = random_loads(
@@ -161,14 +136,14 @@ def stability(
     given = [Case.of(workshop, load) for load in loads]
     learning = {f"snapshots {p:g}": [HardCase(((x, 0.0),), p) for x in given] for p in tissues}
     settings = cases, seed, learnt, list(chosen)
-    checkpoint = kept_results(artifact, atlas.scene, "stability", settings)
+    checkpoint = references.kept_results(artifact, atlas.scene, "stability", settings)
     with worker_pool(open_artifact, artifact) as pool:
-        found = all_equilibria({**chosen, **learning}, pool, checkpoint)
+        found = hard_cases.all_equilibria({**chosen, **learning}, pool, checkpoint)
     pairs = {name: found[name] for name in chosen}
-    pairs |= several(pairs, cases)
+    pairs |= hard_cases.several(pairs, cases)
     table: dict[str, dict[str, list[Result]]] = {}
     for poisson, solutions in zip(tissues, learning, strict=True):
-        own_tissue = tissue(workshop, poisson)
+        own_tissue = hard_cases.tissue(workshop, poisson)
         training = _training(own_tissue, atlas, found[solutions])
         questions = {
             name: [_question(own_tissue, *pair) for pair in own]
@@ -182,14 +157,15 @@ def stability(
                 label = f"{name} {poisson:g}"
                 table.setdefault(name, {}).update(_kept(label, answers, asked, checkpoint))
     report = artifact.parent / atlas.name / "report"
-    publish(report, "stability", table, [name for name, own in pairs.items() if own], "loads")
+    names = [name for name, own in pairs.items() if own]
+    outcomes.publish(report, "stability", table, names, "loads")
     write_csv(report / "stability_silent.csv", _silent(table))
     checkpoint.remove()
     missing = {name: sum(truth.path is None for _, truth in own) for name, own in pairs.items()}
-    return summaries(table) | {
+    return outcomes.summaries(table) | {
         "without_equilibrium": {name: count for name, count in missing.items() if count},
-        "with_several_equilibria": len(pairs.get(SEVERAL, ())),
-        "with_hysteresis": len(pairs.get(HYSTERESIS, ())),
+        "with_several_equilibria": len(pairs.get(hard_cases.SEVERAL, ())),
+        "with_hysteresis": len(pairs.get(hard_cases.HYSTERESIS, ())),
     }
 
 
@@ -216,10 +192,8 @@ def stability_in_time(
         Places in which each kind is tried.
     many : int
         Steps of the longest history.
-    methods, kinds : sequence of str, optional
-        Only these of ``METHODS_IN_TIME``, and only these kinds; all if absent.
-    learnt : int
-        Histories that POD learns from.
+    methods, kinds, learnt
+        As in ``stability``, of ``METHODS_IN_TIME`` and of histories.
 
     Returns
     -------
@@ -239,7 +213,7 @@ def stability_in_time(
         if kinds is None or name in kinds
     }
     settings = cases, seed, many, learnt, list(hard)
-    checkpoint = kept_results(artifact, atlas.scene, "stability_in_time", settings)
+    checkpoint = references.kept_results(artifact, atlas.scene, "stability_in_time", settings)
     tasks: dict[str, Steps] = {
         f"{tip} {name} {i}": case.brief or case.steps
         for (tip, name), own in hard.items()
@@ -247,16 +221,16 @@ def stability_in_time(
         if not case.nonsense
     }
     rng = stream(atlas.scene.seed, Stage.STABILITY_IN_TIME_SNAPSHOTS)
-    made = random_steps(atlas, workshop, learnt, rng, in_time=True)
+    made = references.random_steps(atlas, workshop, learnt, rng, in_time=True)
     learning = {f"snapshots {i}": steps for i, steps in enumerate(made)}
     tips = frozenset(name for name in tasks if name.startswith("True"))
     with worker_pool(open_artifact, artifact) as pool:
-        found = full_histories(tasks | learning, pool, checkpoint, tips)
+        found = references.full_histories(tasks | learning, pool, checkpoint, tips)
     questions: dict[bool, dict[str, list[Question]]] = {False: {}, True: {}}
     for (tip, name), own in hard.items():
         answers = [found.get(f"{tip} {name} {i}") for i in range(len(own))]
         questions[tip][name] = [Question(*pair) for pair in zip(own, answers, strict=True)]
-    solved = snapshots(made, [found[name] for name in learning if name in found])
+    solved = references.snapshots(made, [found[name] for name in learning if name in found])
     training = Training(workshop, solved, atlas, in_time=True)
     table = {}
     for name in tqdm(wanted, "methods"):
@@ -265,9 +239,10 @@ def stability_in_time(
         table[name] = _kept(name, ask, questions[name == TIP], checkpoint)
     names = list(dict.fromkeys(name for _, name in hard))
     asked = "histories (one of those of many steps)"
-    publish(artifact.parent / atlas.name / "report", "stability_in_time", table, names, asked)
+    report = artifact.parent / atlas.name / "report"
+    outcomes.publish(report, "stability_in_time", table, names, asked)
     checkpoint.remove()
-    return summaries(table)
+    return outcomes.summaries(table)
 
 
 # --- what is asked -------------------------------------------------------------------------------
@@ -324,7 +299,8 @@ def _answers(
     """What becomes of a method's answers; of the full model's jump if there is no method."""
     workshop = training.workshop
     if named is None:
-        return [classify(workshop, q.jump, q.jump is not None, q.exact, q.other) for q in questions]
+        judge = partial(outcomes.classify, workshop)
+        return [judge(q.jump, q.jump is not None, q.exact, q.other) for q in questions]
     method = build(*named, training)
     return [_answer(method, workshop, question, every) for question in questions]
 
@@ -339,20 +315,20 @@ def _answer(method: Method, workshop: Workshop, question: Question, every: int) 
         with np.errstate(all="ignore"):
             states, trusted, refused = _play(method, steps, ends, len(counted))
             if refused:
-                return Result(REFUSED)
+                return Result(outcomes.REFUSED)
             if case.nonsense and states:
-                return Result(SILENT if trusted else WRONG_FLAGGED)
+                return Result(outcomes.SILENT if trusted else outcomes.WRONG_FLAGGED)
             if exact is not None:
                 exact = Fields(*(field[counted] for field in exact))
             found = Fields.of(method, states) if states else None
-            result = classify(workshop, found, trusted, exact, question.other)
+            result = outcomes.classify(workshop, found, trusted, exact, question.other)
             if states and case.brief:
                 result = replace(result, drift=_drift(method, case, states[-1]))
             return result
     except ValueError:  # time that makes no sense
-        return Result(REFUSED if exact is None else DIVERGED)
+        return Result(outcomes.REFUSED if exact is None else outcomes.DIVERGED)
     except Exception:  # whatever it is, a method must not raise
-        return Result(DIVERGED, crashed=True)
+        return Result(outcomes.DIVERGED, crashed=True)
 
 
 def _play(
@@ -388,5 +364,5 @@ def _silent(table: Table) -> list[dict[str, Any]]:
         for method in (ARTIFACT, WARM)
         for kind, own in table.get(method, {}).items()
         for i, result in enumerate(own)
-        if result.outcome in SILENT_OUTCOMES
+        if result.outcome in outcomes.SILENT_OUTCOMES
     ]

@@ -84,18 +84,9 @@ class Presser:
 def histories(
     atlas: ReducedModel, workshop: Workshop, tip: bool, cases: int, seed: int, many: int
 ) -> dict[str, list[HardCase]]:
-    """Histories of every kind by its name.
+    """Histories of every kind by its name, in so many places; the longest of ``many`` steps in one.
 
-    Parameters
-    ----------
-    workshop : Workshop
-        Of the artifact's mesh.
-    tip : bool
-        With the rigid tip instead of footprints.
-    cases : int
-        Places.
-    many : int
-        Steps of the longest; these are tried in one place.
+    They are of footprints, or of the rigid tip.
     """
     rng = stream(atlas.scene.seed, Stage.HARD_CASES_IN_TIME, seed)
     # the first is on the rim
