@@ -98,8 +98,11 @@ def test_the_map_is_drawn_and_nothing_else_is_left(report, artifact):
 
 
 def test_a_killed_run_goes_on_where_it_stopped(report, artifact, monkeypatch):
+    def kill(*_):
+        raise KeyboardInterrupt
+
     with monkeypatch.context() as patch:
-        patch.setattr(study.outcomes, "publish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(study.outcomes, "publish", kill)
         with pytest.raises(KeyboardInterrupt):
             run(artifact)
     monkeypatch.setattr(study, "_answers", lambda *_: pytest.fail("asked again"))
