@@ -32,7 +32,6 @@ class Stage(IntEnum):
     STABILITY_SNAPSHOTS = 103
     HARD_CASES_IN_TIME = 104
     STABILITY_IN_TIME_SNAPSHOTS = 105
-    CHART_IN_TIME_SNAPSHOTS = 106
 
 
 def stream(seed: int, stage: Stage, *numbers: int) -> np.random.Generator:
