@@ -5,19 +5,17 @@ so that any of them can tell those of all. A worker holds its row by a file lock
 the system frees the lock, and the worker that takes its place counts on from where it was.
 
 Prometheus' own client takes some 2 µs for every number, of which a frame changes ten, and
-milliseconds to write the text, in which nobody is answered. This takes 1 µs and 0.2 ms.
+milliseconds to write the text, in which nobody is answered. This takes 1.5 µs and 0.2 ms.
 """
 
 import mmap
 import os
+from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from itertools import accumulate, product
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
-
-import numpy as np
-from numba import njit
 
 from palpate.online.serve.errors import STATUS
 from palpate.online.session.frames import Flag
@@ -41,14 +39,11 @@ FLAGS = {
 }
 FRAMES = ("answered", "superseded", "refused")
 
-_FLAGS = len(FLAGS)
-_ABSENT = int(Flag.CONVERGED | Flag.IN_RANGE)  # bits that are news when they are not set
-
 Borders: TypeAlias = tuple[float, float, float, float, float]
 
 
 class Family(NamedTuple):
-    """A metric: its type, its name with the unit, and the label values it is kept for."""
+    """A metric and the label values it is kept for."""
 
     type: Literal["counter", "gauge", "histogram"]
     name: str
@@ -62,15 +57,13 @@ class Family(NamedTuple):
         return len(BOUNDS) + 2 if self.type == "histogram" else 1
 
 
+_KINDS, _CODES, _OUTCOMES = (tuple(product(values)) for values in (KINDS, STATUS, FRAMES))
 _TIMED = tuple(product(KINDS, PHASES))
 _OF_FLAGS = (("query", "out_of_range"), *product(("session",), FLAGS.values()))
-_CODES, _OUTCOMES = tuple(product(STATUS)), tuple(product(FRAMES))
 
 FAMILIES = (
     Family("histogram", "palpate_phase_seconds", "Time per phase", ("kind", "phase"), _TIMED),
-    Family(
-        "histogram", "palpate_queue_seconds", "Wait for a turn", ("kind",), tuple(product(KINDS))
-    ),
+    Family("histogram", "palpate_queue_seconds", "Wait for a turn", ("kind",), _KINDS),
     Family("counter", "palpate_flags_total", "Answers by flag", ("kind", "flag"), _OF_FLAGS),
     Family("counter", "palpate_refusals_total", "Requests refused", ("code",), _CODES),
     Family("counter", "palpate_frames_total", "Session frames", ("outcome",), _OUTCOMES),
@@ -79,84 +72,48 @@ FAMILIES = (
     Family("counter", "palpate_worker_starts_total", "Starts of the worker"),
     Family("gauge", "palpate_worker_pid", "Process number of the worker"),
 )
-"""A query's or a frame's wait is from when it was read to when its turn came."""
-
 _FIRST = (0, *accumulate(len(family.values) * family.width for family in FAMILIES))
 WIDTH = _FIRST[-1]
 """Cells of a row."""
 
+_CELLS = {
+    (family.name, *value): first + i * family.width
+    for family, first in zip(FAMILIES, _FIRST, strict=False)
+    for i, value in enumerate(family.values)
+}
+"""First cell of each metric and label value."""
 
-def _cell(name: str, *value: str) -> int:
-    """Find the first cell of a label value of a metric."""
-    for family, first in zip(FAMILIES, _FIRST, strict=False):
-        if family.name == name:
-            return first + family.values.index(value) * family.width
-    raise KeyError(name)
+_SUM = len(BOUNDS) + 1
+_QUERY_PHASES, _FRAME_PHASES = (_CELLS["palpate_phase_seconds", k, PHASES[0]] for k in KINDS)
+_QUERY_QUEUE, _FRAME_QUEUE = (_CELLS["palpate_queue_seconds", kind] for kind in KINDS)
+_QUERY_OUT_OF_RANGE = _CELLS["palpate_flags_total", "query", "out_of_range"]
+_ANSWERED, _SUPERSEDED, _REFUSED = (_CELLS["palpate_frames_total", name] for name in FRAMES)
+_SESSIONS = _CELLS[("palpate_sessions",)]
+_SESSIONS_OPENED = _CELLS[("palpate_sessions_opened_total",)]
+_STARTS = _CELLS[("palpate_worker_starts_total",)]
+_PID = _CELLS[("palpate_worker_pid",)]
 
-
-_BUCKETS = np.array(BOUNDS)
-_EDGES = (*map(repr, BOUNDS), "+Inf")
-_WIDE = len(BOUNDS) + 2
-_QUERY_PHASES, _FRAME_PHASES = (_cell("palpate_phase_seconds", kind, PHASES[0]) for kind in KINDS)
-_QUERY_QUEUE, _FRAME_QUEUE = (_cell("palpate_queue_seconds", kind) for kind in KINDS)
-_QUERY_OUT_OF_RANGE = _cell("palpate_flags_total", "query", "out_of_range")
-_FRAME_FLAGS = _cell("palpate_flags_total", "session", "contact")
-_ANSWERED, _SUPERSEDED, _REFUSED = (_cell("palpate_frames_total", name) for name in FRAMES)
-_SESSIONS = _cell("palpate_sessions")
-_SESSIONS_OPENED = _cell("palpate_sessions_opened_total")
-_STARTS = _cell("palpate_worker_starts_total")
-_PID = _cell("palpate_worker_pid")
-_REFUSALS = {code: _cell("palpate_refusals_total", code) for code in STATUS}
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _observe(row, first, seconds):
-    """Count a duration in the histogram that begins at cell `first`."""
-    row[first + np.searchsorted(_BUCKETS, seconds)] += 1.0
-    row[first + _WIDE - 1] += seconds
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _observe_phases(row, first, start, decoded, solved, recovered, encoded):
-    """Count the durations of all phases, given their borders."""
-    _observe(row, first, decoded - start)
-    _observe(row, first + _WIDE, solved - decoded)
-    _observe(row, first + 2 * _WIDE, recovered - solved)
-    _observe(row, first + 3 * _WIDE, encoded - recovered)
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _count_frame(row, waited, start, decoded, solved, recovered, encoded, news, superseded):
-    _observe(row, _FRAME_QUEUE, waited)
-    _observe_phases(row, _FRAME_PHASES, start, decoded, solved, recovered, encoded)
-    for bit in range(_FLAGS):
-        row[_FRAME_FLAGS + bit] += news >> bit & 1
-    row[_ANSWERED] += 1.0
-    row[_SUPERSEDED] += superseded
+_FRAME_FLAGS = [
+    [
+        _CELLS["palpate_flags_total", "session", name]
+        for bit, name in FLAGS.items()
+        if (flags ^ (Flag.CONVERGED | Flag.IN_RANGE)) & bit  # these two count where they are absent
+    ]
+    for flags in range(2 * max(Flag))
+]
+"""For every value of a frame's flags, the cells that count it."""
 
 
 class Metrics:
-    """The numbers of one worker.
+    """The numbers of one worker, in a row of the `table` that `make_table` made.
 
-    Parameters
-    ----------
-    table : Path, optional
-        File that the workers share, made by `make_table`. Default: this is the only worker.
-
-    Attributes
-    ----------
-    worker : int
-        Number of the row.
-
-    Raises
-    ------
-    PalpateError
-        If every row of the table is taken.
+    Without one this is the only worker. Raises `PalpateError` if every row is taken.
     """
 
     def __init__(self, table: Path | None = None) -> None:
         self.worker, memory = (0, mmap.mmap(-1, 8 * WIDTH)) if table is None else _claim(table)
-        self._rows = np.frombuffer(memory).reshape(-1, WIDTH)
+        cells = memoryview(memory).cast("d")
+        self._rows = [cells[first : first + WIDTH] for first in range(0, len(cells), WIDTH)]
         self._row = self._rows[self.worker]
         self._row[_SESSIONS] = 0.0  # those of a killed worker are gone
         self._row[_STARTS] += 1.0
@@ -165,39 +122,29 @@ class Metrics:
     @property
     def restarted(self) -> bool:
         """Whether this worker takes the place of one that died."""
-        return bool(self._row[_STARTS] > 1.0)
+        return self._row[_STARTS] > 1.0
 
     def count_wait(self, seconds: float) -> None:
         """Count how long a request waited for its turn."""
-        _observe(self._row, _QUERY_QUEUE, seconds)
+        self._observe(_QUERY_QUEUE, seconds)
 
     def count_query(self, borders: Borders, in_range: bool) -> None:
-        """Count an answered query.
-
-        Parameters
-        ----------
-        borders : tuple of 5 floats, s
-            When the first of `PHASES` began and when each ended.
-        in_range : bool
-        """
-        _observe_phases(self._row, _QUERY_PHASES, *borders)
+        """Count an answered query; `borders` (s) are the start of the first phase and all ends."""
+        self._observe_phases(_QUERY_PHASES, borders)
         self._row[_QUERY_OUT_OF_RANGE] += not in_range
 
     def count_frame(self, waited: float, borders: Borders, flags: int, superseded: int) -> None:
-        """Count an answered frame of a session.
+        """Count an answered frame of a session, and those that were dropped for it.
 
-        Parameters
-        ----------
-        waited : float, s
-            From when it was read to when its turn came.
-        borders : tuple of 5 floats, s
-            When the first of `PHASES` began and when each ended.
-        flags : int
-            Bits of `session.frames.Flag`.
-        superseded : int
-            Frames that were dropped for it.
+        It `waited` (s) from when it was read to when its turn came; for `borders` see
+        `count_query`.
         """
-        _count_frame(self._row, waited, *borders, flags ^ _ABSENT, superseded)
+        self._observe(_FRAME_QUEUE, waited)
+        self._observe_phases(_FRAME_PHASES, borders)
+        for cell in _FRAME_FLAGS[flags]:
+            self._row[cell] += 1.0
+        self._row[_ANSWERED] += 1.0
+        self._row[_SUPERSEDED] += superseded
 
     def count_refused_frame(self) -> None:
         """Count a message of a session that was no frame."""
@@ -205,23 +152,36 @@ class Metrics:
 
     def count_refusal(self, code: str) -> None:
         """Count a refusal, by its code."""
-        self._row[_REFUSALS[code]] += 1.0
+        self._row[_CELLS["palpate_refusals_total", code]] += 1.0
 
     def count_session(self, opened: bool) -> None:
         """Count a session that was opened, or that ended."""
         self._row[_SESSIONS] += 1.0 if opened else -1.0
         self._row[_SESSIONS_OPENED] += opened
 
+    def _observe(self, first: int, *durations: float) -> None:
+        """Count durations (s) in the histograms that follow one another from cell `first`."""
+        row = self._row
+        for seconds in durations:
+            row[first + bisect_left(BOUNDS, seconds)] += 1.0
+            row[first + _SUM] += seconds
+            first += _SUM + 1
+
+    def _observe_phases(self, first: int, borders: Borders) -> None:
+        start, decoded, solved, recovered, encoded = borders
+        self._observe(
+            first, decoded - start, solved - decoded, recovered - solved, encoded - recovered
+        )
+
     def text(self) -> str:
         """Write the numbers of all workers, labelled with theirs, as Prometheus reads them."""
-        rows = self._rows.tolist()
-        started = [worker for worker, row in enumerate(rows) if row[_PID]]
+        rows = {worker: row.tolist() for worker, row in enumerate(self._rows) if row[_PID]}
         lines = []
-        for family, first in zip(FAMILIES, _FIRST, strict=False):
+        for family in FAMILIES:
             lines += [f"# HELP {family.name} {family.help}", f"# TYPE {family.name} {family.type}"]
-            for worker in started:
-                lines += _samples(family, worker, rows[worker][first:])
-        lines += _memory({worker: int(rows[worker][_PID]) for worker in started})
+            for worker, row in rows.items():
+                lines += _samples(family, worker, row)
+        lines += _memory({worker: int(row[_PID]) for worker, row in rows.items()})
         return "\n".join(lines) + "\n"
 
 
@@ -248,20 +208,20 @@ def _claim(path: Path) -> tuple[int, mmap.mmap]:
     raise PalpateError(f"{path}: more workers than rows")
 
 
-def _samples(family: Family, worker: int, cells: Sequence[float]) -> Iterator[str]:
-    """Write the samples of a metric of a worker, whose cells come first in `cells`."""
-    for i, value in enumerate(family.values):
+def _samples(family: Family, worker: int, row: Sequence[float]) -> Iterator[str]:
+    """Write the samples of a metric of a worker."""
+    for value in family.values:
         labels = "".join(f'{n}="{v}",' for n, v in zip(family.labels, value, strict=True))
         labels += f'worker="{worker}"'
-        own = cells[i * family.width : (i + 1) * family.width]
+        first = _CELLS[family.name, *value]
         if family.type != "histogram":
-            yield f"{family.name}{{{labels}}} {own[0]!r}"
+            yield f"{family.name}{{{labels}}} {row[first]!r}"
             continue
-        upto = list(accumulate(own[:-1]))
-        for edge, count in zip(_EDGES, upto, strict=True):
+        upto = list(accumulate(row[first : first + _SUM]))
+        for edge, count in zip((*BOUNDS, "+Inf"), upto, strict=True):
             yield f'{family.name}_bucket{{{labels},le="{edge}"}} {count!r}'
         yield f"{family.name}_count{{{labels}}} {upto[-1]!r}"
-        yield f"{family.name}_sum{{{labels}}} {own[-1]!r}"
+        yield f"{family.name}_sum{{{labels}}} {row[first + _SUM]!r}"
 
 
 def _memory(pids: dict[int, int]) -> Iterator[str]:
