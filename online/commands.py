@@ -15,8 +15,22 @@ from palpate.online.serve.settings import Settings
 
 _option = partial(click.option, show_default=True, show_envvar=True)
 
+_SERVE_EXAMPLES = """\b
+Examples:
+  palpate serve --artifacts artifacts --realtime
+  PALPATE_TOKEN=$(openssl rand -hex 32) palpate serve --host 0.0.0.0 --workers 2
+"""
 
-@click.command(context_settings={"auto_envvar_prefix": "PALPATE"})
+_LOADTEST_EXAMPLES = """\b
+Examples:
+  palpate loadtest http://127.0.0.1:8000 --sessions 4 --queries-per-second 20
+  palpate loadtest http://127.0.0.1:8000 --sessions 0 --queries-per-second 200 --region none
+  palpate loadtest http://127.0.0.1:8000 --sessions 4 --overload 10 --out overload.png
+  palpate loadtest http://127.0.0.1:8000 --rate 200 --queries-per-second 50 --echo
+"""
+
+
+@click.command(epilog=_SERVE_EXAMPLES, context_settings={"auto_envvar_prefix": "PALPATE"})
 @_option(
     "--artifacts",
     type=click.Path(file_okay=False, path_type=Path),
@@ -99,108 +113,84 @@ _option = partial(click.option, show_default=True, show_envvar=True)
 @_option("--log-level", type=click.Choice(LEVELS), default=Settings.log_level)
 @_option("--access-log/--no-access-log", default=False, help="Log every request.")
 def serve(host: str, port: int, public: bool, **settings: Any) -> None:
-    r"""Answer loads over HTTP and in sessions.
+    """Answer loads over HTTP and in sessions.
 
     Prints a request to try once every model is loaded and warm. Every option can also be set by
     the variable named beside it. On loopback anybody on this machine is served; on any other
     address a token is asked for, unless --public says not to.
-
-    \b
-    Examples:
-      palpate serve --artifacts artifacts --realtime
-      PALPATE_TOKEN=$(openssl rand -hex 32) palpate serve --host 0.0.0.0 --workers 2
     """
     from palpate.online.serve.process import serve
 
     serve(Settings(**settings), host, port, public)
 
 
-@click.command()
+@click.command(epilog=_LOADTEST_EXAMPLES)
 @click.argument("url")
 @click.argument("scene", default="turbinate-tip")
-@click.option(
-    "--sessions", type=click.IntRange(0), default=1, show_default=True, help="Tools at once."
-)
-@click.option(
+@_option("--sessions", type=click.IntRange(0), default=1, help="Tools at once.")
+@_option(
     "--rate",
     type=click.FloatRange(1, 100_000),
     default=1000.0,
-    show_default=True,
     help="Frames per second of each session.",
 )
-@click.option(
+@_option(
     "--output",
     "outputs",
     multiple=True,
     type=click.Choice(["coordinates", "displacement", "von_mises", "stress", "half"]),
     help="What frames ask for beyond force and tangent; may be repeated.",
 )
-@click.option(
+@_option(
     "--queries-per-second",
     "queries",
     type=click.FloatRange(0, 100_000),
     default=0.0,
-    show_default=True,
     help="Solves over HTTP, in all, with fields in binary.",
 )
-@click.option(
+@_option(
     "--region",
     type=click.Choice(["none", "surface", "all"]),
     default="all",
-    show_default=True,
     help="Nodes that queries ask fields for.",
 )
-@click.option(
+@_option(
     "--connections",
     type=click.IntRange(1, 1000),
     default=4,
-    show_default=True,
     help="Connections that queries share.",
 )
-@click.option("--duration", type=click.FloatRange(0.5), default=10.0, show_default=True, help="s")
-@click.option(
+@_option("--duration", type=click.FloatRange(0.5), default=10.0, help="s")
+@_option(
     "--overload",
     type=click.FloatRange(1),
     default=1.0,
     help="Multiply the rates for a second DURATION, go back to them for a third, and say how soon "
     "all is as before.",
 )
-@click.option(
-    "--depth",
-    type=click.FloatRange(0),
-    default=1.0,
-    show_default=True,
-    help="How deep the tools press, mm.",
-)
-@click.option(
+@_option("--depth", type=click.FloatRange(0), default=1.0, help="How deep the tools press, mm.")
+@_option(
     "--echo",
     is_flag=True,
     help="Measure what the service adds to a solve, too: send as many frames again that are only "
     "echoed (by a service started with --echo), and as many queries that are only checked.",
 )
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the paths.")
-@click.option("--token", envvar="PALPATE_TOKEN", show_envvar=True)
-@click.option(
+@_option("--seed", type=int, default=0, help="Of the paths.")
+@_option("--token", envvar="PALPATE_TOKEN")
+@_option(
     "--out",
     type=click.Path(dir_okay=False, path_type=Path),
     help="PNG of latency over time and of its distribution.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@_option("--json", "as_json", is_flag=True, help="Print JSON.")
 def loadtest(outputs: tuple[str, ...], out: Path | None, as_json: bool, **plan: Any) -> None:
-    r"""Put a load on the service at URL and time it from when each message was due.
+    """Put a load on the service at URL and time it from when each message was due.
 
     Sessions move a tip over the whole accessible surface of SCENE at up to 50 mm/s, in and out of
     contact; queries press random places. A generator that never sleeps sends each message when it
     is due, whatever became of those before. Windows of 0.25 s in which the machine's host took
     time or the generator was late are not clean; latencies are given with and without them. For
     Linux and macOS.
-
-    \b
-    Examples:
-      palpate loadtest http://127.0.0.1:8000 --sessions 4 --queries-per-second 20
-      palpate loadtest http://127.0.0.1:8000 --sessions 0 --queries-per-second 200 --region none
-      palpate loadtest http://127.0.0.1:8000 --sessions 4 --overload 10 --out overload.png
-      palpate loadtest http://127.0.0.1:8000 --rate 200 --queries-per-second 50 --echo
     """
     from palpate.online.loadtest.report import table
     from palpate.online.loadtest.run import Plan, run

@@ -11,8 +11,8 @@ from contextlib import ExitStack
 
 import pytest
 
+from palpate.online.client.connection import SessionClosed
 from palpate.online.client.http import Client
-from palpate.online.client.session import SessionClosed
 from palpate.online.loadtest.run import Plan, run
 
 from .conftest import PALPATE
@@ -59,13 +59,25 @@ def test_with_a_token_they_are(serve, artifact):
         assert "secret" not in server.log
 
 
+def help_of(command):
+    result = subprocess.run([*PALPATE, command, "--help"], capture_output=True, text=True)
+    return result.stdout
+
+
 def test_help_names_the_variable_of_every_setting():
-    result = subprocess.run([*PALPATE, "serve", "--help"], capture_output=True, text=True)
-    options = re.findall(r"^  --([\w-]+)", result.stdout, re.M)
+    text = help_of("serve")
+    options = re.findall(r"^  --([\w-]+)", text, re.M)
     assert len(options) > 10
     for option in options:
         variable = "PALPATE_" + option.replace("-", "_").upper()
-        assert re.search(rf"\b{variable}S?\b", re.sub(r"\s+", " ", result.stdout)), option
+        assert re.search(rf"\b{variable}S?\b", re.sub(r"\s+", " ", text)), option
+
+
+@pytest.mark.parametrize("command", ["serve", "loadtest"])
+def test_help_has_an_example_a_line(command):
+    _, examples = help_of(command).split("Examples:\n")
+    assert all(line.startswith(("palpate", "PALPATE_")) for line in examples.split("\n  ")[1:])
+    assert "\\b" not in help_of(command)
 
 
 def test_settings_come_from_the_environment(serve, artifact):
