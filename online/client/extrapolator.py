@@ -1,17 +1,12 @@
 """The haptic side of a session: a force for every tick of the device, between and after replies.
 
-A haptic device wants a force every millisecond and at once; replies come late and not always. In
-between, force and tangent of the last reply give the force at the device's own position,
+A haptic device wants a force every millisecond; replies come late and not always. In between, the
+last reply gives the force at the device's own position, F(x) = F_0 + K (x - x_0), with the step
+x - x_0 held to the reply's valid radius, and without what would pull the tip into the tissue. When
+a reply comes in, the difference to what the device felt before dwindles during `BLEND` seconds;
+when replies stop, or only repeat the last good answer, the force fades away.
 
-    F(x) = F_0 + K (x - x_0),
-
-with the step x - x_0 held to the reply's valid radius. What would pull the tip into the tissue is
-left out: a tool that is drawn back feels nothing. When a reply comes in, the difference to what the
-device felt before dwindles during `BLEND` seconds, so that there is no jump; when replies stop, or
-do no more than repeat the last good answer, the force fades away.
-
-Plain functions of time and position; nothing here knows of sockets. Times are of the client's
-clock, seconds; lengths mm; forces mN.
+Times are of the client's clock, s; lengths mm; forces mN.
 """
 
 import math
@@ -66,12 +61,7 @@ def fade(age: float) -> float:
 
 
 class Extrapolator:
-    """The force on a device between replies.
-
-    Parameters
-    ----------
-    most : float, mN
-        Largest force on the device.
+    """The force on a device between replies; `most` is the largest, mN.
 
     Examples
     --------

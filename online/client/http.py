@@ -1,101 +1,57 @@
-"""A small client of the HTTP service: answers as arrays, refusals as exceptions.
-
-Sessions are opened by the clients here and live in `client.session`.
-"""
+"""A small client of the HTTP service: answers as arrays, refusals as exceptions."""
 
 import http.client
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.online.client.session import ServiceError, Session, split_address
+from palpate.online.client.connection import ServiceError, scene_path, split_address
+from palpate.online.client.session import Session
 from palpate.online.serve import wire
-from palpate.online.serve.negotiation import BINARY, JSON
+from palpate.online.serve.wire import BINARY, JSON
 from palpate.shared.errors import PalpateError
 
 
-@dataclass(frozen=True)
-class Answer:
-    """How the tissue answers a load.
+class Answer(NamedTuple):
+    """How the tissue answers a load; fields are None if they were not asked for."""
 
-    Parameters
-    ----------
-    contact, trust, timing : dict
-        As `serve.schemas` describes them.
-    force : ndarray, shape (3,), mN
-        On the tool.
-    contact_displacement : ndarray, shape (3,), mm
-    displacement : ndarray, shape (k, 3), float32, mm, or None if not asked for
-    von_mises : ndarray, shape (k,), float32, kPa, or None if not asked for
-    """
-
-    contact: dict[str, Any]
+    contact: dict[str, Any]  # this, trust and timing are described by the service's /docs
     trust: dict[str, Any]
     timing: dict[str, float]
-    force: NDArray[np.float64]
-    contact_displacement: NDArray[np.float64]
-    displacement: NDArray[np.float32] | None
-    von_mises: NDArray[np.float32] | None
+    force: NDArray[np.float64]  # (3,), mN, on the tool
+    contact_displacement: NDArray[np.float64]  # (3,), mm
+    displacement: NDArray[np.float32] | None  # (k, 3), mm
+    von_mises: NDArray[np.float32] | None  # (k,), kPa
 
 
-@dataclass(frozen=True)
-class Mesh:
-    """The mesh that the fields of a region belong to.
+class Mesh(NamedTuple):
+    """The mesh that the fields of a region belong to."""
 
-    Parameters
-    ----------
-    nodes : ndarray, shape (k, 3), float32, mm
-    triangles : ndarray, shape (t, 3), int32
-        Indices into `nodes`, outward.
-    surface_nodes : ndarray, shape (s,), int32
-        The surface nodes among all nodes.
-    clamped : ndarray, shape (k,), uint8
-    """
-
-    nodes: NDArray[np.float32]
-    triangles: NDArray[np.int32]
-    surface_nodes: NDArray[np.int32]
-    clamped: NDArray[np.uint8]
+    nodes: NDArray[np.float32]  # (k, 3), mm
+    triangles: NDArray[np.int32]  # (t, 3), indices into the nodes, outward
+    surface_nodes: NDArray[np.int32]  # (s,), the surface nodes among all nodes
+    clamped: NDArray[np.uint8]  # (k,), 1 if held fixed
 
 
-@dataclass(frozen=True)
-class Accessible:
-    """The surface that the endoscope can touch.
+class Accessible(NamedTuple):
+    """The surface that the endoscope can touch, and the limits of training on it."""
 
-    Parameters
-    ----------
-    vertices, normals : ndarray, shape (v, 3), float32, mm and unit
-    pressure_limit : ndarray, shape (v,), float32, kPa
-        Largest trained pressure along the inward normal.
-    triangles : ndarray, shape (t, 3), int32
-        Indices into `vertices`, outward.
-    depth_limit : ndarray, shape (v,), float32, mm, or None
-        Largest trained depth of the tip; None if the scene was trained without a tip.
-    """
-
-    vertices: NDArray[np.float32]
-    normals: NDArray[np.float32]
-    pressure_limit: NDArray[np.float32]
-    triangles: NDArray[np.int32]
-    depth_limit: NDArray[np.float32] | None = None
+    vertices: NDArray[np.float32]  # (v, 3), mm
+    normals: NDArray[np.float32]  # (v, 3), unit, outward
+    pressure_limit: NDArray[np.float32]  # (v,), kPa, along the inward normal
+    triangles: NDArray[np.int32]  # (t, 3), indices into the vertices, outward
+    depth_limit: NDArray[np.float32] | None = None  # (v,), mm, of the tip; None without one
 
 
 class Client:
     """One connection to a service.
 
-    Parameters
-    ----------
-    url : str
-        Such as ``http://127.0.0.1:8000``.
-    token : str, optional
-        What the service asks for, if it does.
-    timeout : float, s
+    Give it the `token` that the service asks for, if it does, and how long to wait (s).
 
     Examples
     --------
@@ -124,17 +80,15 @@ class Client:
 
     def scene(self, name: str) -> dict[str, Any]:
         """Ask what may be asked of a scene, and how well it is answered."""
-        return json.loads(self._request("GET", _path(name), JSON))
+        return json.loads(self._request("GET", scene_path(name), JSON))
 
     def mesh(self, name: str, region: str = "surface") -> Mesh:
         """Get the undeformed mesh of a region, ``surface`` or ``all``."""
-        _, arrays = self._document("GET", name, f"/mesh?region={quote(region)}")
-        return Mesh(**arrays)
+        return Mesh(**self._document("GET", name, f"/mesh?region={quote(region)}")[1])
 
     def accessible(self, name: str) -> Accessible:
         """Get the undeformed surface that the endoscope can touch."""
-        _, arrays = self._document("GET", name, "/accessible")
-        return Accessible(**arrays)
+        return Accessible(**self._document("GET", name, "/accessible")[1])
 
     def solve(
         self,
@@ -146,20 +100,10 @@ class Client:
         outputs: Sequence[str] = ("displacement", "von_mises"),
         region: str = "none",
     ) -> Answer:
-        """Press the tissue.
+        """Press the tissue at a position (mm) with a pressure (kPa).
 
-        Parameters
-        ----------
-        name : str
-            A served scene.
-        position : sequence of 3 floats, mm
-        pressure : float, kPa
-        direction : sequence of 3 floats, optional
-            Default: the inward normal.
-        radius : float, mm, optional
-            Default: the scene's.
-        outputs, region
-            The fields to return, and for which nodes: ``none``, ``surface`` or ``all``.
+        The direction is by default the inward normal, the radius (mm) the scene's. `outputs` are
+        the fields to return, for the nodes of `region`: ``none``, ``surface`` or ``all``.
 
         Raises
         ------
@@ -174,15 +118,10 @@ class Client:
         }
         body = json.dumps({"contacts": [contact], "outputs": list(outputs), "region": region})
         head, fields = self._document("POST", name, "/solve", body.encode())
-        return Answer(
-            contact=head["contact"],
-            trust=head["trust"],
-            timing=head["timing"],
-            force=np.array(head["force"]),
-            contact_displacement=np.array(head["contact_displacement"]),
-            displacement=fields.get("displacement"),
-            von_mises=fields.get("von_mises"),
-        )
+        for vector in ("force", "contact_displacement"):
+            head[vector] = np.array(head[vector])
+        found = {**head, **fields}
+        return Answer._make(map(found.get, Answer._fields))
 
     def session(self, name: str, record: Path | None = None) -> Session:
         """Open a session of a scene, on a connection of its own; see `Session`."""
@@ -191,7 +130,7 @@ class Client:
     def _document(
         self, method: str, name: str, rest: str, body: bytes | None = None
     ) -> tuple[wire.Head, dict[str, NDArray[Any]]]:
-        return wire.decode(self._request(method, _path(name) + rest, BINARY, body))
+        return wire.decode(self._request(method, scene_path(name, rest), BINARY, body))
 
     def _request(self, method: str, path: str, accept: str, body: bytes | None = None) -> bytes:
         try:
@@ -203,7 +142,3 @@ class Client:
         if response.status != 200:
             raise ServiceError(response.status, json.loads(content)["error"])
         return content
-
-
-def _path(name: str) -> str:
-    return f"/scenes/{quote(name, safe='')}"

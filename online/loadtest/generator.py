@@ -12,9 +12,11 @@ import os
 import select
 import socket
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from operator import itemgetter
 from time import perf_counter_ns
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,39 +39,21 @@ service says that it left it for a newer one.
 
 
 class Log:
-    """What became of every message of a stream; times in ns from the start.
-
-    Attributes
-    ----------
-    due : list of int
-        When a message should have been sent.
-    sent, received : list of int
-        When it was its turn, and when its answer was whole; 0 if never.
-    outcome : list of int
-    solve_us, recover_us : list of float, µs
-        What the server says it took to solve, and to recover the fields of a query.
-    flags : list of int
-        Of sessions' frames: `session.frames.Flag`.
-    """
+    """What became of every message of a stream; times in ns from the start, 0 for never."""
 
     def __init__(self, due: NDArray[np.float64]) -> None:
         self.due: list[int] = (1e9 * due).astype(np.int64).tolist()
         count = len(self.due)
-        self.sent, self.received, self.outcome, self.flags = ([0] * count for _ in range(4))
-        self.solve_us, self.recover_us = [0.0] * count, [0.0] * count
+        self.sent = [0] * count  # when it was its turn
+        self.received = [0] * count  # when its answer was whole
+        self.outcome = [LOST] * count
+        self.flags = [0] * count  # of frames: `session.frames.Flag`
+        # what the server says it took to solve, and to recover the fields of a query, µs
+        self.solve, self.recover = [0.0] * count, [0.0] * count
 
 
 class Stream(ABC):
-    """A source of messages, with a socket or several.
-
-    Attributes
-    ----------
-    log : Log
-    sockets : list of socket
-        Not blocking.
-    complaint : str
-        What went wrong last; empty if nothing did.
-    """
+    """A source of messages, with a socket or several; `complaint` says what went wrong last."""
 
     def __init__(self, due: NDArray[np.float64], sockets: Sequence[socket.socket]) -> None:
         self.log = Log(due)
@@ -114,44 +98,43 @@ class Stream(ABC):
             connection.close()
 
 
-@dataclass(frozen=True)
-class Machine:
-    """How the machine did, window by window.
+class Machine(NamedTuple):
+    """How the machine did, window by window."""
 
-    Parameters
-    ----------
-    borders : ndarray, shape (w + 1,), ns
-    steal : ndarray, shape (w,), s
-        Time that the host took from all cores; 0 where the system does not tell.
-    """
-
-    borders: NDArray[np.int64]
-    steal: NDArray[np.float64]
+    borders: NDArray[np.int64]  # (w + 1,), ns
+    steal: NDArray[np.float64]  # (w,), s that the host took from all cores; 0 where nobody tells
 
 
 def drive(streams: Sequence[Stream]) -> Machine:
     """Send every message of every stream when it is due, and take the answers."""
-    due, owners, numbers = _timetable(streams)
-    sends = [stream.send for stream in streams]
+    timetable = deque(
+        sorted(
+            (
+                (due, number, stream.send)
+                for stream in streams
+                for number, due in enumerate(stream.log.due)
+            ),
+            key=itemgetter(0),
+        )
+    )
     poll = select.poll()
     receivers = {}
     for stream in streams:
         for connection in stream.sockets:
             poll.register(connection, select.POLLIN)
             receivers[connection.fileno()] = (stream.receive, connection)
-    limit = due[-1] + int(1e9 * DRAIN)
+    limit = timetable[-1][0] + int(1e9 * DRAIN)
     window = int(1e9 * WINDOW)
     samples = [(0, _steal())]
-    k, count = 0, len(due)
     gc.collect()
     gc.disable()
     try:
         start = perf_counter_ns()
         now = 0
-        while now < limit and (k < count or any(stream.waiting for stream in streams)):
-            while k < count and due[k] <= now:
-                sends[owners[k]](numbers[k], now)
-                k += 1
+        while now < limit and (timetable or any(stream.waiting for stream in streams)):
+            while timetable and timetable[0][0] <= now:
+                _, number, send = timetable.popleft()
+                send(number, now)
                 now = perf_counter_ns() - start
             for descriptor, _ in poll.poll(0):
                 receive, connection = receivers[descriptor]
@@ -164,15 +147,6 @@ def drive(streams: Sequence[Stream]) -> Machine:
         gc.enable()
     borders, ticks = zip(*samples, (now, _steal()), strict=True)
     return Machine(np.array(borders), np.diff(ticks) / os.sysconf("SC_CLK_TCK"))
-
-
-def _timetable(streams: Sequence[Stream]) -> tuple[list[int], list[int], list[int]]:
-    """Merge the streams' messages by time: when, whose, which."""
-    due = np.concatenate([stream.log.due for stream in streams])
-    owners = np.repeat(np.arange(len(streams)), [len(stream.log.due) for stream in streams])
-    numbers = np.concatenate([np.arange(len(stream.log.due)) for stream in streams])
-    order = np.argsort(due, kind="stable")
-    return due[order].tolist(), owners[order].tolist(), numbers[order].tolist()
 
 
 def _steal() -> int:

@@ -35,24 +35,11 @@ class Tip(NamedTuple):
 
 
 def tool_path(surface: Accessible, tip: Tip, times: Array, rng: np.random.Generator) -> Array:
-    """Move a tip over a surface.
+    """Move a tip over a surface; return its centre (n, 3) mm at `times` (n,) s, from 0 upwards.
 
     It goes the shortest way from one random vertex to the next, ``LIFTED`` above the surface and
     ``tip.depth`` below it in turn, and slows down and speeds up between a tenth of `SPEED` and
     all of it.
-
-    Parameters
-    ----------
-    surface : Accessible
-    tip : Tip
-    times : ndarray, shape (n,), s
-        Not decreasing, from 0.
-    rng : Generator
-
-    Returns
-    -------
-    ndarray, shape (n, 3), mm
-        Centre of the tip at `times`.
     """
     period, phase = 5.0, rng.uniform(0.0, 2 * np.pi)
     # The integral of SPEED (0.55 - 0.45 cos(2 pi t / period + phase)).

@@ -8,53 +8,30 @@ import json
 import re
 import socket
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
+from httptools import HttpResponseParser
 from numpy.typing import NDArray
 
+from palpate.online.client.connection import connect, split_address
 from palpate.online.loadtest.generator import DROPPED, Stream
-from palpate.online.loadtest.target import Target
-from palpate.online.serve.negotiation import BINARY, JSON
+from palpate.online.serve.wire import BINARY, JSON
 
 PATIENCE = 1.0
 """Seconds that a query waits for a free connection."""
 
-_LENGTH = re.compile(rb"\r\ncontent-length: *(\d+)", re.I)
 _PHASES = re.compile(rb"\bsolve;dur=([\d.]+), recover;dur=([\d.]+)")
 
 
 class QueryStream(Stream):
-    """The loads given, to be solved with fields in binary or only checked.
-
-    Parameters
-    ----------
-    target : Target
-    due : ndarray, shape (n,), s
-    positions : ndarray, shape (n, 3), mm
-    pressures : ndarray, shape (n,), kPa
-    region : str
-        The nodes to ask fields for: ``none``, ``surface`` or ``all``.
-    connections : int
-    verb : str
-        Endpoint of the scene: ``solve`` or ``check``.
-    """
+    """Requests to be sent when they are due, over `connections` to the service at `url`."""
 
     def __init__(
-        self,
-        target: Target,
-        due: NDArray[np.float64],
-        positions: NDArray[np.float64],
-        pressures: NDArray[np.float64],
-        region: str,
-        connections: int,
-        verb: str = "solve",
+        self, url: str, connections: int, due: NDArray[np.float64], requests: Sequence[bytes]
     ) -> None:
-        super().__init__(due, [target.connect() for _ in range(connections)])
-        head = target.head("POST", target.path(verb), accept=BINARY, content_type=JSON)
-        self._requests = [
-            _request(head, position, pressure, region)
-            for position, pressure in zip(positions.tolist(), pressures.tolist(), strict=True)
-        ]
+        super().__init__(due, [connect(url, timeout=10.0) for _ in range(connections)])
+        self._requests = requests
         self._free = deque(self.sockets)
         self._queue: deque[int] = deque()
         self._answers: dict[socket.socket, _Answer] = {}
@@ -75,14 +52,14 @@ class QueryStream(Stream):
     def take(self, connection: socket.socket, chunk: bytes, now: int) -> bool:
         """Take a part of an answer; the connection stays open."""
         answer = self._answers[connection]
-        if not answer.take(chunk):
-            return True
-        log, number = self.log, answer.number
-        log.received[number] = now
-        log.outcome[number] = answer.status
-        log.solve_us[number], log.recover_us[number] = answer.phases_us
-        del self._answers[connection]
-        self._go_on(connection, now)
+        answer.parser.feed_data(chunk)
+        if answer.whole:
+            log, number = self.log, answer.number
+            log.received[number] = now
+            log.outcome[number] = answer.parser.get_status_code()
+            log.solve[number], log.recover[number] = answer.phases
+            del self._answers[connection]
+            self._go_on(connection, now)
         return True
 
     def _go_on(self, connection: socket.socket, now: int) -> None:
@@ -113,33 +90,41 @@ class QueryStream(Stream):
 
 
 class _Answer:
-    """An HTTP response on its way."""
+    """An HTTP response on its way, and what its parser finds in it."""
 
     def __init__(self, number: int) -> None:
         self.number = number
-        self.status = 0
-        self.phases_us = 0.0, 0.0
-        self._head = b""
-        self._missing = 0
+        self.parser = HttpResponseParser(self)
+        self.phases = 0.0, 0.0  # solve and recover, µs
+        self.whole = False
 
-    def take(self, chunk: bytes) -> bool:
-        """Take a part of it; tell whether it is whole."""
-        if self.status:
-            self._missing -= len(chunk)
-        else:
-            self._head += chunk
-            head, blank, body = self._head.partition(b"\r\n\r\n")
-            if not blank:
-                return False
-            self.status = int(head[9:12])
-            length, phases = _LENGTH.search(head), _PHASES.search(head)
-            self._missing = (int(length[1]) if length else 0) - len(body)
-            if phases:
-                self.phases_us = 1e3 * float(phases[1]), 1e3 * float(phases[2])
-        return self._missing <= 0
+    def on_header(self, name: bytes, value: bytes) -> None:
+        if name.lower() == b"server-timing" and (found := _PHASES.search(value)):
+            self.phases = 1e3 * float(found[1]), 1e3 * float(found[2])
+
+    def on_message_complete(self) -> None:
+        self.whole = True
 
 
-def _request(head: str, position: list[float], pressure: float, region: str) -> bytes:
-    contact = {"position": position, "pressure": pressure}
-    body = json.dumps({"contacts": [contact], "region": region})
-    return f"{head}content-length: {len(body)}\r\n\r\n{body}".encode()
+def write_requests(
+    url: str,
+    path: str,
+    token: str | None,
+    loads: tuple[NDArray[np.float64], NDArray[np.float64]],
+    region: str,
+) -> list[bytes]:
+    """Write requests for loads: positions (n, 3) mm and pressures (n,) kPa.
+
+    Answers are asked for in binary, with the fields of the nodes of `region`.
+    """
+    head = [f"POST {path} HTTP/1.1", f"host: {split_address(url).netloc}"]
+    head += [f"accept: {BINARY}", f"content-type: {JSON}"]
+    if token:
+        head.append(f"authorization: Bearer {token}")
+    requests = []
+    for position, pressure in zip(*(values.tolist() for values in loads), strict=True):
+        contact = {"position": position, "pressure": pressure}
+        body = json.dumps({"contacts": [contact], "region": region})
+        lines = [*head, f"content-length: {len(body)}", "", body]
+        requests.append("\r\n".join(lines).encode())
+    return requests

@@ -6,25 +6,14 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from hdrh.histogram import HdrHistogram
 from numpy.typing import NDArray
 
-from palpate.online.loadtest.generator import (
-    ANSWERED,
-    DROPPED,
-    LOST,
-    SUPERSEDED,
-    WINDOW,
-    Log,
-    Machine,
-)
+from palpate.online.loadtest import generator
+from palpate.online.loadtest.generator import ANSWERED, SUPERSEDED, Log, Machine
 from palpate.online.session.frames import Flag
 
 ON_TIME = 100.0
 """Latest that a message may be sent in a clean window, µs after it was due."""
-
-LONGEST = 6_000_000_000
-"""Largest latency that is counted as it is: a minute, in steps of 10 ns."""
 
 QUANTILES = {"p50_us": 50.0, "p90_us": 90.0, "p99_us": 99.0, "p999_us": 99.9, "max_us": 100.0}
 
@@ -32,24 +21,12 @@ Array = NDArray[np.float64]
 
 
 class Messages(NamedTuple):
-    """What became of some messages, in the order in which they were due.
+    """What became of n messages, in the order in which they were due; µs but for `due`."""
 
-    Parameters
-    ----------
-    due : ndarray, shape (n,), s
-    lateness : ndarray, shape (n,), µs
-        From when it was due to when its turn came; NaN if that never was.
-    latency : ndarray, shape (n,), µs
-        From due to answered; NaN without an answer.
-    solve, recover : ndarray, shape (n,), µs
-        What the server says that it spent on them; NaN without an answer.
-    outcome, flags : ndarray, shape (n,), int
-    """
-
-    due: Array
-    lateness: Array
-    latency: Array
-    solve: Array
+    due: Array  # s
+    lateness: Array  # from when it was due to when its turn came; NaN if that never was
+    latency: Array  # from due to answered; NaN without an answer
+    solve: Array  # what the server says that it spent; NaN without an answer
     recover: Array
     outcome: NDArray[np.int64]
     flags: NDArray[np.int64]
@@ -64,7 +41,7 @@ def gather(logs: Sequence[Log]) -> Messages:
     """Put the messages of several streams in one order."""
     due, sent, received, outcome, solve, recover, flags = (
         np.concatenate([getattr(log, name) for log in logs])
-        for name in ("due", "sent", "received", "outcome", "solve_us", "recover_us", "flags")
+        for name in ("due", "sent", "received", "outcome", "solve", "recover", "flags")
     )
     answered = outcome == ANSWERED
     messages = Messages(
@@ -93,25 +70,13 @@ def window_of(machine: Machine, messages: Messages) -> NDArray[np.int64]:
     return found.astype(np.int64)
 
 
-def histogram(microseconds: Array) -> HdrHistogram:
-    """Count durations up to `LONGEST` to three significant digits."""
-    counts = HdrHistogram(1, LONGEST, 3)
-    values, numbers = np.unique((100 * microseconds).round(), return_counts=True)
-    for value, number in zip(values.tolist(), numbers.tolist(), strict=True):
-        counts.record_value(min(int(value), LONGEST), number)
-    return counts
-
-
 def quantiles(microseconds: Array) -> dict[str, float | None]:
-    """Tell the `QUANTILES` of some durations that are not NaN; None if there are none."""
+    """Tell the `QUANTILES` of those durations that are not NaN; None if there are none."""
     known = microseconds[np.isfinite(microseconds)]
     if not len(known):
         return dict.fromkeys(QUANTILES)
-    counts = histogram(known)
-    return {
-        name: counts.get_value_at_percentile(percentile) / 100.0
-        for name, percentile in QUANTILES.items()
-    }
+    values = np.percentile(known, list(QUANTILES.values()), method="inverted_cdf")
+    return dict(zip(QUANTILES, values.tolist(), strict=True))
 
 
 def summarize(
@@ -126,9 +91,9 @@ def summarize(
     return {
         "due": len(messages.due),
         "answered": outcomes.pop(ANSWERED, 0),
-        "lost": outcomes.pop(LOST, 0),
+        "lost": outcomes.pop(generator.LOST, 0),
         "superseded": outcomes.pop(SUPERSEDED, 0),
-        "dropped": outcomes.pop(DROPPED, 0),
+        "dropped": outcomes.pop(generator.DROPPED, 0),
         "refused": {str(status): number for status, number in sorted(outcomes.items())},
         "flags": {bit.name: int((flags & bit > 0).sum()) for bit in Flag},
         "clean": quantiles(messages.latency[clean]),
@@ -140,20 +105,11 @@ def summarize(
 
 
 def summarize_added(messages: Messages, empty: Messages) -> dict[str, float]:
-    """Say what the service adds to a solve.
+    """Say what the service adds to a solve, in medians.
 
-    Parameters
-    ----------
-    messages : Messages
-        Queries, or frames of sessions.
-    empty : Messages
-        Queries that were only checked, or frames that were only echoed.
-
-    Returns
-    -------
-    dict
-        Medians: ``added_us``, round trips less what the service spent on solving and on recovering
-        fields; ``empty_us``, round trips of `empty`; and the first over the second, ``ratio``.
+    ``added_us`` is the round trip less what the service spent on solving and on recovering fields;
+    ``empty_us`` the round trip of what was only checked or echoed; ``ratio`` the first over the
+    second.
     """
     trip, empty_trip = (m.latency - m.lateness for m in (messages, empty))
     added = float(np.nanmedian(trip - messages.solve - messages.recover))
@@ -165,7 +121,7 @@ def summarize_machine(machine: Machine, messages: Messages) -> dict[str, Any]:
     """Say how well machine and generator kept the time."""
     clean = clean_windows(machine, messages)
     return {
-        "window_s": WINDOW,
+        "window_s": generator.WINDOW,
         "windows": len(clean),
         "clean_windows": int(clean.sum()),
         "steal_s": round(float(machine.steal.sum()), 2),
@@ -174,24 +130,15 @@ def summarize_machine(machine: Machine, messages: Messages) -> dict[str, Any]:
     }
 
 
-def summarize_overload(messages: Messages, machine: Machine, borders: Array) -> dict[str, Any]:
-    """Describe latencies before, during and after an overload.
+def summarize_overload(
+    messages: Messages, machine: Machine, start: float, end: float
+) -> dict[str, Any]:
+    """Describe latencies and answers before, during and after an overload of `start` to `end` (s).
 
-    Parameters
-    ----------
-    messages : Messages
-    machine : Machine
-    borders : ndarray, shape (4,), s
-        Start and end of the times before, during and after the overload.
-
-    Returns
-    -------
-    dict
-        Latencies and answers ``before``, ``during`` and ``after``, and ``recovered_s``: from the
-        end of the overload to the first window from which on no window's 99th percentile is above
-        twice the worst before; None if that never came, or nothing was well before.
+    ``recovered_s`` is from its end to the first window from which on no window's 99th percentile is
+    above twice the worst before; None if that never came, or nothing was well before.
     """
-    phases = np.searchsorted(borders[1:3], messages.due, "right")
+    phases = np.searchsorted([start, end], messages.due, "right")
     report: dict[str, Any] = {}
     for number, name in enumerate(("before", "during", "after")):
         of_phase = messages.where(phases == number)
@@ -206,7 +153,7 @@ def summarize_overload(messages: Messages, machine: Machine, borders: Array) -> 
     for w in np.unique(window[phases == 2])[::-1]:
         if np.isinf(bar) or _worst(messages, window, w) > bar:
             break
-        recovered = max(0.0, round(1e-9 * float(machine.borders[w]) - borders[2], 3))
+        recovered = max(0.0, round(1e-9 * float(machine.borders[w]) - end, 3))
     report["recovered_s"] = recovered
     return report
 

@@ -1,19 +1,21 @@
 """Put a load on a service: tools over the surface, and queries beside them."""
 
+import socket
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.online.client.connection import Connection, scene_path
 from palpate.online.client.http import Client
 from palpate.online.loadtest import report
 from palpate.online.loadtest.generator import Machine, Stream, drive
 from palpate.online.loadtest.paths import Tip, tool_path
-from palpate.online.loadtest.queries import QueryStream
+from palpate.online.loadtest.queries import QueryStream, write_requests
 from palpate.online.loadtest.report import Messages, clean_windows, gather, window_of
 from palpate.online.loadtest.sessions import FrameStream
-from palpate.online.loadtest.target import Target
+from palpate.online.session.websocket import ECHO
 from palpate.shared.errors import PalpateError
 
 Array = NDArray[np.float64]
@@ -27,99 +29,94 @@ SHARE = 0.15
 
 @dataclass(frozen=True)
 class Plan:
-    """What to put on a service: the options of ``palpate loadtest``, whose help says more.
-
-    Parameters
-    ----------
-    rate, queries : float, 1/s
-        Frames of each session, and queries in all.
-    duration : float, s
-    overload : float
-        If above 1: what the rates are multiplied with for another `duration`, before a third one
-        as the first.
-    depth : float, mm
-    outputs : int
-        Bits of `session.frames.Output`.
-    """
+    """What to put on a service: the options of ``palpate loadtest``, whose help says more."""
 
     url: str
     scene: str
     sessions: int = 1
-    rate: float = 1000.0
-    queries: float = 0.0
-    duration: float = 10.0
-    overload: float = 1.0
+    rate: float = 1000.0  # frames of each session, 1/s
+    queries: float = 0.0  # in all, 1/s
+    duration: float = 10.0  # s
+    overload: float = 1.0  # what rates are multiplied with for another duration, before a third one
     region: str = "all"
     connections: int = 4
-    depth: float = 1.0
-    outputs: int = 0
+    depth: float = 1.0  # mm
+    outputs: int = 0  # bits of `session.frames.Output`
     echo: bool = False
     token: str | None = None
     seed: int = 0
 
 
-@dataclass(frozen=True)
-class Outcome:
+class Outcome(NamedTuple):
     """What a load test found.
 
-    Parameters
-    ----------
-    summary : dict
-        JSON-able.
-    machine : Machine
-    clean : ndarray, shape (w,), bool
-        Which windows of `machine` were clean.
-    messages : dict of Messages
-        By kind: ``frames`` and ``queries``, and ``echoes`` and ``checks`` to compare them with;
-        those that were sent.
+    Messages are ``frames`` and ``queries``, and ``echoes`` and ``checks`` to compare them with.
     """
 
-    summary: dict[str, Any]
+    summary: dict[str, Any]  # JSON-able
     machine: Machine
-    clean: NDArray[np.bool_]
-    messages: dict[str, Messages]
+    clean: NDArray[np.bool_]  # (w,), which windows of the machine were clean
+    messages: dict[str, Messages]  # by kind, those that were sent
 
 
 def run(plan: Plan) -> Outcome:
     """Put a load on a service and report what became of it.
 
-    Raises
-    ------
-    PalpateError
-        If there is nothing to send, or the service cannot be reached, lacks the scene or refuses a
-        session.
+    Raises `PalpateError` if there is nothing to send, or the service cannot be reached, lacks the
+    scene or refuses a session.
     """
     if not (plan.sessions or plan.queries):
         raise PalpateError("nothing to send: ask for --sessions or --queries-per-second")
-    rng = np.random.default_rng(plan.seed)
-    with Client(plan.url, token=plan.token) as client:
-        scene = client.scene(plan.scene)
-        surface = client.accessible(plan.scene)
-    target = Target(plan.url, plan.scene, plan.token)
     streams: dict[str, list[Stream]] = {"frames": [], "queries": [], "echoes": [], "checks": []}
     try:
-        for i in range(plan.sessions):
-            due = _schedule(plan, plan.rate, i / plan.sessions)
-            path = tool_path(surface, Tip(scene["ranges"]["radius"], plan.depth), due, rng)
-            streams["frames"].append(FrameStream(target, due, path, plan.outputs))
-        if plan.sessions and plan.echo:
-            due = _schedule(plan, plan.rate, 0.5 / plan.sessions)
-            streams["echoes"].append(FrameStream(target, due, path, echo=True))
-        if plan.queries:
-            due = _schedule(plan, plan.queries, 0.5)
-            places = rng.choice(surface.vertices, len(due))
-            pressures = rng.uniform(0.0, SHARE * scene["ranges"]["pressure"][1], len(due))
-            loads = places, pressures, plan.region, plan.connections
-            streams["queries"].append(QueryStream(target, due, *loads))
-            if plan.echo:
-                due = _schedule(plan, plan.queries, 0.0)
-                streams["checks"].append(QueryStream(target, due, *loads, verb="check"))
+        _open(plan, streams)
         machine = drive([stream for kind in streams.values() for stream in kind])
     finally:
         for kind in streams.values():
             for stream in kind:
                 stream.close()
     return _judge(plan, machine, streams)
+
+
+def _open(plan: Plan, streams: dict[str, list[Stream]]) -> None:
+    """Connect to the service and make the streams of a plan."""
+    rng = np.random.default_rng(plan.seed)
+    with Client(plan.url, token=plan.token) as client:
+        ranges = client.scene(plan.scene)["ranges"]
+        surface = client.accessible(plan.scene)
+    for i in range(plan.sessions):
+        due = _schedule(plan, plan.rate, i / plan.sessions)
+        path = tool_path(surface, Tip(ranges["radius"], plan.depth), due, rng)
+        line = _connect(plan, scene_path(plan.scene, "/session"))
+        streams["frames"].append(FrameStream(line, due, path, plan.outputs))
+    if plan.sessions and plan.echo:
+        due = _schedule(plan, plan.rate, 0.5 / plan.sessions)
+        streams["echoes"].append(FrameStream(_connect(plan, ECHO), due, path))
+    if plan.queries:
+        due = _schedule(plan, plan.queries, 0.5)
+        places = rng.choice(surface.vertices, len(due))
+        loads = places, rng.uniform(0.0, SHARE * ranges["pressure"][1], len(due))
+        streams["queries"].append(_queries(plan, "/solve", due, loads))
+        if plan.echo:
+            due = _schedule(plan, plan.queries, 0.0)
+            streams["checks"].append(_queries(plan, "/check", due, loads))
+
+
+def _connect(plan: Plan, path: str) -> socket.socket:
+    """Open a WebSocket and read its greeting."""
+    try:
+        connection = Connection(plan.url, path, plan.token, timeout=10.0)
+    except PalpateError as error:
+        hint = " (start the service with: palpate serve --echo)" if path == ECHO else ""
+        raise PalpateError(f"{path}: {error}{hint}") from error
+    connection.receive()
+    return connection.socket
+
+
+def _queries(plan: Plan, verb: str, due: Array, loads: tuple[Array, Array]) -> QueryStream:
+    path = scene_path(plan.scene, verb)
+    requests = write_requests(plan.url, path, plan.token, loads, plan.region)
+    return QueryStream(plan.url, plan.connections, due, requests)
 
 
 def _schedule(plan: Plan, rate: float, shift: float) -> Array:
@@ -156,8 +153,8 @@ def _judge(plan: Plan, machine: Machine, streams: dict[str, list[Stream]]) -> Ou
             if name in messages
         }
     if plan.overload > 1.0:
-        borders = LEAD + np.arange(4.0) * plan.duration
+        start, end = LEAD + plan.duration, LEAD + 2.0 * plan.duration
         summary["overload"] = report.summarize_overload(
-            messages.get("frames", every), machine, borders
+            messages.get("frames", every), machine, start, end
         )
     return Outcome(summary, machine, clean, messages)

@@ -3,61 +3,42 @@
 With a WebSocket library the library would be measured too.
 """
 
-import base64
-import os
 import socket
 import struct
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.online.loadtest.generator import ANSWERED, CHUNK, SUPERSEDED, Stream
-from palpate.online.loadtest.target import Target
+from palpate.online.loadtest.generator import ANSWERED, SUPERSEDED, Stream
 from palpate.online.session.frames import REPLY, REQUEST, VERSION
-from palpate.online.session.websocket import ECHO
-from palpate.shared.errors import PalpateError
 
 _TEXT, _BINARY, _CLOSE, _PING, _PONG = 1, 2, 8, 9, 10
 _FINAL, _MASKED = 0x80, 0x80
 
-
-def _offset(name: str) -> int:
-    assert REPLY.fields is not None
-    return int(REPLY.fields[name][1])
-
-
-_SOLVED, _DROPPED = _offset("solve_time"), _offset("superseded")
+_OFFSETS = {name: int(field[1]) for name, field in (REPLY.fields or {}).items()}
+_SOLVED, _DROPPED = _OFFSETS["solve_time"], _OFFSETS["superseded"]
 _NEWS = struct.Struct(f"<2xHI{_SOLVED - 8}xf{_DROPPED - _SOLVED - 4}xI")
 """Flags, number, solve_time and superseded of a reply."""
 
 
 class FrameStream(Stream):
-    """One session that sends its positions when they are due; or an echo of the same frames.
+    """A session, or an echo, that is sent positions (n, 3) mm when they are due (n,) s.
 
-    Parameters
-    ----------
-    target : Target
-    due : ndarray, shape (n,), s
-    positions : ndarray, shape (n, 3), mm
-    outputs : int
-        Bits of `session.frames.Output`.
-    echo : bool
-        Whether to send the frames to the service's echo rather than to a session.
+    Its socket is one whose greeting was read; outputs are bits of `session.frames.Output`.
     """
 
     def __init__(
         self,
-        target: Target,
+        connection: socket.socket,
         due: NDArray[np.float64],
         positions: NDArray[np.float64],
         outputs: int = 0,
-        echo: bool = False,
     ) -> None:
-        self._socket, self._received = _open(target, ECHO if echo else target.path("session"))
-        super().__init__(due, [self._socket])
+        super().__init__(due, [connection])
+        self._socket = connection
         self._messages = _messages(due, positions, outputs)
         self._size = len(self._messages) // len(due)
-        self._unsent = b""
+        self._received = self._unsent = b""
         self._last_sent = self._last_answered = -1
         self._open = True
 
@@ -96,7 +77,7 @@ class FrameStream(Stream):
         log.received[number] = now
         log.outcome[number] = ANSWERED
         log.flags[number] = flags
-        log.solve_us[number] = 1e6 * solve_time
+        log.solve[number] = 1e6 * solve_time
         for dropped in range(max(number - superseded, self._last_answered + 1), number):
             log.outcome[dropped] = SUPERSEDED
         self._last_answered = number
@@ -163,43 +144,3 @@ def _frame(received: bytes, start: int, end: int) -> tuple[int, int, int] | None
     if begin + length > end:
         return None
     return received[start] & 0x0F, begin, begin + length
-
-
-def _open(target: Target, path: str) -> tuple[socket.socket, bytes]:
-    """Open a session and wait for its greeting; return the socket and what came after that."""
-    connection = target.connect()
-    try:
-        return connection, _shake_hands(connection, target, path)
-    except BaseException:
-        connection.close()
-        raise
-
-
-def _shake_hands(connection: socket.socket, target: Target, path: str) -> bytes:
-    head = target.head(
-        "GET",
-        path,
-        connection="upgrade",
-        upgrade="websocket",
-        sec_websocket_version="13",
-        sec_websocket_key=base64.b64encode(os.urandom(16)).decode(),
-    )
-    connection.sendall(f"{head}\r\n".encode())
-    received = b""
-    while b"\r\n\r\n" not in received:
-        received += _more(connection)
-    answer, _, received = received.partition(b"\r\n\r\n")
-    if not answer.startswith(b"HTTP/1.1 101"):
-        hint = " (start the service with: palpate serve --echo)" if path == ECHO else ""
-        status = answer.decode("latin-1").splitlines()[0]
-        raise PalpateError(f"{path}: {status} {received.decode('latin-1')}{hint}")
-    while (greeting := _frame(received, 0, len(received))) is None:
-        received += _more(connection)
-    return received[greeting[2] :]
-
-
-def _more(connection: socket.socket) -> bytes:
-    chunk = connection.recv(CHUNK)
-    if not chunk:
-        raise PalpateError("the service closed the connection")
-    return chunk

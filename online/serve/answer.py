@@ -14,9 +14,9 @@ from starlette.responses import Response
 from palpate.online.serve import wire
 from palpate.online.serve.errors import Refusal, check_json_size
 from palpate.online.serve.metrics import PHASES, Metrics
-from palpate.online.serve.negotiation import JSON
 from palpate.online.serve.schemas import Contact, HistoryRequest, SolveRequest, parse
 from palpate.online.serve.store import ServedModel
+from palpate.online.serve.wire import JSON
 from palpate.shared.answer import Answer, describe
 from palpate.shared.errors import QueryError
 from palpate.shared.model import ReducedModel, Warm
@@ -33,20 +33,8 @@ def answer(
 ) -> Response:
     """Solve a request from rest and write the answer.
 
-    Each request is answered on its own: the same request has the same answer, whatever came
-    before it. Sessions are for clients that want a warm start.
-
-    Parameters
-    ----------
-    served : ServedModel
-    kind : SolveRequest or HistoryRequest
-        What the body holds.
-    body : bytes
-    media_type : str
-        Of the answer.
-    max_json_numbers : int
-        Largest number of field values in JSON.
-    metrics : Metrics
+    The same request has the same answer, whatever came before it. Sessions are for clients that
+    want a warm start.
 
     Raises
     ------
@@ -58,16 +46,22 @@ def answer(
     request = parse(kind, body)
     model = served.model
     if media_type == JSON:
-        check_json_size(_count(model, request), max_json_numbers, "region")
+        nodes = {"none": 0, "surface": len(model.surface_nodes), "all": len(model.nodes)}
+        per_node = 3 * ("displacement" in request.outputs) + ("von_mises" in request.outputs)
+        check_json_size(per_node * nodes[request.region], max_json_numbers, "region")
     start = perf_counter()
-    if isinstance(request, SolveRequest):
-        answers = _solve(model, request)
-    else:
+    if isinstance(request, HistoryRequest):
         answers = _follow(model, request)
+    else:
+        answers = [_press(model, request.contacts[0], "contacts.0")]
     solved = perf_counter()
     fields = _recover(model, answers[-1], request)
     recovered = perf_counter()
-    head = _head(model, answers)
+    head: wire.Head = {"scene": model.name}
+    if isinstance(request, HistoryRequest):
+        head["steps"] = [describe(answer) for answer in answers]
+    else:
+        head |= describe(answers[0])
     head["timing"] = {"solve_us": 1e6 * (solved - start), "recover_us": 1e6 * (recovered - solved)}
     content = wire.encode(media_type, head, fields)
     borders = (received, start, solved, recovered, perf_counter())
@@ -79,27 +73,16 @@ def answer(
     return Response(content, media_type=media_type, headers={"server-timing": timing})
 
 
-def _count(model: ReducedModel, request: SolveRequest | HistoryRequest) -> int:
-    """Count the numbers in the fields that a request wants."""
-    nodes = {"none": 0, "surface": len(model.surface_nodes), "all": len(model.nodes)}
-    per_node = 3 * ("displacement" in request.outputs) + ("von_mises" in request.outputs)
-    return per_node * nodes[request.region]
-
-
-def _solve(model: ReducedModel, request: SolveRequest) -> list[Answer]:
-    return [_press(model, request.contacts[0], "contacts.0")]
-
-
 def _follow(model: ReducedModel, request: HistoryRequest) -> list[Answer]:
+    """Answer loads over time, step by step."""
     if not model.scene.tissue.prony:
         raise Refusal("no_time", "name", "The tissue of this scene is elastic; ask it to solve")
     past: Past | None = REST
     warm, now, answers = model.new_warm(), 0.0, []
     for number, step in enumerate(request.steps):
         path = f"steps.{number}.contact"
-        found = _press(model, step.contact, path, past, step.time - now, warm)
-        past, now = found.past, step.time
-        answers.append(found)
+        answers.append(_press(model, step.contact, path, past, step.time - now, warm))
+        past, now = answers[-1].past, step.time
     return answers
 
 
@@ -147,10 +130,3 @@ def _recover(
     if not all(np.isfinite(field).all() for field in fields.values()):
         raise Refusal("no_equilibrium", "region", "The fields of this answer are not finite")
     return fields
-
-
-def _head(model: ReducedModel, answers: list[Answer]) -> dict[str, Any]:
-    """Write all but the fields, JSON-able."""
-    if answers[0].past is None:
-        return {"scene": model.name} | describe(answers[0])
-    return {"scene": model.name, "steps": [describe(answer) for answer in answers]}

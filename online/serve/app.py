@@ -6,7 +6,6 @@ import logging
 import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
-from functools import partial
 from importlib.metadata import version
 from typing import Any
 
@@ -17,11 +16,11 @@ from pydantic.json_schema import models_json_schema
 from palpate.online.serve import errors, guard
 from palpate.online.serve.answer import answer
 from palpate.online.serve.metrics import Metrics
-from palpate.online.serve.negotiation import JSON, OFFERED
 from palpate.online.serve.routes import Service, add_routes
 from palpate.online.serve.schemas import CONVENTIONS, HistoryRequest, SolveRequest
 from palpate.online.serve.settings import Settings
 from palpate.online.serve.store import ServedModel, Store
+from palpate.online.serve.wire import JSON, OFFERED
 from palpate.online.session.session import Sessions
 
 logger = logging.getLogger(__name__)
@@ -30,37 +29,24 @@ logger = logging.getLogger(__name__)
 def create_app(
     settings: Settings,
     store: Store | None = None,
-    on_ready: Callable[[Store], None] | None = None,
+    on_ready: Callable[[Store], None] = lambda store: None,
     metrics: Metrics | None = None,
 ) -> FastAPI:
     """Make the service.
 
     It answers at once; the models are loaded and warmed meanwhile, and ``/ready`` says when that
-    is done. One of several workers leaves all clients to the others until it is ready.
-
-    Parameters
-    ----------
-    settings : Settings
-    store : Store, optional
-        Where models come from; by default the artifacts of `settings`.
-    on_ready : callable, optional
-        Called once, on the thread that answers, when every model is warm.
-    metrics : Metrics, optional
-        Where to count; by default in a table of its own.
+    is done; `on_ready` is then called on the thread that answers. One of several workers leaves
+    all clients to the others until it is ready.
     """
-    models = Store(settings.artifacts) if store is None else store
-    counts = Metrics() if metrics is None else metrics
+    models, counts = store or Store(settings.artifacts), metrics or Metrics()
     sessions = Sessions(models, settings, counts)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        preparing = asyncio.create_task(_prepare(models, sessions, on_ready))
+        prepared = _prepare(models, sessions, on_ready)
         if settings.workers > 1:
-            await preparing
+            await prepared.wait()
         yield
-        preparing.cancel()
-        with suppress(asyncio.CancelledError):
-            await preparing
 
     app = FastAPI(
         title="Palpate",
@@ -77,41 +63,35 @@ def create_app(
     errors.install(app)
     guard.install(app, settings, counts)
     add_routes(app, sessions, settings.echo)
-    _describe_request(app)
+    _describe_requests(app)
     return app
 
 
-async def _prepare(
-    store: Store, sessions: Sessions, on_ready: Callable[[Store], None] | None
-) -> None:
-    """Load and warm the models in a thread, then keep the collector away from them."""
-    loop = asyncio.get_running_loop()
-    opened: asyncio.Future[bool] = loop.create_future()
+def _prepare(store: Store, sessions: Sessions, on_ready: Callable[[Store], None]) -> asyncio.Event:
+    """Load and warm the models in a thread; return what is set when that is over."""
+    loop, prepared = asyncio.get_running_loop(), asyncio.Event()
 
-    def tell(whether: bool) -> None:
-        if not opened.done():
-            opened.set_result(whether)
+    def finish() -> None:
+        gc.collect()
+        gc.freeze()  # the collector need not look at the models again
+        store.ready = True
+        on_ready(store)
+        prepared.set()
 
     def load() -> None:
-        done = False
+        over = finish
         try:
-            store.open(partial(_warm, sessions))
-            done = True
+            store.open(lambda served: _warm(sessions, served))
         except Exception:
             logger.exception("the models could not be loaded")
+            over = prepared.set
         with suppress(RuntimeError):  # the service has ended meanwhile
-            loop.call_soon_threadsafe(tell, done)
+            loop.call_soon_threadsafe(over)
 
     logger.info("loading models; where kernels are compiled for the first time, it takes minutes")
     # a daemon: a service that has to stop does not wait for it
     threading.Thread(target=load, name="loading", daemon=True).start()
-    if not await opened:
-        return
-    gc.collect()
-    gc.freeze()
-    store.ready = True
-    if on_ready is not None:
-        on_ready(store)
+    return prepared
 
 
 def _warm(sessions: Sessions, served: ServedModel) -> None:
@@ -137,8 +117,8 @@ def _warm(sessions: Sessions, served: ServedModel) -> None:
         sessions.prepare(served, [position.tolist() for position in above])
 
 
-def _describe_request(app: FastAPI) -> None:
-    """Add the schema of the hand-read request body to the application's OpenAPI document."""
+def _describe_requests(app: FastAPI) -> None:
+    """Add the schemas of the request bodies, which are read by hand, to the OpenAPI document."""
     generate = app.openapi
 
     def openapi() -> dict[str, Any]:

@@ -1,8 +1,6 @@
 """Everything the service can refuse: one table from code to status, one shape of body.
 
-``{"error": {"code", "field", "message", "allowed"}}`` — `field` is the path of what is wrong in the
-request, such as ``contacts.0.pressure``, and `allowed` what would be right, where that can be said
-in a few words. No input is echoed, so a NaN sent is never a NaN returned.
+No input is echoed, so a NaN sent is never a NaN returned.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,18 +37,8 @@ STATUS = {code: status for status, codes in _CODES.items() for code in codes.spl
 class Refusal(PalpateError):
     """A request that gets no answer.
 
-    Parameters
-    ----------
-    code : str
-        A key of `STATUS`.
-    field : str
-        Path of what is wrong in the request.
-    message : str
-        What is wrong with it.
-    allowed : JSON-able, optional
-        What would be right.
-    headers : mapping from str to str, optional
-        Headers of the response, such as ``Retry-After``.
+    `code` is a key of `STATUS`; `field` the path of what is wrong in the request, such as
+    ``contacts.0.pressure``; `allowed` what would be right, where that is short.
     """
 
     def __init__(
@@ -62,11 +50,8 @@ class Refusal(PalpateError):
         headers: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(message)
-        self.code = code
-        self.field = field
-        self.message = message
-        self.allowed = allowed
-        self.headers = headers
+        self.code, self.field, self.message = code, field, message
+        self.allowed, self.headers = allowed, headers
 
     def response(self) -> Response:
         """Make the HTTP response that says so."""
@@ -94,12 +79,8 @@ def check_json_size(numbers: int, limit: int, field: str) -> None:
 def invalid(details: Sequence[Any], names: Mapping[str, Sequence[str]] | None = None) -> Refusal:
     """Make the refusal of a request that pydantic complained about.
 
-    Parameters
-    ----------
-    details : sequence of pydantic error details
-        Their locations start at the body's top.
-    names : mapping from table to keys, optional
-        The valid keys of the body (``""``) and of its tables (``"contacts"``).
+    The locations of its `details` start at the body's top; `names` are the valid keys of the body
+    (``""``) and of its tables (``"contacts"``).
     """
     # a misspelt key also leaves its right name missing; the misspelling comes first
     first = min(details, key=lambda detail: detail["type"] != "extra_forbidden")
@@ -107,57 +88,40 @@ def invalid(details: Sequence[Any], names: Mapping[str, Sequence[str]] | None = 
     field = ".".join(path) or "body"
     if first["type"] == "json_invalid":
         return Refusal("invalid_json", "body", first["msg"])
-    context = {key: value for key, value in first.get("ctx", {}).items() if key != "error"}
-    allowed: Any = context or None
     if first["type"] == "extra_forbidden" and names is not None:
-        allowed = names[path[0] if len(path) > 1 else ""]
+        allowed: Any = names[path[0] if len(path) > 1 else ""]
+    else:
+        allowed = {k: v for k, v in first.get("ctx", {}).items() if k != "error"} or None
     return Refusal("invalid_value", field, first["msg"], allowed)
 
 
-def _refuse(request: Request, refusal: Refusal) -> Response:
+def _refusal(error: Exception) -> Refusal:
+    """Say in the one shape what stopped a request."""
+    match error:
+        case Refusal():
+            return error
+        case RequestValidationError():  # path and query parameters, all that FastAPI checks here
+            return invalid([{**detail, "loc": detail["loc"][1:]} for detail in error.errors()])
+        case HTTPException(status_code=405):
+            methods = Headers(error.headers).get("allow", "").split(", ")
+            message = "Not a method of this path"
+            return Refusal("method_not_allowed", "method", message, methods, error.headers)
+        case HTTPException():
+            return Refusal("not_found", "path", "There is nothing at this path; see /docs")
+        case _:  # without details; it is raised on to the server, which logs it
+            return Refusal("internal", "", "The service failed; its log says why")
+
+
+async def _refuse(request: Request, error: Exception) -> Response:
     """Count a refusal and answer with it."""
+    if isinstance(error, ClientDisconnect):
+        return Response(status_code=400)  # nobody is there to read it
+    refusal = _refusal(error)
     request.app.state.service.metrics.count_refusal(refusal.code)
     return refusal.response()
 
 
-async def _refusal(request: Request, error: Exception) -> Response:
-    assert isinstance(error, Refusal)
-    return _refuse(request, error)
-
-
-async def _parameters(request: Request, error: Exception) -> Response:
-    """Answer wrong path and query parameters, all that FastAPI checks here."""
-    assert isinstance(error, RequestValidationError)
-    details = [{**detail, "loc": detail["loc"][1:]} for detail in error.errors()]
-    return _refuse(request, invalid(details))
-
-
-async def _http(request: Request, error: Exception) -> Response:
-    """Answer what the router refuses before any endpoint is found."""
-    assert isinstance(error, HTTPException)
-    if error.status_code == 405:
-        methods = Headers(error.headers).get("allow", "").split(", ")
-        message = "Not a method of this path"
-        refusal = Refusal("method_not_allowed", "method", message, methods, error.headers)
-    else:
-        refusal = Refusal("not_found", "path", "There is nothing at this path; see /docs")
-    return _refuse(request, refusal)
-
-
-async def _gone(request: Request, error: Exception) -> Response:
-    """Let a client go that hung up before its request was whole; nobody reads this."""
-    return Response(status_code=400)
-
-
-async def _bug(request: Request, error: Exception) -> Response:
-    """Answer anything else without details; it is raised on to the server, which logs it."""
-    return _refuse(request, Refusal("internal", "", "The service failed; its log says why"))
-
-
 def install(app: FastAPI) -> None:
     """Make `app` answer every error in the one shape, and count it in ``app.state.service``."""
-    app.add_exception_handler(Refusal, _refusal)
-    app.add_exception_handler(RequestValidationError, _parameters)
-    app.add_exception_handler(HTTPException, _http)
-    app.add_exception_handler(ClientDisconnect, _gone)
-    app.add_exception_handler(Exception, _bug)
+    for kind in (Refusal, RequestValidationError, HTTPException, ClientDisconnect, Exception):
+        app.add_exception_handler(kind, _refuse)

@@ -54,8 +54,7 @@ class Guard:
     """Passes on what may pass and refuses the rest."""
 
     def __init__(self, app: ASGIApp, settings: Settings, metrics: Metrics) -> None:
-        self._app = app
-        self._metrics = metrics
+        self._app, self._metrics = app, metrics
         self._origins = frozenset(origin.encode() for origin in settings.origins)
         self._hosts = frozenset(host.lower() for host in settings.hosts)
         self._secret = f"Bearer {settings.token}".encode() if settings.token else None
@@ -84,10 +83,9 @@ class Guard:
             self._check_rate(scope, now)
 
     def _check_host(self, headers: Mapping[bytes, bytes]) -> None:
-        """Refuse calls by other names than this machine's.
+        """Refuse calls by other names than this machine's (DNS rebinding).
 
-        A page of another site may have its own name lead here (DNS rebinding); its origin is then
-        that of the service.
+        A page of another site may have its own name lead here; its origin is then the service's.
         """
         host = _host(headers.get(b"host", b""))
         if self._hosts and host not in self._hosts and not _is_loopback_address(host):
@@ -156,11 +154,10 @@ def _is_loopback_address(host: str) -> bool:
 
 
 class RateLimit:
-    """A bucket of tokens per client that fills at `rate` (1/s).
+    """A bucket of tokens per client that fills at `rate` (1/s) and holds `BURST` seconds' worth.
 
-    It holds `BURST` seconds' worth, but at least one. Kept as the one moment at which the bucket
-    will be full again (the generic cell rate algorithm of ATM networks), so that an idle client
-    costs nothing.
+    Kept as the one moment at which the bucket will be full again (the generic cell rate algorithm
+    of ATM networks), so that an idle client costs nothing.
     """
 
     def __init__(self, rate: float) -> None:
@@ -176,10 +173,7 @@ class RateLimit:
             return wait
         self._full_at[client] = full_at + 1.0 / self.rate
         if len(self._full_at) > MOST_CLIENTS:
-            self._forget(now)
-        return 0.0
-
-    def _forget(self, now: float) -> None:
-        self._full_at = {name: at for name, at in self._full_at.items() if at > now}
+            self._full_at = {name: at for name, at in self._full_at.items() if at > now}
         if len(self._full_at) > MOST_CLIENTS:
             self._full_at.clear()
+        return 0.0

@@ -62,17 +62,16 @@ FULL = _http(Refusal("overloaded", "", _NO_PLACE, _LIMIT, _LATER).response())
 
 
 class HttpProtocol(HttpToolsProtocol):
-    """Uvicorn's HTTP, which also notes when it read a request, and whom it waits for.
+    """Uvicorn's HTTP, which also notes when it read a request, and bounds what connections cost.
 
-    A connection beyond `MOST_CONNECTIONS` is refused and closed, and one whose request is not
-    whole after `PATIENCE` is closed: it holds a place and memory.
+    One beyond `MOST_CONNECTIONS` is refused, and one whose request is not whole after `PATIENCE` is
+    closed.
     """
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Take over a connection."""
         super().connection_made(transport)
-        self.waiting_since: float | None = self.loop.time()
-        self.patience = self.loop.call_later(PATIENCE, self.check_patience)
+        self.patience = self.loop.call_later(PATIENCE, transport.abort)
         if len(self.connections) > MOST_CONNECTIONS:
             transport.write(FULL)
             transport.close()
@@ -85,27 +84,14 @@ class HttpProtocol(HttpToolsProtocol):
     def on_message_begin(self) -> None:
         """Begin a request."""
         super().on_message_begin()
-        self.waiting_since = self.loop.time()
+        self.patience.cancel()
+        self.patience = self.loop.call_later(PATIENCE, self.transport.abort)
         self.scope[RECEIVED] = perf_counter()  # type: ignore[literal-required]
 
     def on_message_complete(self) -> None:
-        """End a request."""
+        """End a request; a handshake also ends here."""
         super().on_message_complete()
-        self.waiting_since = None
-
-    def handle_websocket_upgrade(self) -> None:
-        """Leave a connection to its session."""
         self.patience.cancel()
-        super().handle_websocket_upgrade()
-
-    def check_patience(self) -> None:
-        """Close the connection if its request has been coming for too long; else look again."""
-        now = self.loop.time()
-        since = now if self.waiting_since is None else self.waiting_since
-        if now - since >= PATIENCE:
-            self.transport.abort()
-        else:
-            self.patience = self.loop.call_at(since + PATIENCE, self.check_patience)
 
 
 class Supervisor(Multiprocess):
@@ -122,15 +108,7 @@ class Supervisor(Multiprocess):
 
 
 def serve(settings: Settings, host: str, port: int, public: bool) -> None:
-    """Serve until a signal says to end.
-
-    Parameters
-    ----------
-    settings : Settings
-    host, port
-        Where to listen; port 0 takes a free one.
-    public : bool
-        Whether other machines may be served without a token.
+    """Serve until a signal says to end; port 0 takes a free one.
 
     Raises
     ------
@@ -143,33 +121,45 @@ def serve(settings: Settings, host: str, port: int, public: bool) -> None:
             f"palpate train turbinate --out {settings.artifacts / 'turbinate.h5'}"
         )
     if not settings.token and not public:
-        settings = replace(settings, hosts=_local_names(host))
+        if not is_loopback(host):
+            raise PalpateError(
+                f"--host {host or '(any)'} lets other machines in: set PALPATE_TOKEN, or say "
+                "--public to serve anybody"
+            )
+        settings = replace(settings, hosts=("localhost", host))
     logs.set_up(settings)
     try:
-        _run(settings, host, port)
+        with tempfile.TemporaryDirectory(prefix="palpate-") as directory:
+            _run(settings, host, port, Path(directory) / "metrics")
     finally:
         _leave_loading()
 
 
-def _run(settings: Settings, host: str, port: int) -> None:
-    with tempfile.TemporaryDirectory(prefix="palpate-") as directory:
-        config = _config(settings, host, port)
-        bound = config.bind_socket()
-        # From here on clients wait for a worker that is ready rather than being turned away.
-        bound.listen(config.backlog)
-        url = f"http://{f'[{host}]' if ':' in host else host}:{bound.getsockname()[1]}"
-        table = None
-        if settings.workers > 1:
-            table = Path(directory) / "metrics"
-            make_table(table, settings.workers)
-        config.app = partial(_work, settings, url, table)
-        # A server shuts down on a signal and then raises it again, for us to end cleanly.
-        for stop in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(stop, lambda *_: sys.exit(0))
-        if settings.workers > 1:
-            Supervisor(config, [bound]).run()
-        else:
-            uvicorn.Server(config).run([bound])
+def _run(settings: Settings, host: str, port: int, table: Path) -> None:
+    config = uvicorn.Config(
+        "",  # known once the socket is bound
+        factory=True,
+        host=host,
+        port=port,
+        workers=settings.workers,
+        http=HttpProtocol,
+        log_config=None,
+        access_log=settings.access_log,
+        **OPTIONS,
+    )
+    bound = config.bind_socket()
+    # From here on clients wait for a worker that is ready rather than being turned away.
+    bound.listen(config.backlog)
+    url = f"http://{f'[{host}]' if ':' in host else host}:{bound.getsockname()[1]}"
+    make_table(table, settings.workers)
+    config.app = partial(_work, settings, url, table)
+    # A server shuts down on a signal and then raises it again, for us to end cleanly.
+    for stop in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(stop, lambda *_: sys.exit(0))
+    if settings.workers > 1:
+        Supervisor(config, [bound]).run()
+    else:
+        uvicorn.Server(config).run([bound])
 
 
 def _leave_loading() -> None:
@@ -184,31 +174,7 @@ def _leave_loading() -> None:
         os._exit(0)
 
 
-def _local_names(host: str) -> tuple[str, ...]:
-    """Names by which to serve all who ask: this machine's, if it alone can ask."""
-    if not is_loopback(host):
-        raise PalpateError(
-            f"--host {host or '(any)'} lets other machines in: set PALPATE_TOKEN, or say "
-            "--public to serve anybody"
-        )
-    return ("localhost", host)
-
-
-def _config(settings: Settings, host: str, port: int) -> uvicorn.Config:
-    return uvicorn.Config(
-        "",  # known once the socket is bound
-        factory=True,
-        host=host,
-        port=port,
-        workers=settings.workers,
-        http=HttpProtocol,
-        log_config=None,
-        access_log=settings.access_log,
-        **OPTIONS,
-    )
-
-
-def _work(settings: Settings, url: str, table: Path | None) -> FastAPI:
+def _work(settings: Settings, url: str, table: Path) -> FastAPI:
     """Make the application of one worker, in its own process."""
     # Not before: the supervisor has no use for the models' code.
     from palpate.online.serve.app import create_app
@@ -216,7 +182,8 @@ def _work(settings: Settings, url: str, table: Path | None) -> FastAPI:
     logs.set_up(settings)
     # Uvicorn tells of every session that opens; that it starts and ends, the supervisor tells.
     logging.getLogger("uvicorn.error").setLevel(logging.WARNING)
-    metrics = Metrics(table)
+    # On systems without file locks there is one worker, which has no use for a table.
+    metrics = Metrics(table if settings.workers > 1 else None)
 
     def greet(store: "Store") -> None:
         if settings.realtime:
@@ -233,9 +200,8 @@ def _invite(store: "Store", url: str) -> None:
     for refused in store.refused:
         click.echo(f"Refused {refused.reason}")
     click.echo(f"Serving {', '.join(store.models) or 'nothing'} on {url} (API: {url}/docs)")
-    for name, model in store.models.items():
+    for name, model in list(store.models.items())[:1]:
         click.echo(
             f"Try: curl {url}/scenes/{name}/solve -H 'Content-Type: application/json' "
             f"-d '{json.dumps({'contacts': [model.example]})}'"
         )
-        break

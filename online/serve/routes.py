@@ -13,10 +13,10 @@ from palpate.online.serve.answer import answer
 from palpate.online.serve.errors import Refusal
 from palpate.online.serve.guard import METRICS
 from palpate.online.serve.metrics import CONTENT_TYPE, Metrics
-from palpate.online.serve.negotiation import BINARY, JSON, MSGPACK, negotiate
 from palpate.online.serve.schemas import HistoryRequest, MeshRegion, SolveRequest, parse
 from palpate.online.serve.settings import Settings
 from palpate.online.serve.store import ServedModel, Store
+from palpate.online.serve.wire import BINARY, JSON, MSGPACK, negotiate
 from palpate.online.session import frames
 from palpate.online.session.protocol import tables
 from palpate.online.session.session import Sessions
@@ -24,12 +24,8 @@ from palpate.online.session.websocket import ECHO, Echo
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 
 SceneName = Annotated[str, Path(description="Name of a served scene.", examples=["turbinate"])]
-_NAME = {
-    "name": "name",
-    "in": "path",
-    "required": True,
+_NAME = {"name": "name", "in": "path", "required": True, "schema": {"type": "string"}} | {
     "description": "Name of a served scene.",
-    "schema": {"type": "string"},
     "example": "turbinate",
 }
 
@@ -169,8 +165,7 @@ async def served_scenes(request: Request) -> Any:
         {"name": name, "description": served.model.scene.description}
         for name, served in store.models.items()
     ]
-    refused = [{"file": r.file, "reason": r.reason} for r in store.refused]
-    return _json({"scenes": served, "refused": refused})
+    return _json({"scenes": served, "refused": store.refused})
 
 
 @scenes.get("/{name}", response_model=schemas.SceneSummary, responses=_problems(404, 422))
@@ -212,10 +207,9 @@ async def mesh(name: SceneName, request: Request, region: MeshRegion = "surface"
     """
     media_type = _media_type(request)
     served: ServedModel = request.app.state.service.store.model(name)
-    body = served.meshes.get((region, media_type))
-    if body is None:
-        body = served.meshes[region, media_type] = _mesh(served, region, media_type)
-    return Response(body, media_type=media_type)
+    if (region, media_type) not in served.meshes:
+        served.meshes[region, media_type] = _mesh(served, region, media_type)
+    return Response(served.meshes[region, media_type], media_type=media_type)
 
 
 @scenes.get(
@@ -273,11 +267,11 @@ def _mesh(served: ServedModel, region: str, media_type: str) -> bytes:
     model = served.model
     surface = np.ascontiguousarray(model.surface_nodes, np.int32)
     triangles = np.ascontiguousarray(model.surface_triangles, np.int32)
-    whole = region == "all"
-    arrays: dict[str, Any] = {
-        "nodes": (model.nodes if whole else model.nodes[surface]).astype(np.float32),
-        "triangles": surface[triangles] if whole else triangles,
+    chosen: Any = slice(None) if region == "all" else surface
+    arrays = {
+        "nodes": model.nodes[chosen].astype(np.float32),
+        "triangles": surface[triangles] if region == "all" else triangles,
         "surface_nodes": surface,
-        "clamped": (model.clamped if whole else model.clamped[surface]).astype(np.uint8),
+        "clamped": model.clamped[chosen].astype(np.uint8),
     }
     return wire.encode(media_type, {"scene": model.name, "region": region}, arrays)

@@ -1,7 +1,7 @@
-"""What goes over the wire, for the validator and for the reader of the OpenAPI page.
+"""What goes over the wire: requests are checked against these models.
 
-Requests are checked against these models; answers are written straight from arrays
-(`serve.answer`), and their models below only describe them.
+Answers are written straight from arrays (`serve.answer`); their models below describe them to the
+reader of the OpenAPI page.
 """
 
 from typing import Annotated, Any, Literal, TypeVar
@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, f
 from pydantic_core import PydanticCustomError
 
 from palpate.online.serve.errors import invalid
+from palpate.online.serve.store import RefusedFile
 
 CONVENTIONS = "Units are mm, mN, kPa and s throughout; forces are those of the tissue on the tool."
 """Of every endpoint and of sessions."""
@@ -18,14 +19,14 @@ FieldName = Literal["displacement", "von_mises"]
 Region = Literal["none", "surface", "all"]
 MeshRegion = Literal["surface", "all"]
 
-Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
-Component = Annotated[float, Field(ge=-1e3, le=1e3)]
-Position = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
-Direction = Annotated[list[Component], Field(min_length=3, max_length=3)]
-Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
-Triangle = Annotated[list[int], Field(min_length=3, max_length=3)]
+_THREE = Field(min_length=3, max_length=3)
+Position = Annotated[list[Annotated[float, Field(ge=-1e4, le=1e4)]], _THREE]
+Direction = Annotated[list[Annotated[float, Field(ge=-1e3, le=1e3)]], _THREE]
+Vector = Annotated[list[float], _THREE]
+Triangle = Annotated[list[int], _THREE]
 
 SHORTEST_DIRECTION = 1e-3
+"""Length below which a direction is none."""
 
 MOST_STEPS = 200
 """Largest number of steps of a history: so many keep others waiting for some 50 ms."""
@@ -35,11 +36,7 @@ EXAMPLE_CONTACT: JsonValue = {
     "pressure": 4.0,
     "direction": [0.1, 0.0, -1.0],
 }
-EXAMPLE: JsonValue = {
-    "contacts": [EXAMPLE_CONTACT],
-    "outputs": ["displacement"],
-    "region": "surface",
-}
+EXAMPLE: JsonValue = {"contacts": [EXAMPLE_CONTACT], "region": "surface"}
 EXAMPLE_HISTORY: JsonValue = {
     "steps": [{"time": 0.1, "contact": EXAMPLE_CONTACT}, {"time": 1.1, "contact": None}]
 }
@@ -173,8 +170,8 @@ class ContactAnswer(BaseModel):
 class ErrorEstimate(BaseModel):
     """Relative L2 errors against the full model that 95 % of answers stay within, as fractions.
 
-    Null where nothing is known of them: outside the trained range. In a history: the largest error
-    so far relative to the largest norm so far of the field.
+    Null outside the trained range. In a history: the largest error so far relative to the largest
+    norm so far of the field.
     """
 
     displacement: float | None
@@ -289,13 +286,6 @@ class SceneEntry(BaseModel):
 
     name: str
     description: str
-
-
-class RefusedFile(BaseModel):
-    """An artifact that is not served, and why."""
-
-    file: str
-    reason: str
 
 
 class SceneList(BaseModel):

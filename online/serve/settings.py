@@ -13,7 +13,7 @@ class Settings:
     """Settings of one service: the options of ``palpate serve``, whose help says what they mean.
 
     Only ``hosts`` is no option: names that clients may call the service by, besides loopback
-    addresses; any, if there are none.
+    addresses; any, if empty.
     """
 
     artifacts: Path

@@ -15,23 +15,13 @@ logger = logging.getLogger(__name__)
 
 @dataclass
 class ServedModel:
-    """A reduced model that is served, and what requests need beside it.
-
-    Parameters
-    ----------
-    model : ReducedModel
-    example : dict
-        ``position`` (mm) and ``pressure`` (kPa) of a contact that it can answer.
-    tip : list of 3 floats, mm
-        A position of the tip's centre at which it presses a little.
-    meshes : dict from (region, media type) to bytes
-        The mesh documents asked for so far.
-    """
+    """A reduced model that is served, and what requests need beside it."""
 
     model: ReducedModel
-    example: dict[str, Any]
-    tip: list[float]
+    example: dict[str, Any]  # `position` (mm) and `pressure` (kPa) of a contact it can answer
+    tip: list[float]  # mm, a position of the tip's centre at which it presses a little
     meshes: dict[tuple[str, str], bytes] = field(default_factory=dict)
+    """The mesh documents asked for so far, by region and media type."""
 
 
 @dataclass(frozen=True)
@@ -43,15 +33,7 @@ class RefusedFile:
 
 
 class Store:
-    """All models of a directory.
-
-    Parameters
-    ----------
-    directory : Path
-        Searched for ``*.h5``, in order of name.
-    load : callable, optional
-        Reads a file; raises `PalpateError` for a file it refuses.
-    """
+    """All models of the ``*.h5`` of a directory, which `load` reads."""
 
     def __init__(
         self, directory: Path, load: Callable[[Path], ReducedModel] = ReducedModel.load
@@ -87,7 +69,7 @@ class Store:
             raise Refusal("not_ready", "", "The models are being loaded; try again in a moment")
 
     def model(self, name: str) -> ServedModel:
-        """Find the model called `name`; raise `Refusal` if there is none (yet)."""
+        """Return the model called `name`; raise `Refusal` if there is none (yet)."""
         self.require_ready()
         served = self.models.get(name)
         if served is None:

@@ -23,8 +23,10 @@ each can be viewed in place (``new Float32Array(buffer, 16 + H + offset, n)``).
 """
 
 import math
+import re
 import struct
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import msgpack
@@ -32,8 +34,13 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from palpate.online.serve.negotiation import BINARY, JSON, MSGPACK
+from palpate.online.serve.errors import Refusal
 from palpate.shared.errors import PalpateError
+
+JSON = "application/json"
+BINARY = "application/octet-stream"
+MSGPACK = "application/msgpack"
+OFFERED = (JSON, BINARY, MSGPACK)
 
 MAGIC = b"PLPT"
 VERSION = 1
@@ -50,16 +57,10 @@ class WireError(PalpateError):
 
 
 def encode(media_type: str, head: Head, arrays: Arrays) -> bytes:
-    """Write a document.
+    """Write a document in one of the formats on offer.
 
-    Parameters
-    ----------
-    media_type : str
-        One of `serve.negotiation.OFFERED`.
-    head : dict
-        JSON-able, without the keys ``fields`` and ``arrays``.
-    arrays : mapping from name to ndarray
-        C-contiguous; dtypes float32, int32 and uint8, the last kind last.
+    The head has no keys ``fields`` and ``arrays``; arrays are C-contiguous, of the dtypes float32,
+    int32 and uint8, the last kind last.
     """
     return _WRITERS[media_type](head, arrays)
 
@@ -94,14 +95,7 @@ _WRITERS = {JSON: _encode_json, MSGPACK: _encode_msgpack, BINARY: _encode_binary
 
 
 def decode(body: bytes) -> tuple[Head, dict[str, NDArray[Any]]]:
-    """Read a document of the binary layout.
-
-    Returns
-    -------
-    head : dict
-        Without ``arrays``.
-    arrays : dict from name to ndarray
-        Views into `body`.
+    """Read a document of the binary layout: its head, and its arrays as views into `body`.
 
     Raises
     ------
@@ -128,3 +122,47 @@ def decode(body: bytes) -> tuple[Head, dict[str, NDArray[Any]]]:
         flat = np.frombuffer(body, _DTYPES[entry["dtype"]], size, start + entry["offset"])
         arrays[entry["name"]] = flat.reshape(entry["shape"])
     return head, arrays
+
+
+_RANGE = re.compile(r"([\w!#$&^.+*-]+/[\w!#$&^.+*-]+)\s*((?:;[^,]*)?)", re.ASCII)
+"""A type with its subtype, and its parameters."""
+
+_QUALITY = re.compile(
+    r";\s*q\s*=\s*(?:(0(?:\.\d{0,3})?|1(?:\.0{0,3})?)\s*(?:;|$))?", re.I | re.ASCII
+)
+"""The parameter that says how much a type is liked; nothing is captured if it makes no sense."""
+
+
+@lru_cache(maxsize=64)
+def negotiate(accept: str) -> str:
+    """Choose the offered media type that `accept` likes best; JSON if it does not mind.
+
+    Of types liked equally, the one named more exactly wins, then the first on offer.
+    """
+    ranges = [_parse(part) for part in accept.split(",")] if accept.strip() else [("*/*", 1.0)]
+    best, score = "", (0.0, 0)
+    for offered in OFFERED:
+        # the most exact range that matches a type decides on it, even if it says no
+        exactness, quality = max((_exactness(pattern, offered), q) for pattern, q in ranges)
+        if exactness > 0 and quality > 0.0 and (quality, exactness) > score:
+            best, score = offered, (quality, exactness)
+    if not best:
+        raise Refusal(
+            "not_acceptable", "accept", "None of the accepted formats is on offer", OFFERED
+        )
+    return best
+
+
+def _parse(part: str) -> tuple[str, float]:
+    """Split a media range from its quality; a malformed one matches nothing."""
+    match = _RANGE.fullmatch(part.strip())
+    if match is None:
+        return "", 0.0
+    quality = _QUALITY.search(match[2])
+    return match[1].lower(), float(quality[1] or 0.0) if quality else 1.0
+
+
+def _exactness(pattern: str, offered: str) -> int:
+    """Rank a match: 3 for the type itself, 2 for ``application/*``, 1 for ``*/*``, 0 for none."""
+    kinds = ("*/*", offered.split("/")[0] + "/*", offered)
+    return kinds.index(pattern) + 1 if pattern in kinds else 0

@@ -21,9 +21,8 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import IntEnum, IntFlag
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,8 +94,7 @@ REASONS_MEAN = {
 }
 
 
-@dataclass(frozen=True)
-class Field:
+class Field(NamedTuple):
     """A field of a frame."""
 
     name: str
@@ -114,41 +112,79 @@ REQUEST_FIELDS = (
     Field("position", "float64", "mm", "centre of the tip", (3,)),
 )
 
-REPLY_FIELDS = (
-    Field("version", "uint16", "", "of this layout, 2"),
-    Field("flags", "uint16", "", "bits"),
-    Field("seq", "uint32", "", "of the request that is answered"),
-    Field("client_time", "float64", "s", "of the request"),
-    Field("server_received", "float64", "s", "when the request came, on the server's clock"),
-    Field("server_sent", "float64", "s", "when the reply went, on the server's clock"),
-    Field("position", "float64", "mm", "centre of the tip that all below belongs to", (3,)),
-    Field("force", "float64", "mN", "on the tool", (3,)),
-    Field("tangent", "float64", "mN/mm", "derivative of `force` by `position`, by rows", (3, 3)),
-    Field("energy", "float64", "mN mm", "stored in the tissue"),
-    Field("solve_time", "float32", "s", "spent on solving"),
-    Field("valid_radius", "float32", "mm", "how far from `position` force and tangent hold"),
-    Field("contact_point", "float32", "mm", "on the tissue", (3,)),
-    Field("normal", "float32", "", "outward, unit, at the contact", (3,)),
-    Field("depth", "float32", "mm", "of the tip below the surface at rest"),
-    Field("penetration", "float32", "mm", "of the tip into the deformed surface"),
-    Field("error_displacement", "float32", "", "estimated relative error; infinite: unknown"),
-    Field("error_von_mises", "float32", "", "estimated relative error; infinite: unknown"),
-    Field("error_force", "float32", "", "estimated relative error; infinite: unknown"),
-    Field("min_jacobian", "float32", "", "smallest volume ratio; 1 at rest, 0 is collapse"),
-    Field("max_von_mises", "float32", "kPa", "largest in the body; 0 if not asked for"),
-    Field("p99_von_mises", "float32", "kPa", "99th percentile of it; 0 if not asked for"),
-    Field("model", "int32", "", "local models that answer, -1 for none", (MODELS,)),
-    Field("weight", "float32", "", "their shares", (MODELS,)),
-    Field("superseded", "uint32", "", "requests dropped for newer ones since the last reply"),
-    Field("nodes", "uint32", "", "nodes of the fields that follow, or 0"),
-    Field("iterations", "uint16", "", "Newton steps taken"),
-    Field("steps", "uint16", "", "positions solved on the way here"),
-    Field("coordinates", "uint16", "", "reduced coordinates per local model that follow, or 0"),
-    Field("outputs", "uint16", "", "what follows or is filled in, bits"),
-    Field("depth_limit", "float32", "mm", "largest trained depth there"),
-    Field("reason", "uint32", "", "why `position` is not the one asked for; 0 if it is"),
-)
+U16 = Annotated[int, "uint16"]
+U32 = Annotated[int, "uint32"]
+F32 = Annotated[float, "float32"]
+F64 = Annotated[float, "float64"]
+F32s = Annotated[NDArray[np.float32], "float32"]
+F64s = Annotated[NDArray[np.float64], "float64"]
+I32s = Annotated[NDArray[np.int32], "int32"]
 
+
+class Reply(NamedTuple):
+    """A reply frame: of each field its type in the frame, its unit and its meaning.
+
+    Arrays are views of the frame. The last three follow the fields, and are None unless they were
+    asked for; of `coordinates` the number stands among the fields.
+    """
+
+    version: Annotated[U16, "", "of this layout, 2"]
+    flags: Annotated[U16, "", "bits"]
+    seq: Annotated[U32, "", "of the request that is answered"]
+    client_time: Annotated[F64, "s", "of the request"]
+    server_received: Annotated[F64, "s", "when the request came, on the server's clock"]
+    server_sent: Annotated[F64, "s", "when the reply went, on the server's clock"]
+    position: Annotated[F64s, "mm", "centre of the tip that all below belongs to", (3,)]
+    force: Annotated[F64s, "mN", "on the tool", (3,)]
+    tangent: Annotated[F64s, "mN/mm", "derivative of `force` by `position`, by rows", (3, 3)]
+    energy: Annotated[F64, "mN mm", "stored in the tissue"]
+    solve_time: Annotated[F32, "s", "spent on solving"]
+    valid_radius: Annotated[F32, "mm", "how far from `position` force and tangent hold"]
+    contact_point: Annotated[F32s, "mm", "on the tissue", (3,)]
+    normal: Annotated[F32s, "", "outward, unit, at the contact", (3,)]
+    depth: Annotated[F32, "mm", "of the tip below the surface at rest"]
+    penetration: Annotated[F32, "mm", "of the tip into the deformed surface"]
+    error_displacement: Annotated[F32, "", "estimated relative error; infinite: unknown"]
+    error_von_mises: Annotated[F32, "", "estimated relative error; infinite: unknown"]
+    error_force: Annotated[F32, "", "estimated relative error; infinite: unknown"]
+    min_jacobian: Annotated[F32, "", "smallest volume ratio; 1 at rest, 0 is collapse"]
+    max_von_mises: Annotated[F32, "kPa", "largest in the body; 0 if not asked for"]
+    p99_von_mises: Annotated[F32, "kPa", "99th percentile of it; 0 if not asked for"]
+    model: Annotated[I32s, "", "local models that answer, -1 for none", (MODELS,)]
+    weight: Annotated[F32s, "", "their shares", (MODELS,)]
+    superseded: Annotated[U32, "", "requests dropped for newer ones since the last reply"]
+    nodes: Annotated[U32, "", "nodes of the fields that follow, or 0"]
+    iterations: Annotated[U16, "", "Newton steps taken"]
+    steps: Annotated[U16, "", "positions solved on the way here"]
+    coordinates: Annotated[
+        NDArray[np.float32] | None,
+        "uint16",
+        "",
+        "reduced coordinates per local model that follow, or 0",
+    ]
+    outputs: Annotated[U16, "", "what follows or is filled in, bits"]
+    depth_limit: Annotated[F32, "mm", "largest trained depth there"]
+    reason: Annotated[U32, "", "why `position` is not the one asked for; 0 if it is"]
+    displacement: NDArray[Any] | None
+    von_mises: NDArray[Any] | None
+
+    @property
+    def contact(self) -> bool:
+        """Whether the tip touches."""
+        return bool(self.flags & Flag.CONTACT)
+
+    @property
+    def good(self) -> bool:
+        """Whether this is a trained-for equilibrium at the position asked for."""
+        asked = Flag.CONVERGED | Flag.IN_RANGE | Flag.CLAMPED | Flag.FALLBACK
+        return self.flags & asked == Flag.CONVERGED | Flag.IN_RANGE
+
+
+REPLY_FIELDS = tuple(
+    Field(name, *hint.__metadata__)
+    for name, hint in get_type_hints(Reply, include_extras=True).items()
+    if hasattr(hint, "__metadata__")
+)
 
 _CODES = {"uint16": "H", "uint32": "I", "int32": "i", "float32": "f", "float64": "d"}
 
@@ -193,88 +229,54 @@ class Request(NamedTuple):
 
 def encode_request(request: Request) -> bytes:
     """Write a request frame."""
-    return _REQUEST.pack(
-        VERSION, request.outputs, request.seq, request.client_time, *request.position
-    )
+    seq, client_time, position, outputs = request
+    return _REQUEST.pack(VERSION, outputs, seq, client_time, *position)
 
 
 def decode_request(frame: bytes) -> Request:
-    """Read a request frame.
-
-    Raises
-    ------
-    VersionError
-        If it is of another version.
-    FrameError
-        If its size, a bit or a number is wrong.
-    """
-    if len(frame) >= 2 and (version := int.from_bytes(frame[:2], "little")) != VERSION:
-        raise VersionError("version", f"is {version}; this service speaks version {VERSION}")
+    """Read a request frame; raise `FrameError` if its version, size, a bit or a number is wrong."""
+    _check_version(frame)
     if len(frame) != _REQUEST.size:
         raise FrameError("frame", f"must have {_REQUEST.size} bytes, not {len(frame)}")
     _, outputs, seq, client_time, x, y, z = _REQUEST.unpack(frame)
-    return check_request(Request(seq, client_time, (x, y, z), outputs))
-
-
-def check_request(request: Request) -> Request:
-    """Return a request whose numbers make sense; raise `FrameError` for any other."""
-    if request.outputs & ~_OUTPUTS:
+    if outputs & ~_OUTPUTS:
         raise FrameError("outputs", f"has bits other than those of {_OUTPUTS}")
-    if not math.isfinite(request.client_time):
+    if not math.isfinite(client_time):
         raise FrameError("client_time", "must be a finite number of seconds")
     # NaN compares false
-    if not all(abs(coordinate) <= FARTHEST for coordinate in request.position):
+    if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST and abs(z) <= FARTHEST):
         raise FrameError("position", f"must be three numbers from {-FARTHEST:g} to {FARTHEST:g} mm")
-    return request
+    return Request(seq, client_time, (x, y, z), outputs)
+
+
+def _check_version(frame: bytes) -> None:
+    if len(frame) >= 2 and (version := int.from_bytes(frame[:2], "little")) != VERSION:
+        raise VersionError("version", f"is {version}; the layout spoken here is version {VERSION}")
 
 
 class Extras(NamedTuple):
-    """What a reply holds on request.
+    """What a reply holds on request; arrays are C-contiguous."""
 
-    Parameters
-    ----------
-    outputs : int
-        Bits of `Output`: what is there.
-    coordinates : ndarray, shape (MODELS, r), float32
-    displacement : ndarray, shape (n, 3), float32 or float16, mm
-    von_mises : ndarray, shape (n,), float32 or float16, kPa
-    max_von_mises, p99_von_mises : float, kPa
-    """
-
-    outputs: int = 0
-    coordinates: NDArray[Any] | None = None
-    displacement: NDArray[Any] | None = None
-    von_mises: NDArray[Any] | None = None
-    max_von_mises: float = 0.0
-    p99_von_mises: float = 0.0
+    outputs: int = 0  # bits of `Output`: what is there
+    coordinates: NDArray[np.float32] | None = None  # (MODELS, r)
+    displacement: NDArray[Any] | None = None  # (n, 3), mm, float32 or float16
+    von_mises: NDArray[Any] | None = None  # (n,), kPa, float32 or float16
+    max_von_mises: float = 0.0  # kPa
+    p99_von_mises: float = 0.0  # kPa
 
 
 NO_EXTRAS = Extras()
 
 
 class ToolAnswer(NamedTuple):
-    """The answer to a position of the tool.
-
-    Parameters
-    ----------
-    touch : Answer
-    flags : int
-        Bits of `Flag`.
-    steps : int
-        Positions solved on the way.
-    valid_radius : float, mm
-        How far from the position force and tangent hold.
-    solve_seconds : float
-    reason : int
-        A `Reason`.
-    """
+    """The answer to a position of the tool."""
 
     touch: Answer
-    flags: int
-    steps: int
-    valid_radius: float
+    flags: int  # bits of `Flag`
+    steps: int  # positions solved on the way
+    valid_radius: float  # mm, how far from the position force and tangent hold
     solve_seconds: float
-    reason: int
+    reason: int  # a `Reason`
 
 
 def encode_reply(
@@ -287,17 +289,8 @@ def encode_reply(
 ) -> bytes:
     """Write a reply frame.
 
-    Parameters
-    ----------
-    request : Request
-        What is answered.
-    answer : ToolAnswer
-        Outside the trained range its estimated errors count as infinite.
-    extras : Extras
-        C-contiguous.
-    superseded : int
-    received, sent : float, s
-        On the server's clock.
+    Outside the trained range estimated errors count as infinite; `received` and `sent` (s) are on
+    the server's clock.
     """
     touch = answer.touch
     patches = touch.parts
@@ -354,98 +347,29 @@ def _nodes(extras: Extras) -> int:
     return 0
 
 
-class Reply(NamedTuple):
-    """A reply frame; for the fields see `REPLY_FIELDS`. Arrays are views into the frame.
-
-    Parameters
-    ----------
-    coordinates : ndarray, shape (MODELS, r), float32, or None
-    displacement : ndarray, shape (n, 3), float32 or float16, mm, or None
-    von_mises : ndarray, shape (n,), float32 or float16, kPa, or None
-    """
-
-    flags: int
-    seq: int
-    client_time: float
-    server_received: float
-    server_sent: float
-    position: NDArray[np.float64]
-    force: NDArray[np.float64]
-    tangent: NDArray[np.float64]
-    energy: float
-    solve_time: float
-    valid_radius: float
-    contact_point: NDArray[np.float32]
-    normal: NDArray[np.float32]
-    depth: float
-    penetration: float
-    error_displacement: float
-    error_von_mises: float
-    error_force: float
-    min_jacobian: float
-    max_von_mises: float
-    p99_von_mises: float
-    model: NDArray[np.int32]
-    weight: NDArray[np.float32]
-    superseded: int
-    nodes: int
-    iterations: int
-    steps: int
-    outputs: int
-    depth_limit: float
-    reason: int
-    coordinates: NDArray[np.float32] | None
-    displacement: NDArray[Any] | None
-    von_mises: NDArray[Any] | None
-
-    @property
-    def contact(self) -> bool:
-        """Whether the tip touches."""
-        return bool(self.flags & Flag.CONTACT)
-
-    @property
-    def good(self) -> bool:
-        """Whether this is a trained-for equilibrium at the position asked for."""
-        asked = Flag.CONVERGED | Flag.IN_RANGE | Flag.CLAMPED | Flag.FALLBACK
-        return self.flags & asked == Flag.CONVERGED | Flag.IN_RANGE
-
-
-_HEAD = Reply._fields[:-3]
-
-
 def decode_reply(frame: bytes) -> Reply:
-    """Read a reply frame.
-
-    Raises
-    ------
-    VersionError
-        If it is of another version.
-    FrameError
-        If it is not as long as it says.
-    """
-    if len(frame) >= 2 and (version := int.from_bytes(frame[:2], "little")) != VERSION:
-        raise VersionError("version", f"is {version}; this reader knows version {VERSION}")
+    """Read a reply frame; raise `FrameError` if its version or its length is wrong."""
+    _check_version(frame)
     if len(frame) < REPLY.itemsize:
         raise FrameError("frame", f"{len(frame)} bytes are too few for a reply")
     record = np.frombuffer(frame, REPLY, 1)[0]
-    outputs, nodes, r = (int(record[name]) for name in ("outputs", "nodes", "coordinates"))
-    half = np.dtype("<f2" if outputs & _HALF else "<f4")
-    parts = {
-        "coordinates": (outputs & _COORDINATES, np.dtype("<f4"), (MODELS, r)),
-        "displacement": (outputs & _DISPLACEMENT, half, (nodes, 3)),
-        "von_mises": (outputs & _VON_MISES, half, (nodes,)),
-    }
+    values = {name: record[name] for name in REPLY.names or ()}
+    head = {name: v.item() if v.ndim == 0 else v for name, v in values.items()}
+    outputs, nodes = head["outputs"], head["nodes"]
+    kind = np.dtype("<f2" if outputs & _HALF else "<f4")
     offset = REPLY.itemsize
-    arrays: dict[str, NDArray[Any] | None] = dict.fromkeys(parts)
-    for name, (wanted, dtype, shape) in parts.items():
-        size = math.prod(shape) if wanted else 0
-        if offset + size * dtype.itemsize > len(frame):
-            raise FrameError("frame", f"{len(frame)} bytes end within {name}")
-        if wanted:
-            arrays[name] = np.frombuffer(frame, dtype, size, offset).reshape(shape)
-        offset += size * dtype.itemsize
+    for name, bit, dtype, shape in (
+        ("coordinates", _COORDINATES, np.dtype("<f4"), (MODELS, head["coordinates"])),
+        ("displacement", _DISPLACEMENT, kind, (nodes, 3)),
+        ("von_mises", _VON_MISES, kind, (nodes,)),
+    ):
+        head[name] = None
+        if outputs & bit:
+            size = math.prod(shape)
+            if offset + size * dtype.itemsize > len(frame):
+                raise FrameError("frame", f"{len(frame)} bytes end within {name}")
+            head[name] = np.frombuffer(frame, dtype, size, offset).reshape(shape)
+            offset += size * dtype.itemsize
     if offset != len(frame):
         raise FrameError("frame", f"{len(frame)} bytes where its fields say {offset}")
-    values: list[Any] = [record[name] for name in _HEAD]
-    head = [value.item() if value.ndim == 0 else value for value in values]
-    return Reply(*head, *arrays.values())
+    return Reply(**head)

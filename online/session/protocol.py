@@ -3,7 +3,7 @@
 ``python -m palpate.online.session.protocol`` writes ``online/PROTOCOL.md``.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,35 +34,23 @@ def layout() -> dict[str, Any]:
 
 
 def _layout(fields: Sequence[Field], dtype: np.dtype[Any]) -> dict[str, Any]:
+    offsets: Mapping[str, Any] = dtype.fields or {}
     return {
         "size": dtype.itemsize,
-        "fields": [
-            {
-                "name": field.name,
-                "offset": _offset(dtype, field),
-                "type": field.type,
-                "shape": field.shape,
-                "unit": field.unit,
-                "meaning": field.meaning,
-            }
-            for field in fields
-        ],
+        "fields": [field._asdict() | {"offset": offsets[field.name][1]} for field in fields],
     }
 
 
 def tables() -> str:
     """Describe the layout in Markdown."""
     lines = []
-    for title, fields, dtype in (
-        ("Request", REQUEST_FIELDS, REQUEST),
-        ("Reply", REPLY_FIELDS, REPLY),
-    ):
-        lines += [f"{title}, {dtype.itemsize} bytes:", ""]
+    for title, frame in (("Request", layout()["request"]), ("Reply", layout()["reply"])):
+        lines += [f"{title}, {frame['size']} bytes:", ""]
         lines += ["| offset | field | type | unit | meaning |", "|---|---|---|---|---|"]
-        lines += [
-            f"| {_offset(dtype, f)} | {f.name} | {f.type}{_suffix(f)} | {f.unit} | {f.meaning} |"
-            for f in fields
-        ]
+        for field in frame["fields"]:
+            kind = field["type"] + "".join(f"[{n}]" for n in field["shape"])
+            cells = field["offset"], field["name"], kind, field["unit"], field["meaning"]
+            lines.append(f"| {' | '.join(map(str, cells))} |")
         lines.append("")
     values: dict[str, dict[Any, str]] = {
         "bit of `outputs`": frames.OUTPUTS_MEAN,
@@ -74,15 +62,6 @@ def tables() -> str:
         lines += [f"| {v.value} | {v.name} | {meaning} |" for v, meaning in meanings.items()]
         lines.append("")
     return "\n".join(lines)
-
-
-def _offset(dtype: np.dtype[Any], field: Field) -> int:
-    assert dtype.fields is not None
-    return int(dtype.fields[field.name][1])
-
-
-def _suffix(field: Field) -> str:
-    return "".join(f"[{n}]" for n in field.shape)
 
 
 if __name__ == "__main__":

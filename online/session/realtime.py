@@ -34,12 +34,7 @@ def enter() -> str:
     """Ask for real-time scheduling of this thread and for memory that is never swapped out.
 
     Call it when the models are warm: what is in memory by then is what answers need. Threads and
-    processes made later are ordinary.
-
-    Returns
-    -------
-    str
-        A sentence that says plainly what the system granted.
+    processes made later are ordinary. Returns a sentence that says what the system granted.
     """
     return f"{_schedule()}; {_lock_memory()}"
 
@@ -79,10 +74,7 @@ def _lock_memory() -> str:
 class BusyWait:
     """Keeps an event loop from sleeping while frames come.
 
-    Parameters
-    ----------
-    workers : int
-        That keep one each; if they are as many as this process has cores, none does.
+    It does so if each of the `workers` can have a core, and one is left over.
     """
 
     def __init__(self, workers: int) -> None:

@@ -8,8 +8,10 @@ again, bit for bit (`session.replay`).
 """
 
 import json
+from collections import OrderedDict
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -33,6 +35,15 @@ ASKED = (
     Field("received", "float64", "s", "when the reply came, on the client's clock"),
 )
 
+COMMANDS = Field(
+    "commands",
+    "uint32",
+    "",
+    "a row per snapshot taken or restored: number of replies before it; "
+    "0 if it was taken, 1 if it was restored; number of the snapshot",
+    (3,),
+)
+
 
 class Command(NamedTuple):
     """A snapshot that was taken or restored."""
@@ -47,33 +58,21 @@ class RecordingError(PalpateError):
 
 
 class Recorder:
-    """Writes a session to a file as it goes.
-
-    Parameters
-    ----------
-    path : Path
-        Overwritten.
-    greeting : dict
-        Of the session.
-    """
+    """Writes a session with this greeting to a file, which is overwritten, as it goes."""
 
     def __init__(self, path: Path, greeting: dict[str, Any]) -> None:
-        self._requests: dict[int, Request] = {}
+        self._requests: OrderedDict[int, Request] = OrderedDict()
         self._asked: list[tuple[Any, ...]] = []
         self._replies: list[bytes] = []
-        self._file = h5py.File(path, "w")
-        self._file.attrs["format"] = FORMAT
-        self._file.attrs["format_version"] = FORMAT_VERSION
-        self._file.attrs["scene"] = greeting["scene"]
-        self._file.attrs["greeting"] = json.dumps(greeting)
         self._count = 0
-        commands = self._file.create_dataset("commands", (0, 3), "uint32", maxshape=(None, 3))
-        commands.attrs["units"] = ""
-        commands.attrs["description"] = (
-            "a row per snapshot taken or restored: number of replies before it; "
-            "0 if it was taken, 1 if it was restored; number of the snapshot"
+        self._file = h5py.File(path, "w")
+        self._file.attrs.update(
+            format=FORMAT,
+            format_version=FORMAT_VERSION,
+            scene=greeting["scene"],
+            greeting=json.dumps(greeting),
         )
-        for field in (*ASKED, *REPLY_FIELDS):
+        for field in (*ASKED, *REPLY_FIELDS, COMMANDS):
             dataset = self._file.create_dataset(
                 field.name,
                 shape=(0, *field.shape),
@@ -81,43 +80,30 @@ class Recorder:
                 chunks=(CHUNK, *field.shape),
                 dtype=field.type,
             )
-            dataset.attrs["units"] = field.unit
-            dataset.attrs["description"] = field.meaning
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+            dataset.attrs.update(units=field.unit, description=field.meaning)
 
     def sent(self, request: Request) -> None:
         """Note a request."""
         self._requests[request.seq] = request
         if len(self._requests) > MOST_UNANSWERED:
-            del self._requests[next(iter(self._requests))]
+            self._requests.popitem(last=False)
 
     def received(self, reply: bytes, now: float) -> None:
-        """Note the reply (a frame) to one of the requests noted, which came at `now` (s).
-
-        A reply to anything else is left out: what was asked is not known.
-        """
-        request = self._requests.pop(int(np.frombuffer(reply, REPLY, 1)[0]["seq"]), None)
-        if request is None:
-            return
+        """Note the reply (a frame) to one of the requests noted, which came at `now` (s)."""
+        seq = int(np.frombuffer(reply, REPLY, 1)[0]["seq"])
+        if seq not in self._requests:
+            return  # nobody knows what was asked
+        while (request := self._requests.popitem(last=False)[1]).seq != seq:
+            pass  # replies come in order: what was sent earlier was dropped or refused
         self._count += 1
         self._asked.append((request.position, request.outputs, now))
         self._replies.append(reply[: REPLY.itemsize])
-        # replies come in order: what was sent earlier was dropped or refused
-        for seq in [seq for seq in self._requests if _before(seq, request.seq)]:
-            del self._requests[seq]
         if len(self._replies) >= CHUNK:
             self._write()
 
     def obeyed(self, restores: bool, number: int) -> None:
         """Note that a snapshot was taken or gone back to, after the replies received so far."""
-        commands = self._file["commands"]
-        commands.resize(len(commands) + 1, axis=0)
-        commands[-1] = self._count, restores, number
+        _append(self._file[COMMANDS.name], [(self._count, restores, number)])
 
     def close(self) -> None:
         """Write what is left and close the file."""
@@ -131,49 +117,29 @@ class Recorder:
         replies = np.frombuffer(b"".join(self._replies), REPLY)
         for table in (asked, replies):
             for name in table.dtype.names or ():
-                dataset = self._file[name]
-                dataset.resize(len(dataset) + len(table), axis=0)
-                dataset[-len(table) :] = table[name]
+                _append(self._file[name], table[name])
         self._file.flush()
         self._asked.clear()
         self._replies.clear()
 
 
-def _before(seq: int, other: int) -> bool:
-    """Whether a number was given before another one; numbers start again at 2^32."""
-    return (other - seq) % 2**32 < 2**31
+def _append(dataset: h5py.Dataset, rows: Sequence[Any] | NDArray[Any]) -> None:
+    dataset.resize(len(dataset) + len(rows), axis=0)
+    dataset[-len(rows) :] = rows
 
 
 class Recording(NamedTuple):
-    """A recorded session.
-
-    Parameters
-    ----------
-    scene : str
-    requests : list of Request
-        Those that were answered, in order.
-    replies : ndarray, shape (n,), of `session.frames.REPLY`
-    received : ndarray, shape (n,), s
-        On the client's clock.
-    commands : list of Command
-        In order.
-    """
+    """A recorded session, in order of the replies."""
 
     scene: str
-    requests: list[Request]
-    replies: NDArray[Any]
-    received: NDArray[np.float64]
+    requests: list[Request]  # those that were answered
+    replies: NDArray[Any]  # (n,), of `session.frames.REPLY`
+    received: NDArray[np.float64]  # (n,), s on the client's clock
     commands: list[Command]
 
 
 def read_recording(path: Path) -> Recording:
-    """Read a recording.
-
-    Raises
-    ------
-    RecordingError
-        If the file is missing, damaged or none of this version.
-    """
+    """Read a recording; raise `RecordingError` if it is missing, damaged or of another version."""
     try:
         with h5py.File(path, "r") as file:
             if file.attrs.get("format") != FORMAT:

@@ -16,23 +16,12 @@ VOLATILE = ("server_received", "server_sent", "solve_time", "superseded")
 
 
 class Replay(NamedTuple):
-    """How a replay compares with its recording.
-
-    Parameters
-    ----------
-    replies : int
-    different : int
-        Replies that are not the same, bit for bit.
-    first_different : int or None
-        Number of the first one.
-    force_difference : float, mN
-        Largest difference of a component.
-    """
+    """How a replay compares with its recording."""
 
     replies: int
-    different: int
-    first_different: int | None
-    force_difference: float
+    different: int  # replies that are not the same, bit for bit
+    first_different: int | None  # number of the first of them
+    force_difference: float  # largest of a component, mN
 
 
 def replay(recording: Recording, model: ReducedModel) -> Replay:

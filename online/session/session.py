@@ -1,9 +1,9 @@
 """Sessions: a tool moves, the tissue answers; the newest position counts.
 
 Frames that came while another one was solved are read together, and all but the newest are dropped
-and counted. Solves run on the event loop, since handing one to a thread and back takes longer than
-the solve. A client that does not read its replies holds up itself alone, and is cut off after
-`PATIENCE`; one that sends more than `MOST_FRAMES` is read no faster than that.
+and counted. Solves run on the event loop: handing one to a thread and back takes longer. A client
+that does not read its replies is cut off after `PATIENCE`; one that sends more than `MOST_FRAMES`
+is read no faster than that.
 """
 
 import asyncio
@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from enum import Enum, auto
 from time import perf_counter
-from typing import Any
 
 import orjson
 from starlette.types import Message, Receive, Scope, Send
@@ -77,19 +76,7 @@ _NEXT = {
 
 
 class Sessions:
-    """The ASGI application of every session.
-
-    Parameters
-    ----------
-    store : Store
-    settings : Settings
-    metrics : Metrics
-
-    Attributes
-    ----------
-    busy_wait : BusyWait
-        Of the event loop.
-    """
+    """The ASGI application of every session."""
 
     def __init__(self, store: Store, settings: Settings, metrics: Metrics) -> None:
         self.settings = settings
@@ -127,15 +114,11 @@ class Sessions:
     def prepare(self, served: ServedModel, path: Sequence[Sequence[float]]) -> None:
         """Call everything that a session calls once, and make spare trackers.
 
-        Parameters
-        ----------
-        served : ServedModel
-        path : sequence of positions of the tip, mm
-            Leads through all that the tissue's history may need.
+        The tip follows `path` (mm), which leads through all that the tissue's history may need.
         """
-        uncounted, spare = Metrics(), []
         x, y, z = served.tip
         request = Request(0, 0.0, (x, y, z), sum(Output))
+        spare = self._spare[served.model.name] = []
         for _ in range(SPARE):
             tracker = ToolTracker(served.model)
             for number, position in enumerate(path):
@@ -144,24 +127,14 @@ class Sessions:
             answer = tracker.follow(request.position, BUDGET)
             extras = recover(served.model, answer.touch, request.outputs)
             write_reply(frames.encode_reply(request, answer, extras))
-            uncounted.count_frame(0.0, (0.0, 0.0, 0.0, 0.0, 0.0), answer.flags, 0)
             tracker.restart()
             spare.append(tracker)
-        self._spare[served.model.name] = spare
 
 
 class Session:
-    """One client with one tool.
+    """One client with one tool, whose tracker is new or restarted.
 
-    Parameters
-    ----------
-    sessions : Sessions
-        What it is one of.
-    served : ServedModel
-    tracker : ToolTracker
-        New or restarted.
-    scope, receive, send
-        As ASGI gives them; of `session.websocket.SessionProtocol`.
+    `scope`, `receive` and `send` are those of `session.websocket.SessionProtocol`.
     """
 
     def __init__(
@@ -173,19 +146,15 @@ class Session:
         receive: Receive,
         send: Send,
     ) -> None:
-        self._sessions = sessions
-        self._served = served
-        self._model = served.model
-        self._tracker = tracker
+        self._sessions, self._tracker = sessions, tracker
+        self._served, self._model = served, served.model
         self._receive, self._send = receive, send
         self._pending: Callable[[], bool] = scope["extensions"][PENDING]
         self._read_at: Callable[[], float] = scope["extensions"][READ_AT]
         self._snapshots: dict[int, Snapshot] = {}
-        self._received = 0.0
+        self._received = self._full_at = 0.0
         self._superseded = 0
-        self._full_at = 0.0
-        self._state = State.CONNECTING
-        self._since = perf_counter()
+        self._state, self._since = State.CONNECTING, perf_counter()
         self._close_reason = 0, ""
 
     async def run(self) -> None:
@@ -212,8 +181,7 @@ class Session:
         """Go from one state to another one."""
         if state not in _NEXT[self._state]:
             raise RuntimeError(f"a session cannot go from {self._state} to {state}")
-        self._state = state
-        self._since = perf_counter()
+        self._state, self._since = state, perf_counter()
 
     def _close(self, code: int, reason: str) -> None:
         """Let the session end with a reason."""
@@ -278,17 +246,8 @@ class Session:
         ending = None
         try:
             reply = self._reply(message)
-        except VersionError as error:
-            reply = self._complaint("unknown_version", error.field, error.message)
-            ending = WRONG_VERSION, str(error)
-        except FrameError as error:
-            reply = self._complaint("invalid_frame", error.field, error.message)
-        except Refusal as refusal:
-            reply = self._complaint(refusal.code, refusal.field, refusal.message, refusal.allowed)
-        except Exception:
-            logger.exception("a session failed")
-            reply = self._complaint("internal", "", "The service failed; its log says why")
-            ending = FAILED, "the service failed; its log says why"
+        except Exception as error:
+            reply, ending = self._complaint(error)
         await self._deliver(reply)
         if ending is not None:
             self._close(*ending)
@@ -300,11 +259,26 @@ class Session:
         if self._state is State.SENDING:  # it was not cut off meanwhile
             self._enter(State.WAITING)
 
-    def _complaint(self, *error: Any) -> Message:
+    def _complaint(self, error: Exception) -> tuple[Message, tuple[int, str] | None]:
+        """Say what is wrong with a message, and with what code and reason that ends the session."""
         self._sessions.metrics.count_refused_frame()
-        return {"type": "websocket.send", "text": error_body(*error).decode()}
+        ending = None
+        match error:
+            case Refusal():
+                body = error_body(error.code, error.field, error.message, error.allowed)
+            case VersionError():
+                body = error_body("unknown_version", error.field, error.message)
+                ending = WRONG_VERSION, str(error)
+            case FrameError():
+                body = error_body("invalid_frame", error.field, error.message)
+            case _:
+                logger.error("a session failed", exc_info=error)
+                body = error_body("internal", "", "The service failed; its log says why")
+                ending = FAILED, "the service failed; its log says why"
+        return {"type": "websocket.send", "text": body.decode()}, ending
 
     def _reply(self, message: Message) -> Message:
+        """Obey a command, or answer a position as it came: in binary or in JSON."""
         start, frame, text = perf_counter(), message.get("bytes"), message.get("text") or ""
         if frame is not None:
             reply = self._answer(frames.decode_request(frame), start)
@@ -325,27 +299,23 @@ class Session:
         solved = perf_counter()
         extras = recover(self._model, answer.touch, request.outputs)
         recovered = perf_counter()
-        superseded, self._superseded = self._superseded, 0
-        frame = frames.encode_reply(
-            request, answer, extras, superseded, self._received, perf_counter()
-        )
+        received, dropped, self._superseded = self._received, self._superseded, 0
+        frame = frames.encode_reply(request, answer, extras, dropped, received, perf_counter())
         borders = (start, decoded, solved, recovered, perf_counter())
-        self._sessions.metrics.count_frame(
-            start - self._received, borders, answer.flags, superseded
-        )
+        self._sessions.metrics.count_frame(start - received, borders, answer.flags, dropped)
         return frame
 
     def _obey(self, text: str) -> str:
         """Keep the state of the tissue or go back to one that was kept; echo the command."""
-        restores, number = read_command(text)
-        if not restores:
+        command, number = read_command(text)
+        if command == "snapshot":
             self._snapshots[number] = self._tracker.snapshot()
         elif number in self._snapshots:
             self._tracker.restore(self._snapshots[number])
         else:
             kept = sorted(self._snapshots)
             raise Refusal("unknown_snapshot", "restore", "None was kept by this number", kept)
-        return orjson.dumps({"restore" if restores else "snapshot": number}).decode()
+        return orjson.dumps({command: number}).decode()
 
     def _greeting(self) -> str:
         """Say what is served and how to speak with it."""

@@ -15,23 +15,21 @@ MOST_SNAPSHOTS = 8
 
 
 class TextRequest(Strict):
-    """A position of the tip."""
+    """A position of the tip; `seq` and `client_time` are echoed."""
 
-    seq: int = Field(0, ge=0, lt=2**32, description="The client's number of this message, echoed.")
-    client_time: float = Field(
-        0.0, description="The client's clock, s, echoed; the time of visco-elastic tissue."
-    )
-    position: Position = Field(description="Centre of the tip, [x, y, z] mm.")
+    seq: int = Field(0, ge=0, lt=2**32)
+    client_time: float = 0.0
+    position: Position
     outputs: list[Literal["coordinates", "displacement", "von_mises", "stress"]] = Field(
-        [], max_length=4, description="What is wanted beyond force and tangent."
+        [], max_length=4
     )
 
 
 class TextCommand(Strict):
     """A request to keep the state of a session's tissue, or to go back to one that was kept."""
 
-    snapshot: int | None = Field(None, ge=0, lt=MOST_SNAPSHOTS, description="Number to keep it by.")
-    restore: int | None = Field(None, ge=0, lt=MOST_SNAPSHOTS, description="Number to go back to.")
+    snapshot: int | None = Field(None, ge=0, lt=MOST_SNAPSHOTS)
+    restore: int | None = Field(None, ge=0, lt=MOST_SNAPSHOTS)
 
 
 def read_request(text: str) -> Request:
@@ -47,20 +45,17 @@ def is_command(text: str | None) -> bool:
     return text is not None and ('"snapshot"' in text or '"restore"' in text)
 
 
-def read_command(text: str) -> tuple[bool, int]:
-    """Read a command: whether it restores, and the number; raise `Refusal` for nonsense."""
-    read = parse(TextCommand, text)
-    if (read.snapshot is None) == (read.restore is None):
+def read_command(text: str) -> tuple[str, int]:
+    """Read a command: ``snapshot`` or ``restore``, and the number; raise `Refusal` for nonsense."""
+    given = parse(TextCommand, text).model_dump(exclude_none=True)
+    if len(given) != 1:
         raise Refusal(
             "invalid_value",
             "snapshot",
             "One of snapshot and restore is wanted",
             list(TextCommand.model_fields),
         )
-    if read.restore is not None:
-        return True, read.restore
-    assert read.snapshot is not None
-    return False, read.snapshot
+    return next(iter(given.items()))
 
 
 def write_reply(frame: bytes) -> str:
@@ -70,7 +65,7 @@ def write_reply(frame: bytes) -> str:
     """
     reply = frames.decode_reply(frame)
     document = {name: value for name, value in reply._asdict().items() if value is not None}
-    document["flags"] = [str(bit.name).lower() for bit in Flag(reply.flags)]
-    document["outputs"] = [str(bit.name).lower() for bit in Output(reply.outputs)]
+    for name, bits in (("flags", Flag), ("outputs", Output)):
+        document[name] = [str(bit.name).lower() for bit in bits(document[name])]
     document["reason"] = REASONS_MEAN[Reason(reply.reason)]
     return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY).decode()

@@ -2,16 +2,14 @@
 
 A position is first tried as it is, from the warm start of the last. If no equilibrium is found
 there, the way to it from the last good position is walked in smaller and smaller strides, for as
-long as there is time. The answer is then the farthest good position, with a flag, and never a state
-that is no equilibrium. Where tissue snaps there is no such way: the search for where it comes to
-rest goes on from position to position.
+long as there is time; the answer is the farthest good position. Where tissue snaps there is no such
+way: the search for where it comes to rest goes on from position to position.
 
-Visco-elastic tissue lives by the client's time: between two answers passes what lies between the
-`client_time` of their frames, be they steps that the client chooses or its clock. The tool moved
-evenly in it. A way that is walked in strides takes its time in the same parts; where it ends early
-(`CLAMPED`) the rest of the time passes with the next frame; without an answer (`FALLBACK`) time
-stands still. After a pause of the client nobody knows where its tool was in between: at most
-`LONGEST` passes between two answers, and `STALLED` says that it was cut.
+In visco-elastic tissue as much time passes between two answers as between the `client_time` of
+their frames, and the tool moved evenly in it. A way that is walked in strides takes its time in the
+same parts; where it ends early (`CLAMPED`) the rest passes with the next frame; without an answer
+(`FALLBACK`) time stands still. After a pause nobody knows where the tool was: at most `LONGEST`
+passes between two answers, and `STALLED` says that it was cut.
 """
 
 import math
@@ -22,15 +20,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.online.session.frames import (
-    MODELS,
-    NO_EXTRAS,
-    Extras,
-    Flag,
-    Output,
-    Reason,
-    ToolAnswer,
-)
+from palpate.online.session import frames
+from palpate.online.session.frames import Extras, Flag, Output, Reason, ToolAnswer
 from palpate.shared.answer import Answer
 from palpate.shared.errors import QueryError
 from palpate.shared.model import ReducedModel
@@ -73,12 +64,7 @@ class Snapshot(NamedTuple):
 
 
 class ToolTracker:
-    """The tool of one session, and where it has been.
-
-    Parameters
-    ----------
-    model : ReducedModel
-    """
+    """The tool of one session, and where it has been."""
 
     def __init__(self, model: ReducedModel) -> None:
         self._model = model
@@ -134,7 +120,8 @@ class ToolTracker:
             steps = self._catch_up(target, may_go_on)
         # the time that has not passed yet is left for the next frame
         self._clock = now - (1.0 - self._reached) * self._span
-        touch = self._good or _NO_TOUCH._replace(position=target, contact_point=target)
+        # before the first good answer, one without force and without any claim
+        touch = self._good or Answer(position=target, contact_point=target)
         flags = _CONTACT * touch.contact
         if self._reached == 0.0:
             flags |= _FALLBACK
@@ -195,23 +182,12 @@ class ToolTracker:
 
 def _is_finite(touch: Answer) -> bool:
     """Whether an answer holds no NaN, and no infinity but in its error estimates."""
-    numbers = (
-        *touch.force.tolist(),
-        *touch.tangent.ravel().tolist(),
-        *touch.contact_point.tolist(),
-        *touch.normal.tolist(),
-        touch.energy,
-        touch.depth,
-        touch.penetration,
-        touch.min_jacobian,
-    )
+    vectors = (touch.force, touch.tangent.ravel(), touch.contact_point, touch.normal)
+    numbers = touch.energy + touch.depth + touch.penetration + touch.min_jacobian
+    numbers += sum(sum(vector.tolist()) for vector in vectors)
     # an estimate may be infinite: nothing is known of the error then
     estimates = touch.error_displacement + touch.error_von_mises + touch.error_force
-    return math.isfinite(sum(numbers)) and not math.isnan(estimates)
-
-
-_NO_TOUCH = Answer()
-"""No force and no claim, for when there has been no good answer yet."""
+    return math.isfinite(numbers) and not math.isnan(estimates)
 
 
 def _valid_radius(touch: Answer) -> float:
@@ -222,7 +198,7 @@ def _valid_radius(touch: Answer) -> float:
 def recover(model: ReducedModel, touch: Answer, outputs: int) -> Extras:
     """Get what a request asked for beyond force and tangent."""
     if not outputs & ~_HALF:
-        return NO_EXTRAS
+        return frames.NO_EXTRAS
     kind = np.float16 if outputs & _HALF else np.float32
     coordinates = displacement = von_mises = None
     largest = percentile = 0.0
@@ -244,7 +220,7 @@ def recover(model: ReducedModel, touch: Answer, outputs: int) -> Extras:
 def _coordinates(touch: Answer) -> NDArray[np.float32]:
     """Reduced coordinates (MODELS, r), a row per local model."""
     r = max((len(c) for _, _, c in touch.parts), default=0)
-    rows = np.zeros((MODELS, r), np.float32)
+    rows = np.zeros((frames.MODELS, r), np.float32)
     for row, (_, _, c) in zip(rows, touch.parts, strict=False):
         row[:] = c
     return rows

@@ -49,15 +49,12 @@ LINGER = 1.0
 
 
 class SessionProtocol(WebSocketsSansIOProtocol):
-    """Like uvicorn's, but for eight things.
+    """Uvicorn's, with limits.
 
-    An application can tell whether there is more to read, and when it was read. The system's
-    buffers are small, so that what waits in them is recent. A service that stops lets its
-    applications answer what they have and close with a reason. Closing does not wait long for a
-    client that says nothing. A connection whose application has ended is cut even if its client
-    never reads what is left. So is that of a client that floods it with what no application ever
-    sees, pings and parts of messages. A refusal is no error of the application, and not logged as
-    one.
+    An application can tell whether there is more to read, and when it was read; what waits in the
+    system's small buffers is recent. A service that stops lets its applications answer what they
+    have and close with a reason. Closing waits for no client that says nothing or reads nothing,
+    and one that floods the service with pings and parts of messages is cut off.
     """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
@@ -130,7 +127,7 @@ class SessionProtocol(WebSocketsSansIOProtocol):
             self.loop.call_later(LINGER, self.transport.abort)
 
     async def send(self, message: Any) -> None:
-        """Send a message of the application."""
+        """Send a message of the application; a refusal is none of its errors, nor logged as one."""
         await super().send(message)
         if message["type"] == "websocket.http.response.body":
             self.handshake_complete = True

@@ -7,7 +7,8 @@ import pytest
 import uvicorn
 from starlette.testclient import TestClient
 
-from palpate.online.client.session import ServiceError, Session
+from palpate.online.client.connection import ServiceError
+from palpate.online.client.session import Session
 from palpate.online.serve.app import create_app
 from palpate.online.serve.process import HttpProtocol
 from palpate.online.serve.settings import Settings

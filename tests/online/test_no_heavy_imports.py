@@ -3,7 +3,6 @@ import sys
 
 HEAVY = [
     "felupe",
-    "hdrh",
     "matplotlib",
     "palpate.offline",
     "pyvista",

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from palpate.online.serve import wire
-from palpate.online.serve.negotiation import BINARY
+from palpate.online.serve.wire import BINARY
 
 from .fake_model import FakeModel
 

@@ -12,7 +12,8 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from palpate.online.client.session import Session, SessionClosed
+from palpate.online.client.connection import SessionClosed
+from palpate.online.client.session import Session
 from palpate.online.serve.settings import Settings
 from palpate.online.session import frames, websocket
 from palpate.online.session import session as server_session
@@ -88,9 +89,9 @@ def test_ten_thousand_fuzzed_frames(url, rng):
         sessions = [stack.enter_context(Session(url, "toy")) for _ in range(8)]
         for _ in range(10_000 // len(sessions)):
             for session in sessions:
-                session.send_bytes(fuzzed(rng))
+                session._connection.send(fuzzed(rng))
             for i, session in enumerate(sessions):
-                message = session._message()
+                message = session._connection.receive()
                 check(message)
                 if isinstance(message, str) and "unknown_version" in message:
                     with pytest.raises(SessionClosed) as closed:
@@ -108,9 +109,9 @@ def test_fuzzed_text(url, rng):
             text = bytearray(whole)
             for _ in range(rng.integers(1, 4)):
                 text[rng.integers(len(text))] = rng.integers(32, 127)
-            session._protocol.send_text(bytes(text))
-            session._flush()
-            message = session._message()
+            session._connection.protocol.send_text(bytes(text))
+            session._connection.flush()
+            message = session._connection.receive()
             assert "NaN" not in message
             assert set(json.loads(message)) & {"error", "force"}
 
@@ -120,7 +121,7 @@ def test_what_is_no_websocket_and_handshakes_that_never_end(url, rng):
     with witness(url), ExitStack() as stack:
         for _ in range(50):
             with Session(url, "toy") as session:
-                session._socket.sendall(rng.bytes(rng.integers(1, 500)))
+                session._connection.socket.sendall(rng.bytes(rng.integers(1, 500)))
         request = b"GET /scenes/toy/session HTTP/1.1\r\nupgrade: websocket\r\n"
         for length in range(0, len(request), 2):
             connection = socket.create_connection((parts.hostname, parts.port))
@@ -130,7 +131,7 @@ def test_what_is_no_websocket_and_handshakes_that_never_end(url, rng):
 
 def test_a_message_too_long_ends_its_session_only(url):
     with witness(url), Session(url, "toy") as session:
-        session.send_bytes(bytes(100_000))
+        session._connection.send(bytes(100_000))
         with pytest.raises(SessionClosed) as closed:
             session.receive()
         assert closed.value.code == 1009
@@ -144,14 +145,14 @@ def test_clients_that_vanish(serving, tmp_path):
             for _ in range(20):
                 place_comes_free(url).close()
             for session in silent:
-                session._socket.close()
+                session._connection.socket.close()
         with witness(url):
             for _ in range(20):
                 session = place_comes_free(url)
                 session.send(PRESSED)
                 linger = struct.pack("ii", 1, 0)
-                session._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
-                session._socket.close()
+                session._connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
+                session._connection.socket.close()
 
 
 def test_a_client_that_does_not_read_is_cut(serving, tmp_path, monkeypatch, caplog):
@@ -159,7 +160,7 @@ def test_a_client_that_does_not_read_is_cut(serving, tmp_path, monkeypatch, capl
     model = FakeModel(divisions=40)  # replies of 27 KB
     with serving(Settings(tmp_path, max_sessions=2), toy=model) as url, witness(url):
         with Session(url, "toy") as slow:
-            slow._socket.settimeout(10.0)
+            slow._connection.socket.settimeout(10.0)
             frame = frames.encode_request(Request(1, 0.0, PRESSED, EVERYTHING))
             with pytest.raises(ConnectionError):
                 pour(slow, repeat(frame))
@@ -188,9 +189,9 @@ def test_floods_that_no_session_sees_are_cut(url, monkeypatch, caplog, frame, mo
     with witness(url):
         with Session(url, "toy") as session:
             if frame == control(EMPTY_PART):
-                session._socket.sendall(control(0x02))  # begins a message
+                session._connection.socket.sendall(control(0x02))  # begins a message
             with pytest.raises(ConnectionError):
-                flood(session._socket, 1000 * frame)
+                flood(session._connection.socket, 1000 * frame)
         place_comes_free(url).close()
     assert reason in caplog.text
 
@@ -203,40 +204,42 @@ def flood(connection, data):
 def test_pings_and_messages_in_parts_are_answered(url):
     frame = frames.encode_request(Request(7, 0.0, PRESSED))
     with Session(url, "toy") as session:
-        session._socket.sendall(control(0x02, frame[:10]) + control(PING, b"!"))
-        session._socket.sendall(control(0x00, frame[10:30]) + control(0x80, frame[30:]))
+        session._connection.socket.sendall(control(0x02, frame[:10]) + control(PING, b"!"))
+        session._connection.socket.sendall(control(0x00, frame[10:30]) + control(0x80, frame[30:]))
         assert session.receive().seq == 7
 
 
-def test_a_flood_is_answered_or_counted(url):
-    """Every frame is either answered or told as superseded; the last one is answered."""
+def test_in_a_flood_the_newest_position_counts(url):
+    """Every frame is answered, in order, or told as superseded; the last one is answered."""
     count = 10_000
+    positions = [(5.0, 5.0, 6.5 + 1e-5 * i) for i in range(count)]
     with witness(url), Session(url, "toy") as session:
-        flood_ = (frames.encode_request(Request(i, 0.0, PRESSED)) for i in range(count))
+        flood_ = (frames.encode_request(Request(i, 0.0, at)) for i, at in enumerate(positions))
         flood = threading.Thread(target=pour, args=(session, flood_))
         flood.start()
-        answered = superseded = 0
-        seq = None
-        while seq != count - 1:
-            reply = session.receive()
-            answered, superseded, seq = answered + 1, superseded + reply.superseded, reply.seq
+        replies = [session.receive()]
+        while replies[-1].seq != count - 1:
+            replies.append(session.receive())
         flood.join()
-    assert answered + superseded == count
+    superseded = sum(reply.superseded for reply in replies)
+    assert len(replies) + superseded == count
     assert superseded > 0
+    assert (np.diff([reply.seq for reply in replies]) > 0).all()
+    np.testing.assert_array_equal(replies[-1].position, positions[-1])
 
 
 def pour(session, frames_):
     """Send frames as fast as the socket takes them, reading nothing."""
-    protocol = type(session._protocol)(session._protocol.uri)
-    protocol.state = session._protocol.state
+    protocol = type(session._connection.protocol)(session._connection.protocol.uri)
+    protocol.state = session._connection.protocol.state
     for i, frame in enumerate(frames_, 1):
         protocol.send_binary(frame)
         if i % 100 == 0:
-            session._socket.sendall(b"".join(protocol.data_to_send()))
+            session._connection.socket.sendall(b"".join(protocol.data_to_send()))
 
 
 def test_a_tool_that_jumps_through_the_body(url, rng):
     with witness(url), Session(url, "toy") as session:
         for position in rng.uniform([0, 0, -5], [10, 10, 12], (500, 3)):
             session.send(position)
-            check(session._message())
+            check(session._connection.receive())

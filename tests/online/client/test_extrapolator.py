@@ -8,7 +8,6 @@ from palpate.online.client.extrapolator import (
     HOLD,
     RAMP,
     Extrapolator,
-    clamp,
     fade,
     linear_force,
 )
@@ -53,12 +52,6 @@ def test_a_force_never_pulls(step, depth):
     reply = reply._replace(valid_radius=10.0)
     force = linear_force(reply, reply.position + np.array(step))
     assert force @ reply.normal >= -1e-12 * np.abs(reply.force).max()
-
-
-def test_a_force_is_clamped():
-    np.testing.assert_allclose(clamp(np.array([3.0, 0.0, 4.0]), 1.0), [0.6, 0.0, 0.8])
-    np.testing.assert_array_equal(clamp(np.array([3.0, 0.0, 4.0]), 6.0), [3.0, 0.0, 4.0])
-    assert not clamp(np.zeros(3), 0.0).any()
 
 
 def test_without_replies_there_is_no_force():

@@ -21,7 +21,7 @@ def log(due, latency_ms=0.2, late_ms=0.0, outcome=ANSWERED):
     log.sent = (due + 1e6 * np.broadcast_to(late_ms, shape)).astype(int).tolist()
     log.received = (due + 1e6 * np.broadcast_to(latency_ms, shape)).astype(int).tolist()
     log.outcome = np.broadcast_to(outcome, shape).tolist()
-    log.solve_us = [50.0] * shape
+    log.solve = [50.0] * shape
     log.flags = [int(Flag.CONTACT)] * shape
     return log
 
@@ -34,10 +34,8 @@ def machine(seconds, steal=()):
 
 
 def test_quantiles_are_those_of_the_values(rng):
-    values = rng.lognormal(5.0, 1.0, 100_000)
-    found = quantiles(np.append(values, np.nan))
-    for name, percentile in (("p50_us", 50), ("p99_us", 99), ("p999_us", 99.9), ("max_us", 100)):
-        assert found[name] == pytest.approx(np.percentile(values, percentile), rel=2e-3)
+    found = quantiles(np.append(rng.permutation(np.arange(1.0, 1001.0)), np.nan))
+    assert list(found.values()) == pytest.approx([500.0, 900.0, 990.0, 999.0, 1000.0], abs=1.0)
     assert quantiles(np.full(3, np.nan))["p50_us"] is None
 
 
@@ -96,7 +94,7 @@ def test_recovery_is_when_latencies_are_as_before(slow_until, recovered):
     due = np.arange(0.01, 8.0, 0.01)
     slow = (due > 2.0) & (due < slow_until)
     messages = gather([log(due, np.where(slow, 50.0, 0.2))])
-    found = summarize_overload(messages, machine(8), np.array([0.0, 2.0, 4.0, 8.0]))
+    found = summarize_overload(messages, machine(8), 2.0, 4.0)
     assert found["recovered_s"] == recovered
     assert found["before"]["p99_us"] == pytest.approx(200.0, rel=1e-3)
     assert found["during"]["p50_us"] == pytest.approx(50_000.0, rel=1e-3)
@@ -107,7 +105,7 @@ def test_a_lost_message_is_no_recovery():
     outcome = np.full(len(due), ANSWERED)
     outcome[-120:-110] = LOST  # in the last window but one
     messages = gather([log(due, outcome=outcome)])
-    found = summarize_overload(messages, machine(6), np.array([0.0, 2.0, 4.0, 6.0]))
+    found = summarize_overload(messages, machine(6), 2.0, 4.0)
     assert found["recovered_s"] == 1.0
 
 
@@ -116,9 +114,9 @@ def test_superseded_frames_do_not_hide_a_recovery_nor_make_one():
     outcome = np.full(len(due), ANSWERED)
     outcome[(due > 2.0) & (due < 4.5)] = SUPERSEDED
     messages = gather([log(due, outcome=outcome)])
-    found = summarize_overload(messages, machine(6), np.array([0.0, 2.0, 4.0, 6.0]))
+    found = summarize_overload(messages, machine(6), 2.0, 4.0)
     assert found["recovered_s"] == 0.0
     outcome[:] = LOST
     messages = gather([log(due, outcome=outcome)])
-    found = summarize_overload(messages, machine(6), np.array([0.0, 2.0, 4.0, 6.0]))
+    found = summarize_overload(messages, machine(6), 2.0, 4.0)
     assert found["recovered_s"] is None

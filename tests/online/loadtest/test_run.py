@@ -45,7 +45,7 @@ def test_superseded_frames_are_told_from_lost_ones(url):
 
 
 def test_a_session_that_is_refused_says_why(url):
-    with pytest.raises(PalpateError, match="too_many_sessions"):
+    with pytest.raises(PalpateError, match="16 sessions are open"):
         run(Plan(url, "toy", sessions=Settings.max_sessions + 1))
 
 

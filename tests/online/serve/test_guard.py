@@ -4,7 +4,8 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from palpate.online.client.session import ServiceError, Session
+from palpate.online.client.connection import ServiceError
+from palpate.online.client.session import Session
 from palpate.online.serve import guard
 from palpate.online.serve.guard import RateLimit
 from palpate.online.serve.settings import Settings, is_loopback

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from palpate.online.serve import wire
-from palpate.online.serve.negotiation import BINARY
 from palpate.online.serve.schemas import MOST_STEPS
+from palpate.online.serve.wire import BINARY
 from palpate.shared.model import ReducedModel
 from palpate.shared.reduced.transfer import REST
 

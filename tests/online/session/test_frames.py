@@ -1,5 +1,4 @@
 import struct
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,29 +15,31 @@ from palpate.online.session.frames import (
     ToolAnswer,
     VersionError,
 )
+from palpate.shared.answer import Answer
 
 REQUEST = Request(seq=7, client_time=1.5, position=(1.0, 2.0, 3.0), outputs=5)
 
 
-def step(parts=()):
-    touch = SimpleNamespace(
-        position=np.array([1.0, 2.0, 3.0]),
-        force=np.array([4.0, 5.0, 6.0]),
-        tangent=np.arange(9.0).reshape(3, 3),
-        energy=2.5,
-        contact_point=np.array([1.0, 2.0, 1.0]),
-        normal=np.array([0.0, 0.0, 1.0]),
-        depth=0.5,
-        depth_limit=1.5,
-        penetration=0.01,
-        error_displacement=0.001,
-        error_von_mises=0.002,
-        error_force=0.003,
-        min_jacobian=0.9,
-        iterations=3,
-        parts=parts,
-    )
-    return ToolAnswer(touch, flags=7, steps=2, valid_radius=0.25, solve_seconds=1e-4, reason=0)
+TOUCH = Answer(
+    position=np.array([1.0, 2.0, 3.0]),
+    force=np.array([4.0, 5.0, 6.0]),
+    tangent=np.arange(9.0).reshape(3, 3),
+    energy=2.5,
+    contact_point=np.array([1.0, 2.0, 1.0]),
+    normal=np.array([0.0, 0.0, 1.0]),
+    depth=0.5,
+    depth_limit=1.5,
+    error_displacement=0.001,
+    error_von_mises=0.002,
+    error_force=0.003,
+    iterations=3,
+)
+
+
+def step(flags=7, **changes):
+    """Return an answer of the tool, with some fields of the touch changed."""
+    touch = TOUCH._replace(**changes)
+    return ToolAnswer(touch, flags, steps=2, valid_radius=0.25, solve_seconds=1e-4, reason=0)
 
 
 def test_every_field_lies_on_a_multiple_of_its_size():
@@ -63,8 +64,8 @@ def test_a_request_comes_back():
 
 
 def test_a_reply_comes_back():
-    parts = ((12, 0.75, None), (3, 0.25, None))
-    frame = frames.encode_reply(REQUEST, step(parts), superseded=4, received=10.0, sent=10.5)
+    answer = step(parts=((12, 0.75, None), (3, 0.25, None)))
+    frame = frames.encode_reply(REQUEST, answer, superseded=4, received=10.0, sent=10.5)
     reply = frames.decode_reply(frame)
     assert (reply.seq, reply.client_time, reply.flags) == (7, 1.5, 7)
     assert (reply.server_received, reply.server_sent, reply.superseded) == (10.0, 10.5, 4)
@@ -84,16 +85,20 @@ def test_a_reply_comes_back():
     assert reply.coordinates is reply.displacement is reply.von_mises is None
 
 
-@pytest.mark.parametrize("error", [3.5e38, 1e300, float("inf")])
-def test_estimates_too_large_for_their_field_are_unknown(error):
-    huge = step()
-    huge.touch.error_displacement = huge.touch.error_von_mises = huge.touch.error_force = error
-    reply = frames.decode_reply(frames.encode_reply(REQUEST, huge))
-    assert reply.error_displacement == reply.error_von_mises == reply.error_force == np.inf
-    huge.touch.error_force = 3e38
-    assert frames.decode_reply(frames.encode_reply(REQUEST, huge)).error_force < np.inf
-    outside = huge._replace(flags=huge.flags & ~Flag.IN_RANGE)
-    assert frames.decode_reply(frames.encode_reply(REQUEST, outside)).error_force == np.inf
+@pytest.mark.parametrize(
+    ("error", "flags", "known"),
+    [
+        (3e38, 7, True),
+        (3.5e38, 7, False),
+        (np.inf, 7, False),
+        (0.001, 7 & ~Flag.IN_RANGE, False),
+    ],
+)
+def test_errors_too_large_for_their_field_or_out_of_range_are_unknown(error, flags, known):
+    answer = step(flags, error_displacement=error, error_von_mises=error, error_force=error)
+    reply = frames.decode_reply(frames.encode_reply(REQUEST, answer))
+    for estimate in (reply.error_displacement, reply.error_von_mises, reply.error_force):
+        assert (estimate < np.inf) == known
 
 
 @pytest.mark.parametrize("half", [False, True])
@@ -115,8 +120,7 @@ def test_extras_come_back(rng, half):
 
 @pytest.mark.parametrize("flag", [Flag.CLAMPED, Flag.FALLBACK])
 def test_a_reply_for_another_position_is_not_good(flag):
-    answer = step()._replace(flags=7 | flag)
-    assert not frames.decode_reply(frames.encode_reply(REQUEST, answer)).good
+    assert not frames.decode_reply(frames.encode_reply(REQUEST, step(7 | flag))).good
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,9 @@ import pytest
 from click.testing import CliRunner
 
 from palpate.online import commands
+from palpate.online.client.connection import ServiceError
 from palpate.online.client.http import Client
-from palpate.online.client.session import ServiceError, Session
+from palpate.online.client.session import Session
 from palpate.online.session.frames import (
     REPLY_FIELDS,
     Flag,
@@ -135,8 +136,7 @@ def test_long_sessions_are_written_piece_by_piece(serving, tmp_path, monkeypatch
 
 @pytest.fixture
 def recorder(tmp_path):
-    with Recorder(tmp_path / "session.h5", {"scene": "toy"}) as recorder:
-        yield recorder
+    return Recorder(tmp_path / "session.h5", {"scene": "toy"})
 
 
 def test_requests_that_were_dropped_or_refused_are_not_kept(recorder, tmp_path):
@@ -162,7 +162,7 @@ def test_requests_without_any_reply_do_not_fill_the_memory(recorder, monkeypatch
 def test_a_reply_to_a_frame_of_the_clients_own_is_left_out(url, tmp_path):
     path = tmp_path / "session.h5"
     with Session(url, "toy", record=path) as session:
-        session.send_bytes(encode_request(Request(77, 0.0, (5.0, 5.0, 6.5))))
+        session._connection.send(encode_request(Request(77, 0.0, (5.0, 5.0, 6.5))))
         assert session.receive().seq == 77
         reply = session.step((5.0, 5.0, 6.4))
     assert [request.seq for request in read_recording(path).requests] == [reply.seq]
