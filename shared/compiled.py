@@ -84,12 +84,14 @@ def bind(content: NamedTuple) -> Any:
 
 def kind_of(value: types.Type) -> type | None:
     """Class of the named tuple, bound or not, that a value of this numba type is."""
-    if isinstance(value, types.NamedTuple):
+    if isinstance(value, types.NamedTuple | types.NamedUniTuple):
         return value.instance_class
     return value.kind if isinstance(value, _BoundType) else None
 
 
-def by_type(piece: Callable[..., Any], table: Mapping[type, Callable[..., Any]]) -> None:
+def by_type(
+    piece: Callable[..., Any], table: Mapping[type, Callable[..., Any]], **options: bool
+) -> None:
     """Compile calls of ``piece`` as calls of the function for the type of their first argument.
 
     Parameters
@@ -97,12 +99,16 @@ def by_type(piece: Callable[..., Any], table: Mapping[type, Callable[..., Any]])
     piece : function
         Names the arguments and says what is done; never run itself.
     table : mapping of type to function
-        Of the classes of named tuples, bound or not; the functions have the arguments of ``piece``.
+        Of the classes of named tuples, bound or not; the functions have the arguments of ``piece``,
+        the first of any name.
+    options : bool
+        Of the compiler.
     """
 
     def choose(*args: types.Type) -> Callable[..., Any] | None:
         kind = kind_of(args[0])
         return None if kind is None else table.get(kind)
 
-    choose.__signature__ = inspect.signature(piece)  # type: ignore[attr-defined]
-    overload(piece, jit_options={"error_model": "numpy"})(choose)
+    jit_options: Any = {"error_model": "numpy"} | options
+    choose.__signature__ = inspect.signature(next(iter(table.values())))  # type: ignore[attr-defined]
+    overload(piece, jit_options=jit_options)(choose)

@@ -40,9 +40,7 @@ class FieldRecovery:
         self._body = body
         self._models = models
         self._transfer_of = transfer_of
-        self._recovery = stress_recovery(
-            body.nodes, body.elements, body.mu, body.lam, precision=np.float32
-        )
+        self._recovery = stress_recovery(body.nodes, body.elements, body.law, precision=np.float32)
         self._stress = np.zeros(len(body.nodes))
 
     def coefficients(self, answer: Answer) -> dict[int, Field]:

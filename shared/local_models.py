@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from palpate.shared.artifact import Stored, values_of
 from palpate.shared.geometry.quadrature import surface_quadrature, volume_quadrature
 from palpate.shared.mechanics.footprint import SurfaceQuadrature
+from palpate.shared.mechanics.laws import law_of
 from palpate.shared.mechanics.sphere import Tip, TipSurface, tip_of, tip_surface
-from palpate.shared.mechanics.tissue import lame
+from palpate.shared.mechanics.tissue import Law
 from palpate.shared.reduced.outcome import HISTORY_FEATURES, PRESS_FEATURES, TOUCH_FEATURES
 from palpate.shared.scene import Scene
 
@@ -44,17 +45,15 @@ class Body:
     accessible: Annotated[
         NDArray[np.bool_], Stored("accessible", "1", "faces an endoscope can touch (f,)")
     ]
-    mu: Array  # (e,) kPa
-    lam: Array  # (e,) kPa
+    law: Law  # parameters of the elements (e,)
     tip: Tip
 
     @classmethod
     def of(cls, arrays: Mapping[str, NDArray[Any]], scene: Scene) -> Self:
         """Body of an artifact of this scene."""
-        tissue = scene.tissue
-        moduli = np.tile(lame(tissue.young, tissue.poisson), (len(arrays["elements"]), 1)).T
-        tip = tip_of(scene.endoscope.radius, tissue.young)
-        return cls(**values_of(cls, arrays), mu=moduli[0].copy(), lam=moduli[1].copy(), tip=tip)
+        law = law_of(scene.tissue, len(arrays["elements"]))
+        tip = tip_of(scene.endoscope.radius, scene.tissue.young)
+        return cls(**values_of(cls, arrays), law=law, tip=tip)
 
     @cached_property
     def touchable(self) -> tuple[TipSurface, NDArray[np.int32]]:

@@ -18,8 +18,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import (
-    BaseModel,
-    ConfigDict,
     Field,
     PrivateAttr,
     ValidationError,
@@ -31,6 +29,8 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
 from palpate.shared.errors import PalpateError
+from palpate.shared.mechanics.laws import AnyTissue
+from palpate.shared.part import Fraction, Part, Positive
 
 ElementName = Literal["hex8", "hex8-mean-dilatation", "hex8-fbar", "hex20"]
 Element = Annotated[
@@ -40,8 +40,6 @@ Element = Annotated[
     ),
 ]
 
-Positive = Annotated[float, Field(gt=0)]
-Fraction = Annotated[float, Field(gt=0, lt=1)]
 Divisions = tuple[
     Annotated[int, Field(ge=1, le=500)],
     Annotated[int, Field(ge=1, le=500)],
@@ -54,12 +52,6 @@ Range = tuple[float, float]
 
 class SceneError(PalpateError):
     """A scene that cannot be used; the message names the file, the field and what is allowed."""
-
-
-class Part(BaseModel):
-    """A table of the scene file: immutable, strict about types, closed to unknown keys."""
-
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
 
 def _in_radii(multiple: float, description: str) -> Any:
@@ -125,30 +117,6 @@ def divisions_of(geometry: Extrusion | Block) -> Divisions:
     if geometry.divisions is None:
         raise SceneError("geometry.divisions: not given; palpate train chooses them")
     return geometry.divisions
-
-
-class Tissue(Part):
-    """What the body is made of."""
-
-    law: Literal["neo-hookean"] = Field(description="elastic law; neo-hookean is FEAP's")
-    young: Positive = Field(description="Young's modulus at rest, kPa")
-    poisson: float = Field(ge=0, lt=0.5, description="Poisson's ratio at rest")
-    prony: tuple[tuple[Fraction, Positive], ...] = Field(
-        (),
-        max_length=6,
-        description="[[share of the isochoric stress that is lost, time constant in s], ...]",
-    )
-
-    @model_validator(mode="after")
-    def _some_stiffness_stays(self) -> Tissue:
-        total = sum(share for share, _ in self.prony)
-        if not total < 1.0:
-            raise PydanticCustomError(
-                "prony",
-                "the shares of prony must sum to less than 1, not {total}",
-                {"total": total},
-            )
-        return self
 
 
 class Patch(Part):
@@ -255,7 +223,9 @@ class Scene(Part):
     geometry: Annotated[Extrusion | Block, Field(discriminator="kind")] = Field(
         description="the shape of the body"
     )
-    tissue: Tissue = Field(description="what the body is made of")
+    tissue: Annotated[AnyTissue, Field(discriminator="law")] = Field(
+        description="what the body is made of"
+    )
     support: Patch = Field(description="what is held fixed")
     surface: Patch = Field(description="what the endoscope can touch")
     endoscope: Endoscope = Field(description="the instrument that presses")

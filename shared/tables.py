@@ -34,7 +34,7 @@ def press_models(body: Body, models: LocalModels, scene: Scene) -> PressModels:
     most = -(-int(np.diff(models.point_from).max()) // LANES) * LANES
     point_gradients = np.zeros((count, r, 9 * most), np.int16)
     steps = np.empty((count, r), np.float32)
-    weights, mu, lam = (np.zeros((count, most)) for _ in range(3))
+    weights, elements = np.zeros((count, most)), np.zeros((count, most), int)
     modes: list[Field] = [np.empty(0, np.float32)] * count
     rows: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = [(np.empty(0, int),) * 2] * count
     for region, steps_of_region in enumerate(models.steps):
@@ -50,7 +50,7 @@ def press_models(body: Body, models: LocalModels, scene: Scene) -> PressModels:
             steps[k] = np.maximum(np.abs(G).max(axis=1), 1e-30) / np.iinfo(np.int16).max
             point_gradients[k] = np.rint(G / steps[k, :, None])
             weights[k, : len(element)] = models.weights[own]
-            mu[k, : len(element)], lam[k, : len(element)] = body.mu[element], body.lam[element]
+            elements[k, : len(element)] = element
             reach = models.extent + scene.endoscope.radius
             near = np.flatnonzero(np.sum((surface.points - models.centres[k]) ** 2, 1) < reach**2)
             nodes, local = np.unique(surface.nodes[near], return_inverse=True)
@@ -61,7 +61,7 @@ def press_models(body: Body, models: LocalModels, scene: Scene) -> PressModels:
         centres=np.ascontiguousarray(models.centres.T),
         frames=models.frames,
         pressures=np.ascontiguousarray(models.pressures),
-        points=PointTables(point_gradients, steps, weights, mu, lam),
+        points=PointTables(point_gradients, steps, weights, body.law.at(elements)),
         node_from=_offsets(modes),
         modes=np.vstack(modes).reshape(-1, 3 * r),
         face_from=_offsets([r[0] for r in rows]),
@@ -91,8 +91,8 @@ def touch_models(
     reach = models.extent + REACH * body.tip.radius
     bases = models.basis.reshape(*models.steps.shape, len(body.nodes), 3)
     count = len(models.centres)
-    points = _no_points(count, tips)
-    tangent_points = points if tangent is None else _no_points(count, tangent)
+    points = _no_points(body, tips)
+    tangent_points = points if tangent is None else _no_points(body, tangent)
     modes: list[Field] = [np.empty(0, np.float32)] * count
     near: list[NDArray[np.int32]] = [np.empty(0, np.int32)] * count
     own: list[tuple[NDArray[np.int32], NDArray[np.int64]]] = [(near[0], np.empty(0, int))] * count
@@ -143,14 +143,17 @@ def _neighbours(count: int, tips: LocalTips) -> dict[str, NDArray[Any]]:
     }
 
 
-def _no_points(count: int, tips: LocalTips) -> PointTables:
-    """Room for the points of so many models."""
-    most = -(-int(np.diff(tips.point_from).max()) // LANES) * LANES
-    modes = tips.modes.shape[2]
+def _no_points(body: Body, tips: LocalTips) -> PointTables:
+    """Room for the points of all models: of their tissue, but without gradients and weights."""
+    counts, modes = np.diff(tips.point_from), tips.modes.shape[2]
+    elements = np.zeros((len(counts), -(-int(counts.max()) // LANES) * LANES), int)
+    filled = np.arange(elements.shape[1]) < counts[:, None]
+    elements[filled] = tips.points // body.gradients.shape[1]
     return PointTables(
-        np.zeros((count, modes, 9 * most), np.float32),
-        np.ones((count, modes), np.float32),
-        *(np.zeros((count, most)) for _ in range(3)),
+        np.zeros((len(counts), modes, 9 * elements.shape[1]), np.float32),
+        np.ones((len(counts), modes), np.float32),
+        np.zeros(elements.shape),
+        body.law.at(elements),
     )
 
 
@@ -165,8 +168,6 @@ def _place_points(
     G = _mode_gradients(V, body.gradients[element, q])
     points.gradients[k] = _tiles(G, points.weights.shape[1])
     points.weights[k, : len(element)] = tips.weights[rows]
-    points.mu[k, : len(element)] = body.mu[element]
-    points.lam[k, : len(element)] = body.lam[element]
 
 
 def _rows(basis: Field, nodes: NDArray[np.int32], C: Field) -> Field:

@@ -18,7 +18,7 @@ so F and Fbar are the same to it.
 import numpy as np
 from numba import njit
 
-from palpate.shared.mechanics import tissue, viscosity
+from palpate.shared.mechanics import laws, tissue, viscosity
 from palpate.shared.mechanics.tensors import (
     add,
     cofactor,
@@ -26,6 +26,7 @@ from palpate.shared.mechanics.tensors import (
     ddot,
     det,
     dot,
+    isochoric,
     load_packed,
     scale,
     store,
@@ -61,21 +62,21 @@ def _add_point_force(conn, grad, w, P, r):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def standard_residual(conn, grad, weight, mu, lam, u, r):
+def standard_residual(conn, grad, weight, law, u, r):
     """Add the internal force of ``u`` to ``r``; return (energy, smallest J).
 
-    conn (e, n) int32; grad (e, q, n, 3) 1/mm; weight (e, q) mm^3; mu, lam (e,) kPa;
+    conn (e, n) int32; grad (e, q, n, 3) 1/mm; weight (e, q) mm^3; law (e,);
     u, r (3 nodes,) mm and mN.
     """
     energy, smallest = 0.0, np.inf
     for e in range(len(conn)):
         for q in range(weight.shape[1]):
             F = _deformation_gradient(conn[e], grad[e, q], u)
-            J, square, P = tissue.first_piola(F, mu[e], lam[e])
+            J, part, P = laws.first_piola(laws.at(law, e), F)
             smallest = min(smallest, J)
             if not J > 0.0:
                 return tissue.INVERTED, smallest
-            energy += weight[e, q] * tissue.energy(J, square, mu[e], lam[e])
+            energy += weight[e, q] * laws.energy(laws.at(law, e), J, part)
             _add_point_force(conn[e], grad[e, q], weight[e, q], P, r)
     return energy, smallest
 
@@ -125,14 +126,15 @@ def scatter_faces(K, slots, data):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def standard_tangent(conn, grad, weight, mu, lam, u, slots, data):
+def standard_tangent(conn, grad, weight, law, u, slots, data):
     """Add the tangent stiffness at ``u`` to CSR ``data`` (mN/mm); slots (e, 3n, 3n) int32."""
     n = conn.shape[1]
     A, G, C, K = np.empty((9, 9)), np.empty((3, n)), np.empty((9, n)), np.empty((3, 3, n, n))
     for e in range(len(conn)):
         K[:] = 0.0
         for q in range(weight.shape[1]):
-            tissue.tangent(_deformation_gradient(conn[e], grad[e, q], u), mu[e], lam[e], A)
+            F = _deformation_gradient(conn[e], grad[e, q], u)
+            laws.tangent(laws.at(law, e), F, A)
             _add_point_tangent(grad[e, q], A, weight[e, q], G, C, K)
         _scatter(K, slots[e], data)
 
@@ -152,7 +154,7 @@ def _dilatation(conn, theta_grad, theta_weight, u, g):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def dilatation_residual(conn, grad, weight, theta_grad, theta_weight, mu, lam, u, r):
+def dilatation_residual(conn, grad, weight, theta_grad, theta_weight, law, u, r):
     """As ``standard_residual`` for elements with one dilatation; theta_grad (e, t, n, 3)."""
     n = conn.shape[1]
     g, f, own = np.empty(3 * n), np.empty(3 * n), np.arange(n)
@@ -172,8 +174,8 @@ def dilatation_residual(conn, grad, weight, theta_grad, theta_weight, mu, lam, u
             if not J > 0.0:
                 return tissue.INVERTED, smallest
             alpha, w = (theta / J) ** (1.0 / 3.0), weight[e, q]
-            bar, square, P = tissue.first_piola(scale(alpha, F), mu[e], lam[e])
-            energy += w * tissue.energy(bar, square, mu[e], lam[e])
+            bar, part, P = laws.first_piola(laws.at(law, e), scale(alpha, F))
+            energy += w * laws.energy(laws.at(law, e), bar, part)
             p = ddot(P, F) / 3.0
             by_theta += w * alpha * p / theta
             _add_point_force(own, grad[e, q], w * alpha, combine(1.0, P, -p / J, C), f)
@@ -184,31 +186,31 @@ def dilatation_residual(conn, grad, weight, theta_grad, theta_weight, mu, lam, u
 
 
 @njit(cache=True, error_model="numpy")
-def _fixed_dilatation_tangent(F, alpha, mu, lam, A):
+def _fixed_dilatation_tangent(law, F, alpha, A):
     """Write the tangent ``psi_FF`` of ``dilatation_tangent`` (9, 9) kPa to ``A``.
 
     Returns the stress ``P`` at ``alpha F``, its derivative along ``alpha F``, and ``F^-T``.
     """
-    Fbar = scale(alpha, F)
-    _, _, P = tissue.first_piola(Fbar, mu, lam)
-    Tbar, geometric, bulk = tissue.linearise(Fbar, mu, lam)
-    T, once = scale(alpha, Tbar), ddot(P, F)
+    Fbar, cofactors = scale(alpha, F), cofactor(F)
+    _, _, P = laws.first_piola(law, Fbar)
+    state = laws.linearise(law, Fbar)
+    T, once = scale(1.0 / det(F, cofactors), cofactors), ddot(P, F)
     for k in range(9):
         H = unit(k)
         third = ddot(T, H) / 3.0
         # of alpha (P - P:F/3 T), with dalpha = -alpha third and dT = -T H^T T
-        dP = tissue.increment(Tbar, geometric, bulk, mu, scale(alpha, combine(1.0, H, -third, F)))
+        dP = laws.increment(law, state, scale(alpha, combine(1.0, H, -third, F)))
         along = third * once / 3.0 - (ddot(dP, F) + ddot(P, H)) / 3.0
         D = add(
             combine(1.0, dP, -third, P),
             combine(along, T, once / 3.0, dot(T, dot(transposed(H), T))),
         )
         store(scale(alpha, D), A[k], 0, 1)
-    return P, tissue.increment(Tbar, geometric, bulk, mu, Fbar), T
+    return P, laws.increment(law, state, Fbar), T
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def dilatation_tangent(conn, grad, weight, theta_grad, theta_weight, mu, lam, u, slots, data):
+def dilatation_tangent(conn, grad, weight, theta_grad, theta_weight, law, u, slots, data):
     """As ``standard_tangent`` for elements with one dilatation.
 
     With ``psi(F, theta) = W(alpha F)``: K = sum w [B^T psi_FF B + B^T psi_Ft g^T + g psi_tF B +
@@ -225,7 +227,7 @@ def dilatation_tangent(conn, grad, weight, theta_grad, theta_weight, mu, lam, u,
         for q in range(weight.shape[1]):
             F, w = _deformation_gradient(conn[e], grad[e, q], u), weight[e, q]
             alpha = (theta / det(F, cofactor(F))) ** (1.0 / 3.0)
-            P, by_scale, T = _fixed_dilatation_tangent(F, alpha, mu[e], lam[e], A)
+            P, by_scale, T = _fixed_dilatation_tangent(laws.at(law, e), F, alpha, A)
             _add_point_tangent(grad[e, q], A, w, G, C, K)
             once, twice = ddot(P, F), ddot(by_scale, F)
             by_theta += w * alpha * once / (3.0 * theta)
@@ -271,7 +273,7 @@ def viscous_residual(conn, grad, weight, mu, B, u, r):
         for q in range(weight.shape[1]):
             F = _deformation_gradient(conn[e], grad[e, q], u)
             J = det(F, cofactor(F))
-            modulus = mu[e] * J ** (-2.0 / 3.0)
+            modulus = mu[e] * isochoric(J)
             past = unpacked(load_packed(B[e, q], 0, 1))
             contraction, P = viscosity.overstress(F, past, J, modulus)
             energy += weight[e, q] * 0.5 * modulus * contraction

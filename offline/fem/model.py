@@ -21,9 +21,9 @@ from palpate.offline.fem.mesh import Mesh
 from palpate.shared.errors import PalpateError
 from palpate.shared.geometry.quadrature import volume_quadrature
 from palpate.shared.mechanics import newton, sphere, viscosity
+from palpate.shared.mechanics.laws import AnyTissue, law_of
 from palpate.shared.mechanics.sphere import Tip, TipSurface, Touching, room_for
 from palpate.shared.mechanics.tensors import SYMMETRIC
-from palpate.shared.mechanics.tissue import lame
 from palpate.shared.scene import ElementName, Scene
 
 Array = NDArray[np.float64]
@@ -153,34 +153,27 @@ class FullModel:
     ----------
     mesh : Mesh
     element : {"hex8", "hex8-mean-dilatation", "hex8-fbar", "hex20"}
-    young, poisson : float
-        kPa and 1; of tissue that had no time to relax.
-    prony : tuple of (float, float)
-        Share of the isochoric stress that is lost with each time constant (s). Only ``step``
-        and ``touch_step`` know of time: ``solve`` and ``touch`` answer instantly.
+    tissue : AnyTissue
+        Only ``step`` and ``touch_step`` know of its time: ``solve`` and ``touch`` answer instantly.
     """
 
     mesh: Mesh
     element: ElementName
-    young: float
-    poisson: float
-    prony: tuple[tuple[float, float], ...] = ()
+    tissue: AnyTissue
     _load: Array = field(init=False, repr=False)
 
     @classmethod
     def of(cls, scene: Scene, mesh: Mesh) -> FullModel:
         """Full model of a scene on its mesh."""
-        tissue = scene.tissue
-        return cls(mesh, scene.geometry.element, tissue.young, tissue.poisson, tissue.prony)
+        return cls(mesh, scene.geometry.element, scene.tissue)
 
     def __post_init__(self) -> None:
         mesh = self.mesh
         self.free = np.flatnonzero(np.repeat(~mesh.clamped, 3))
         self.gradients, self.weights = volume_quadrature(mesh.nodes, mesh.elements, 2)
         self.connectivity = np.ascontiguousarray(mesh.elements, dtype=np.int32)
-        mu, lam = lame(self.young, self.poisson)
-        self.mu = np.full(len(mesh.elements), mu)
-        self.lam = np.full(len(mesh.elements), lam)
+        self.law = law_of(self.tissue, len(mesh.elements))
+        self.prony = self.tissue.prony
         self._theta = self._theta_points()
         self._slots, self.pattern = self._sparsity()
         self._load = np.zeros(len(self.free))
@@ -198,7 +191,7 @@ class FullModel:
         """The model of what the tissue is after an infinite time, elastic."""
         if not self.prony:
             return self
-        other = replace(self, prony=())
+        other = replace(self, tissue=self.tissue.model_copy(update={"prony": ()}))
         other._past = predicted(self.at_rest, viscosity.step_weights(self.prony, np.inf))
         return other
 
@@ -261,15 +254,13 @@ class FullModel:
         force[:] = 0.0
         args = (self.connectivity, self.gradients, self.weights)
         if self._theta is None:
-            energy, smallest = assembly.standard_residual(
-                *args, self.mu, self.lam, displacement, force
-            )
+            energy, smallest = assembly.standard_residual(*args, self.law, displacement, force)
         else:
             energy, smallest = assembly.dilatation_residual(
-                *args, *self._theta, self.mu, self.lam, displacement, force
+                *args, *self._theta, self.law, displacement, force
             )
         if self._past is not None and smallest > 0.0:
-            energy += assembly.viscous_residual(*args, self.mu, self._past, displacement, force)
+            energy += assembly.viscous_residual(*args, self.law.mu, self._past, displacement, force)
         return energy, smallest
 
     def internal_free(self, u: Array) -> Array:
@@ -313,14 +304,14 @@ class FullModel:
         """Tangent stiffness (mN/mm) of the free dofs; the next call overwrites the matrix."""
         self._data[:] = 0.0
         args = (self.connectivity, self.gradients, self.weights)
-        rest = (self.mu, self.lam, displacement, self._slots, self._data)
+        rest = (self.law, displacement, self._slots, self._data)
         if self._theta is None:
             assembly.standard_tangent(*args, *rest)
         else:
             assembly.dilatation_tangent(*args, *self._theta, *rest)
         if self._past is not None:
             assembly.viscous_tangent(
-                *args, self.mu, self._past, displacement, self._slots, self._data
+                *args, self.law.mu, self._past, displacement, self._slots, self._data
             )
         return csr_matrix((self._data, self.pattern.indices, self.pattern.indptr), copy=False)
 
@@ -473,10 +464,10 @@ class FullModel:
         """Residual (mN) that counts as equilibrium: small beside what the past exerts, or none."""
         force = np.zeros_like(self._full)
         assembly.viscous_residual(
-            self.connectivity, self.gradients, self.weights, self.mu, self._past,
+            self.connectivity, self.gradients, self.weights, self.law.mu, self._past,
             history.displacement.reshape(-1), force,
         )  # fmt: skip
-        none = ROUND_OFF * self.young * self.weights.sum() ** (2 / 3)
+        none = ROUND_OFF * self.tissue.young * self.weights.sum() ** (2 / 3)
         return max(TOLERANCE * float(np.linalg.norm(force[self.free])), float(none))
 
     def touch(
@@ -511,7 +502,7 @@ class FullModel:
             contact.position[:] = position - (1.0 - fraction) * approach
 
         # the force is not known before; that which dents the tissue by the tip's radius is
-        target = TOLERANCE * self.young * contact.tip.radius**2
+        target = TOLERANCE * self.tissue.young * contact.tip.radius**2
         self._contact = contact
         self._load[:] = 0.0
         try:

@@ -133,9 +133,7 @@ def stress_points(content, q):
     """Write the stress of the points at coordinates ``q``; return the smallest det F."""
     points, work = content.points, content.work
     superpose(points.gradients, q, work.H)
-    nonlinear_stress(
-        work.H, points.weights, points.mu, points.lam, work.J, work.trace, work.linear, work.P
-    )
+    nonlinear_stress(work.H, points.weights, points.law, work.J, work.part, work.linear, work.P)
     return work.J.min()
 
 
@@ -143,8 +141,8 @@ def stress_points(content, q):
 def linearise_points(content, state, products):
     """Write the change of the points' stress with every mode (r, 9 c), at ``work.H``."""
     points = content.points
-    linearise(content.work.H, points.weights, points.mu, points.lam, state)
-    increments(state, points.gradients, products)
+    linearise(content.work.H, points.weights, points.law, state)
+    increments(points.law, state, points.gradients, products)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -153,7 +151,7 @@ def _step(content, nodes, forces, accurate):
     points, past, load, secants = content.points, content.past, content.load, content.secants
     q, work = content.q, content.newton
     reduce_load(content.modes, nodes, forces, load.f)
-    term = bind_compiled(begin_step(past, points.mu, 0, 0))
+    term = bind_compiled(begin_step(past, points.law.mu, 0, 0))
     problem = bind_compiled(Problem(points, term, load, secants, content.work))
     size = external_force(term, load.f, secants.external, secants.origin)
     last_answer(past, 0, q)
@@ -213,8 +211,7 @@ class Galerkin(Method):
             gradients=np.zeros((rows, TILE // LANES * count), np.float32),
             steps=np.ones(rows, np.float32),
             weights=np.pad(cubature.weights, fill),
-            mu=np.pad(model.mu[element], fill),
-            lam=np.pad(model.lam[element], fill),
+            law=model.law.at(np.pad(element, fill)),
         )
         past: Elastic | Remembering = Elastic()
         if in_time:

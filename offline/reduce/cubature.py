@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr_delete, solve, solve_triangular
 
+from palpate.shared.mechanics.tissue import Law
 from palpate.shared.reduced.points import LANES, add_past_stress, nonlinear_stress
 
 Array = NDArray[np.float64]
@@ -140,8 +141,7 @@ def _append(Q: Array, R: Array, column: Array) -> tuple[Array, Array]:
 def point_forces(
     gradients: NDArray[np.float32],
     weights: Array,
-    mu: Array,
-    lam: Array,
+    law: Law,
     state: Array,
     past: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None,
 ) -> NDArray[np.float32] | None:
@@ -152,30 +152,31 @@ def point_forces(
     gradients : ndarray, shape (c, 9, r), 1/mm
         Of the modes; c is a multiple of ``LANES``.
     weights : ndarray, shape (c,), mm^3
-    mu, lam : ndarray, shape (c,), kPa
+    law : Law
+        Of the points (c,).
     state : ndarray, shape (r,)
     past : (ndarray, ndarray), shape (6 c,), optional
         Of tissue that remembers: ``B`` and ``S`` of ``reduced.points.predict_points``.
     """
     H = np.dot(gradients, state.astype(np.float32)).reshape(-1, LANES, 9)
     rows = np.ascontiguousarray(H.transpose(0, 2, 1)).reshape(-1)
-    P, (J, trace, linear) = np.empty_like(rows), np.empty((3, len(gradients)))
-    nonlinear_stress(rows, weights, mu, lam, J, trace, linear, P)
+    P, (J, part, linear) = np.empty_like(rows), np.empty((3, len(gradients)))
+    nonlinear_stress(rows, weights, law, J, part, linear, P)
     if not J.min() > 0.0:
         return None
     if past is not None:
-        add_past_stress(rows, weights, mu, J, *past, 0.0, trace, P)
+        add_past_stress(rows, weights, law.mu, J, *past, 0.0, part, P)
     points = P.reshape(-1, 9, LANES).transpose(0, 2, 1).reshape(-1, 1, 9)
     return (points @ gradients)[:, 0]
 
 
 def linear_forces(
-    gradients: NDArray[np.float32], weights: Array, mu: Array, lam: Array, states: Array
+    gradients: NDArray[np.float32], weights: Array, law: Law, states: Array
 ) -> NDArray[np.float32]:
     """Linear elasticity's force of every point (c, r k) at states (k, r); see ``point_forces``."""
     H = (gradients @ states.T.astype(np.float32)).reshape(len(gradients), 3, 3, -1)
-    P = mu[:, None, None, None] * (H + H.swapaxes(1, 2))
-    P += (lam[:, None] * np.trace(H, axis1=1, axis2=2))[:, None, None] * np.eye(3)[..., None]
+    P = law.mu[:, None, None, None] * (H + H.swapaxes(1, 2))
+    P += (law.lam[:, None] * np.trace(H, axis1=1, axis2=2))[:, None, None] * np.eye(3)[..., None]
     P = (weights[:, None, None, None] * P).reshape(len(gradients), 9, -1).astype(np.float32)
     return np.asarray((gradients.swapaxes(1, 2) @ P).reshape(len(gradients), -1))
 
@@ -183,7 +184,7 @@ def linear_forces(
 def with_linear_forces(
     forces: NDArray[np.float32],
     gradients: NDArray[np.float32],
-    law: tuple[Array, Array, Array],
+    law: tuple[Array, Law],
     count: int,
     rng: np.random.Generator,
 ) -> NDArray[np.float32]:
@@ -197,8 +198,8 @@ def with_linear_forces(
     ----------
     forces : ndarray, shape (c, k)
     gradients : ndarray, shape (c, 9, r), 1/mm
-    law : (ndarray, ndarray, ndarray), shape (c,)
-        Weights (mm^3) and Lame parameters (kPa).
+    law : (ndarray, shape (c,), and Law)
+        Weights (mm^3) and parameters of the points.
     count : int
         Of random states.
     rng : Generator
@@ -210,9 +211,7 @@ def with_linear_forces(
     return np.hstack([forces, combined(linear, 2 * count, rng)])
 
 
-def nonlinear_forces(
-    rows: NDArray[np.float32], weights: Array, mu: Array, lam: Array, states: Array
-) -> Array:
+def nonlinear_forces(rows: NDArray[np.float32], weights: Array, law: Law, states: Array) -> Array:
     """Nonlinear force of all points together (k, r) at states (k, r); NaN where inverted.
 
     Parameters
@@ -220,17 +219,18 @@ def nonlinear_forces(
     rows : ndarray, shape (r, 9 c), 1/mm
         Gradients of the modes in tiles.
     weights : ndarray, shape (c,), mm^3
-    mu, lam : ndarray, shape (c,), kPa
+    law : Law
+        Of the points (c,).
     states : ndarray, shape (k, r)
     """
     forces = np.empty(states.shape)
-    J, trace, linear = np.empty((3, len(weights)))
+    J, part, linear = np.empty((3, len(weights)))
     for start in range(0, len(states), STATES):
         some = slice(start, start + STATES)
         H = states[some].astype(np.float32) @ rows
         P = np.empty_like(H)
         for h, p in zip(H, P, strict=True):
-            nonlinear_stress(h, weights, mu, lam, J, trace, linear, p)
+            nonlinear_stress(h, weights, law, J, part, linear, p)
             if not J.min() > 0.0:
                 p[:] = np.nan
         forces[some] = P @ rows.T

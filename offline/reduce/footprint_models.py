@@ -26,6 +26,7 @@ from palpate.shared.geometry.surface import Surface
 from palpate.shared.local_models import Body, LocalModels
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH, footprint, pressure_limit
+from palpate.shared.mechanics.tissue import Law
 from palpate.shared.reduced.features import (
     CHANGES,
     CHANGING,
@@ -228,10 +229,10 @@ class LocalTrainer:
         return np.asarray(points.gradients[0] * points.steps[0][:, None])
 
     @property
-    def law(self) -> tuple[Array, Array, Array]:
-        """Weights (mm^3) and Lame parameters (kPa) of the points, each (c,)."""
+    def law(self) -> tuple[Array, Law]:
+        """Weights (mm^3) and parameters of the law of the points, each (c,)."""
         points = self.tables.points
-        return points.weights[0], points.mu[0], points.lam[0]
+        return points.weights[0], points.law.at(0)
 
     def internal_forces(self, states: Array) -> Array:
         """What the law adds to linear elasticity's force: (k, r) in states (k, r)."""
@@ -244,7 +245,7 @@ class LocalTrainer:
         products, changes = np.empty_like(rows), []
         for q in states.astype(np.float32):
             linearise(q @ rows, *self.law, moduli)
-            increments(moduli, rows, products)
+            increments(self.law[1], moduli, rows, products)
             changes.append(rows @ products.T)
         return np.array(changes, float)
 

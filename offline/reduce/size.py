@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.offline.validate.norms import statistics
+from palpate.shared.mechanics.laws import AnyTissue
 from palpate.shared.mechanics.tissue import lame
-from palpate.shared.scene import Budget, Size, Tissue, Tolerance
+from palpate.shared.scene import Budget, Size, Tolerance
 
 Array = NDArray[np.float64]
 
@@ -133,7 +134,7 @@ class Choice:
         return {"why": self.why, "tried": [trial.document for trial in self.trials]}
 
 
-def ladder(tissue: Tissue) -> tuple[Size, ...]:
+def ladder(tissue: AnyTissue) -> tuple[Size, ...]:
     """Sizes for a tissue: the less compressible, the more points take its volume's energy.
 
     They go with the cube root of the ratio of Lame's constants: at a Poisson's ratio of 0.49 56

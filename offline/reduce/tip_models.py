@@ -32,6 +32,7 @@ from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS
 from palpate.shared.mechanics.sphere import FORCE, room_for
 from palpate.shared.mechanics.sphere import touch as press_faces
+from palpate.shared.mechanics.tissue import Law
 from palpate.shared.mechanics.viscosity import step_weights
 from palpate.shared.reduced.features import (
     RESIDUAL_FEATURES,
@@ -210,7 +211,7 @@ class TipTrainer:
         memory, points = self._memory(), self.models.points
         B, S = np.zeros((2, SYMMETRIC * points.weights.shape[1]), np.float32)
         now = step_weights(self._prony, 0.0)
-        predict_points(memory.points, memory.linear, now, points.mu[0], B, S)
+        predict_points(memory.points, memory.linear, now, points.law.mu[0], B, S)
         return B, S
 
 
@@ -303,8 +304,8 @@ def train_tip(
     states = [state.within(V) for state in pressed]
     modes = (space @ V).astype(np.float32)
     gradients = trainer.gradients @ V.astype(np.float32)
-    law = trainer.models.points
-    forces = _training_forces(gradients, (law.weights[0], law.mu[0], law.lam[0]), states, rng)
+    own = trainer.models.points
+    forces = _training_forces(gradients, (own.weights[0], own.law.at(0)), states, rng)
     A = np.ascontiguousarray(forces[: len(weights)].T)
     points, chosen = nonnegative(A, A.sum(axis=1, dtype=float), most)
     # a first guess by what is known so far spares the answers that refine it half their iterations
@@ -435,7 +436,7 @@ def _modes(states: list[_State], count: int) -> Array:
 
 def _training_forces(
     gradients: NDArray[np.float32],
-    law: tuple[Array, Array, Array],
+    law: tuple[Array, Law],
     states: list[_State],
     rng: np.random.Generator,
 ) -> NDArray[np.float32]:

@@ -122,7 +122,7 @@ class Workshop:
         """Mesh and tissue as the reduced model sees them."""
         parts = {part.name: getattr(self.mesh, part.name) for part in fields(Mesh)}
         tip = tip_of(self.scene.endoscope.radius, self.scene.tissue.young)
-        return Body(**parts, mu=self.model.mu, lam=self.model.lam, tip=tip)
+        return Body(**parts, law=self.model.law, tip=tip)
 
     @cached_property
     def beyond_clamped_layer(self) -> NDArray[np.bool_]:
@@ -153,8 +153,7 @@ class Workshop:
 
     @cached_property
     def _recovery(self) -> StressRecovery:
-        mesh, model = self.mesh, self.model
-        return stress_recovery(mesh.nodes, mesh.elements, model.mu, model.lam)
+        return stress_recovery(self.mesh.nodes, self.mesh.elements, self.model.law)
 
     def von_mises(self, displacement: Array) -> Array:
         """Nodal von Mises stress (n,) kPa."""

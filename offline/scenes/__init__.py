@@ -7,7 +7,8 @@ from typing import Literal, get_args, get_origin
 
 from pydantic.fields import FieldInfo
 
-from palpate.shared.scene import Part, Scene, SceneError, absent, kinds_of, load_scene
+from palpate.shared.part import Part
+from palpate.shared.scene import Scene, SceneError, absent, kinds_of, load_scene
 
 FOLDER = Path(__file__).parent
 

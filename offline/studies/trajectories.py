@@ -23,8 +23,8 @@ from palpate.offline.studies.hard_cases import HardCase
 from palpate.offline.studies.relaxation import load_steps
 from palpate.offline.validate.tip_histories import OFF
 from palpate.shared.mechanics.footprint import TIP_DEPTH
+from palpate.shared.mechanics.tissue import Tissue
 from palpate.shared.model import ReducedModel
-from palpate.shared.scene import Tissue
 
 Array = NDArray[np.float64]
 

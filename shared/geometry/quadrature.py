@@ -16,6 +16,7 @@ from palpate.shared.geometry.elements import (
 )
 from palpate.shared.mechanics.footprint import SurfaceQuadrature
 from palpate.shared.mechanics.stress import StressRecovery
+from palpate.shared.mechanics.tissue import Law
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -77,9 +78,9 @@ def surface_quadrature(
 
 
 def stress_recovery(
-    nodes: Array, elements: Ints, mu: Array, lam: Array, precision: type = np.float64
+    nodes: Array, elements: Ints, law: Law, precision: type = np.float64
 ) -> StressRecovery:
-    """Recovery of nodal stresses from 2x2x2 points per element; mu, lam (e,) kPa."""
+    """Recovery of nodal stresses from 2x2x2 points per element; law (e,)."""
     gradients, _ = volume_quadrature(nodes, elements, 2)
     at, _ = gauss(2, 3)
     to_points, _ = shape(HEX_CORNERS, at)
@@ -94,8 +95,7 @@ def stress_recovery(
         connectivity=np.ascontiguousarray(elements, dtype=np.int32),
         gradients=np.ascontiguousarray(np.moveaxis(gradients, 1, 3), dtype=precision),
         extrapolation=np.linalg.inv(to_points).astype(np.float64),
-        mu=np.ascontiguousarray(mu),
-        lam=np.ascontiguousarray(lam),
+        law=law,
         elements_at=np.bincount(corners.ravel(), minlength=len(nodes)).astype(float),
         midsides=midsides.astype(np.int32),
     )

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from palpate.shared.mechanics import tissue, viscosity
+from palpate.shared.mechanics import laws, viscosity
 from palpate.shared.mechanics.tensors import (
     FAST,
     add_identity,
@@ -23,6 +23,7 @@ from palpate.shared.mechanics.tensors import (
     twice_deviator,
     unpacked,
 )
+from palpate.shared.mechanics.tissue import Law
 
 
 class StressRecovery(NamedTuple):
@@ -31,8 +32,7 @@ class StressRecovery(NamedTuple):
     connectivity: NDArray[np.int32]  # (e, n)
     gradients: NDArray[np.floating]  # (e, n, 3, 8) 1/mm: point index last, for vector arithmetic
     extrapolation: NDArray[np.float64]  # (8, 8) corner from point
-    mu: NDArray[np.float64]  # (e,) kPa
-    lam: NDArray[np.float64]  # (e,) kPa
+    law: Law  # (e,)
     elements_at: NDArray[np.float64]  # (nodes,) number of elements that share a corner node
     midsides: NDArray[np.int32]  # (k, 3) midside node and the corners either side of it
 
@@ -60,9 +60,9 @@ def nodal_von_mises(mesh, u, out):
                 H[k] += x * gradients[k]
                 H[24 + k] += y * gradients[k]
                 H[48 + k] += z * gradients[k]
-        mu, lam = mesh.mu[e], mesh.lam[e]
+        law = laws.at(mesh.law, e)
         for q in range(8):
-            at_points[q] = tissue.von_mises(add_identity(load(H, q, 8), 1.0), mu, lam)
+            at_points[q] = laws.von_mises(law, add_identity(load(H, q, 8), 1.0))
         for corner in range(8):
             value = 0.0
             for q in range(8):
@@ -111,10 +111,10 @@ def nodal_von_mises_after(mesh, u, B, out):
     out[:] = 0.0
     for e in range(len(mesh.connectivity)):
         _gradients(mesh.connectivity[e], flat[e], u, H)
-        b, mu, lam = B[e].reshape(-1), mesh.mu[e], mesh.lam[e]
+        b, law = B[e].reshape(-1), laws.at(mesh.law, e)
         for q in range(8):
             F, past = add_identity(load(H, q, 8), 1.0), unpacked(load_packed(b, q, 8))
-            at_points[q] = viscosity.von_mises(F, past, mu, lam)
+            at_points[q] = viscosity.von_mises(law, F, past)
         for corner in range(8):
             value = 0.0
             for q in range(8):

@@ -219,6 +219,22 @@ def det(A, cofactors):
 
 
 @inline
+def cross(A, B):
+    """Tensor cross product ``A x B``: the derivative of ``cofactor`` at A along B."""
+    return (
+        A[4] * B[8] - A[5] * B[7] + A[8] * B[4] - A[7] * B[5],
+        A[5] * B[6] - A[3] * B[8] + A[6] * B[5] - A[8] * B[3],
+        A[3] * B[7] - A[4] * B[6] + A[7] * B[3] - A[6] * B[4],
+        A[2] * B[7] - A[1] * B[8] + A[7] * B[2] - A[8] * B[1],
+        A[0] * B[8] - A[2] * B[6] + A[8] * B[0] - A[6] * B[2],
+        A[1] * B[6] - A[0] * B[7] + A[6] * B[1] - A[7] * B[0],
+        A[1] * B[5] - A[2] * B[4] + A[5] * B[1] - A[4] * B[2],
+        A[2] * B[3] - A[0] * B[5] + A[3] * B[2] - A[5] * B[0],
+        A[0] * B[4] - A[1] * B[3] + A[4] * B[0] - A[3] * B[1],
+    )
+
+
+@inline
 def twice_deviator(A, third):
     """``2 dev sym A``, where ``third`` is a third of the trace."""
     two = constant(2.0, third)
@@ -238,3 +254,16 @@ def unit(k):
         1.0 * (k == 3), 1.0 * (k == 4), 1.0 * (k == 5),
         1.0 * (k == 6), 1.0 * (k == 7), 1.0 * (k == 8),
     )  # fmt: skip
+
+
+@inline
+def isochoric(J):
+    """``J^(-2/3)`` of a positive determinant, to double precision in vector code.
+
+    Newton's method for the inverse cube root, from a guess within 4 % of it: read as an integer, a
+    number in single precision is nearly its logarithm, which is divided by -3.
+    """
+    root = np.float64(np.int32(1419967116 - np.float32(J).view(np.int32) // 3).view(np.float32))
+    for _ in range(4):
+        root *= (4.0 - J * root * root * root) / 3.0
+    return root * root

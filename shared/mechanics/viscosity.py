@@ -46,6 +46,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from palpate.shared.mechanics.laws import first_piola
 from palpate.shared.mechanics.tensors import (
     FAST,
     add,
@@ -56,6 +57,7 @@ from palpate.shared.mechanics.tensors import (
     dot,
     gram,
     inline,
+    isochoric,
     load,
     scale,
     store,
@@ -63,7 +65,7 @@ from palpate.shared.mechanics.tensors import (
     transposed,
     unit,
 )
-from palpate.shared.mechanics.tissue import equivalent, first_piola
+from palpate.shared.mechanics.tissue import equivalent
 
 Array = NDArray[np.float64]
 
@@ -200,7 +202,7 @@ def increment(G, FB, B, third, H):
 @njit(cache=True, error_model="numpy")
 def add_tangent(F, B, mu, A):
     """Add what the past does to the tangent ``A`` (9, 9) kPa, which stays symmetric."""
-    modulus = mu * det(F, cofactor(F)) ** (-2.0 / 3.0)
+    modulus = mu * isochoric(det(F, cofactor(F)))
     G, FB, B, third = linearise(F, B, modulus)
     for k in range(9):
         row = A[k]
@@ -208,8 +210,8 @@ def add_tangent(F, B, mu, A):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def von_mises(F, B, mu, lam):
+def von_mises(law, F, B):
     """Von Mises equivalent (kPa) of the Cauchy stress with its past; see ``overstress``."""
-    J, _, P = first_piola(F, mu, lam)
-    _, Q = overstress(F, B, J, mu * abs(J) ** (-2.0 / 3.0))
+    J, _, P = first_piola(law, F)
+    _, Q = overstress(F, B, J, law.mu * isochoric(abs(J)))
     return equivalent(F, add(P, Q), J)

@@ -99,7 +99,7 @@ def _form_bulk(correction, problem, q):
     for i in range(len(q)):
         work.stepped[i] = q[i] * points.steps[i]
     superpose(points.gradients, work.stepped, H)
-    linearise(H, points.weights, points.mu, points.lam, correction.state)
+    linearise(H, points.weights, points.law, correction.state)
     form_products(problem.past, correction, points, H)
     lower_products(points.gradients, correction.products, bulk)
     for j in range(len(q)):
@@ -113,19 +113,19 @@ def form_products(past, correction, points, H):
 
 
 def _form_products_at_once(past, correction, points, H):
-    increments(correction.state, points.gradients, correction.products)
+    increments(points.law, correction.state, points.gradients, correction.products)
 
 
 def _form_products_in_time(past, correction, points, H):
     # In training a tangent may have fewer points than the residual, of which no past is known:
     # it then has the linear part of the past only.
     if len(past.B) * 9 != len(H) * 6:
-        increments(correction.state, points.gradients, correction.products)
+        increments(points.law, correction.state, points.gradients, correction.products)
         return
     # there are more modes than components of a gradient, so the moduli of the points come first
-    increments(correction.state, correction.units, correction.moduli)
+    increments(points.law, correction.state, correction.units, correction.moduli)
     add_past_increments(
-        H, past.B, points.weights, points.mu, past.loss[0], correction.units, past.state,
+        H, past.B, points.weights, points.law.mu, past.loss[0], correction.units, past.state,
         correction.moduli,
     )  # fmt: skip
     contract(correction.moduli, points.gradients, correction.products)

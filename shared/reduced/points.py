@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from palpate.shared.mechanics import tissue, viscosity
+from palpate.shared.mechanics import laws, tissue, viscosity
 from palpate.shared.mechanics.tensors import (
     FAST,
     SYMMETRIC,
@@ -22,6 +22,7 @@ from palpate.shared.mechanics.tensors import (
     cofactor,
     combine,
     det,
+    isochoric,
     load,
     load_packed,
     packed,
@@ -33,6 +34,7 @@ from palpate.shared.mechanics.tensors import (
     twice_deviator,
     unpacked,
 )
+from palpate.shared.mechanics.tissue import Law
 
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
@@ -42,8 +44,8 @@ LANES = 16
 
 TILE = 9 * LANES
 
-STATE = 13
-"""Numbers that describe the tangent at a point: F^-T and four moduli."""
+STATE = 18
+"""Numbers that describe the tangent at a point: see ``laws.linearise``."""
 
 PAST_STATE = 26
 """Numbers that describe the tangent of the past at a point."""
@@ -55,8 +57,7 @@ class Points(NamedTuple):
     gradients: Any  # (r, 9 c) in tiles, float32 or int16, in units of the steps
     steps: Field  # (r,) 1/mm
     weights: Array  # (c,) mm^3
-    mu: Array  # (c,) kPa
-    lam: Array  # (c,) kPa
+    law: Law  # (c,)
 
 
 class PointTables(NamedTuple):
@@ -65,16 +66,13 @@ class PointTables(NamedTuple):
     gradients: Any  # (p, r, 9 c)
     steps: Field  # (p, r)
     weights: Array  # (p, c)
-    mu: Array  # (p, c)
-    lam: Array  # (p, c)
+    law: Law  # (p, c)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def points_of(tables, k):
     """Points of local model k."""
-    return Points(
-        tables.gradients[k], tables.steps[k], tables.weights[k], tables.mu[k], tables.lam[k]
-    )
+    return Points(tables.gradients[k], tables.steps[k], tables.weights[k], laws.at(tables.law, k))
 
 
 # --- vector code ---------------------------------------------------------------------------------
@@ -125,42 +123,40 @@ def multiply(A, x, out):
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def nonlinear_stress(H, weights, mu, lam, J, square, linear, P):
+def nonlinear_stress(H, weights, law, J, part, linear, P):
     """What the stress adds to that of linear elasticity, times weight, at all points in tiles.
 
-    ``H`` (9 c,) is the displacement gradient.  Also det F, F : F and the energy density of linear
-    elasticity, point by point.
+    ``H`` (9 c,) is the displacement gradient.  Also what ``laws.energy`` needs, and the energy
+    density of linear elasticity, point by point.
     """
     for tile in range(len(weights) // LANES):
         h, p = H[TILE * tile : TILE * (tile + 1)], P[TILE * tile : TILE * (tile + 1)]
-        at = LANES * tile
-        w, m, n = weights[at : at + LANES], mu[at : at + LANES], lam[at : at + LANES]
-        j, t, e = J[at : at + LANES], square[at : at + LANES], linear[at : at + LANES]
+        own = slice(LANES * tile, LANES * (tile + 1))
+        w, tissues, j, t, e = weights[own], laws.at(law, own), J[own], part[own], linear[own]
         for c in range(LANES):
-            G = load(h, c, LANES)
-            e[c], L = tissue.rest_stress(G, m[c], n[c])
-            j[c], t[c], S = tissue.first_piola(add_identity(G, 1.0), m[c], n[c])
+            G, point = load(h, c, LANES), laws.at(tissues, c)
+            e[c], L = tissue.rest_stress(G, point.mu, point.lam)
+            j[c], t[c], S = laws.first_piola(point, add_identity(G, 1.0))
             store(scale(w[c], subtract(S, L)), p, c, LANES)
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def linearise(H, weights, mu, lam, state):
+def linearise(H, weights, law, state):
     """What ``increments`` needs, in tiles of ``STATE`` components; moduli times weight."""
     for tile in range(len(weights) // LANES):
         h = H[TILE * tile : TILE * (tile + 1)]
         s = state[STATE * LANES * tile : STATE * LANES * (tile + 1)]
-        at = LANES * tile
-        w, m, n = weights[at : at + LANES], mu[at : at + LANES], lam[at : at + LANES]
+        own = slice(LANES * tile, LANES * (tile + 1))
+        w, tissues = weights[own], laws.at(law, own)
         for c in range(LANES):
             F = add_identity(load(h, c, LANES), 1.0)
-            T, geometric, bulk = tissue.linearise(F, m[c], n[c])
-            store(T, s, c, LANES)
-            s[9 * LANES + c], s[10 * LANES + c] = w[c] * geometric, w[c] * bulk
-            s[11 * LANES + c], s[12 * LANES + c] = w[c] * m[c], w[c] * n[c]
+            tensor, moduli = laws.linearise(laws.at(tissues, c), F)
+            store(tensor, s, c, LANES)
+            store(scale(w[c], moduli), s, 9 * LANES + c, LANES)
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def increments(state, gradients, out):
+def increments(law, state, gradients, out):
     """Tangent less that at rest, times the gradient of every mode: (m, 9 c) in tiles."""
     for tile in range(gradients.shape[1] // TILE):
         s = state[STATE * LANES * tile : STATE * LANES * (tile + 1)]
@@ -168,11 +164,9 @@ def increments(state, gradients, out):
             h = gradients[mode, TILE * tile : TILE * (tile + 1)]
             d = out[mode, TILE * tile : TILE * (tile + 1)]
             for c in range(LANES):
-                G = load(h, c, LANES)
-                mu, lam = s[11 * LANES + c], s[12 * LANES + c]
-                T, geometric, bulk = load(s, c, LANES), s[9 * LANES + c], s[10 * LANES + c]
-                D = tissue.increment(T, geometric, bulk, mu, G)
-                store(subtract(D, tissue.rest_stress(G, mu, lam)[1]), d, c, LANES)
+                G, moduli = load(h, c, LANES), load(s, 9 * LANES + c, LANES)
+                D = laws.increment(law, (load(s, c, LANES), moduli), G)
+                store(subtract(D, tissue.rest_stress(G, moduli[0], moduli[1])[1]), d, c, LANES)
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
@@ -222,11 +216,11 @@ def lower_products(A, B, K):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def added_energy(weights, mu, lam, J, trace, linear):
+def added_energy(weights, law, J, part, linear):
     """Energy that the tissue law adds to linear elasticity's, after ``nonlinear_stress``."""
     energy = 0.0
     for c in range(len(weights)):
-        energy += weights[c] * (tissue.energy(J[c], trace[c], mu[c], lam[c]) - linear[c])
+        energy += weights[c] * (laws.energy(laws.at(law, c), J[c], part[c]) - linear[c])
     return energy
 
 
@@ -304,15 +298,6 @@ def _reduce_columns(K, at, L):
 # --- the law at many points ----------------------------------------------------------------------
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
-def inverse_cube_root(J):
-    """``J^(-1/3)`` to double precision for J from 0.2 to 5 by Newton's method: vector code."""
-    y = 3.0 / (2.0 + J)
-    for _ in range(5):
-        y *= (4.0 - J * y * y * y) / 3.0
-    return y
-
-
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
 def predict_points(history, linear, weights, mu, B, S):
     """What is known of the end of a step before it is solved.
@@ -356,8 +341,7 @@ def add_past_stress(H, weights, mu, J, B, S, loss, energy, P):
         for c in range(LANES):
             G = load(h, c, LANES)
             past = unpacked(load_packed(b, c, LANES))
-            root = inverse_cube_root(j[c])
-            modulus = m[c] * root * root
+            modulus = m[c] * isochoric(j[c])
             contraction, Q = viscosity.overstress(add_identity(G, 1.0), past, j[c], modulus)
             # linear: -(S + 2 mu loss dev sym H)
             soft = scale(loss * m[c], twice_deviator(G, trace(G) / 3.0))
@@ -428,9 +412,9 @@ def _past_state(h, b, w, m, loss, s):
     """
     for c in range(LANES):
         F = add_identity(load(h, c, LANES), 1.0)
-        root = inverse_cube_root(det(F, cofactor(F)))
+        modulus = m[c] * isochoric(det(F, cofactor(F)))
         past = unpacked(load_packed(b, c, LANES))
-        G, FB, past, third = viscosity.linearise(F, past, w[c] * m[c] * root * root)
+        G, FB, past, third = viscosity.linearise(F, past, w[c] * modulus)
         store(G, s, c, LANES)
         store(FB, s, 9 * LANES + c, LANES)
         store_packed(packed(past), s, 18 * LANES + c, LANES)

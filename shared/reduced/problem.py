@@ -54,7 +54,7 @@ class Work(NamedTuple):
     H: Field  # (9 c,) displacement gradient in tiles
     P: Field  # (9 c,) stress times weight, in tiles
     J: Array  # (c,) det F
-    trace: Array  # (c,) F : F
+    part: Array  # (c,) of the energy, see ``laws.first_piola``
     linear: Array  # (c,) kPa, energy density of linear elasticity
     stepped: Field  # (r,) state times steps
     latest: Array  # (r,) state of the last evaluation
@@ -82,15 +82,11 @@ def _potential(system, u, residual):
             stepped[i] = u[i] * steps[i]
             latest[i] = u[i]
         superpose(points.gradients, stepped, work.H)
-        nonlinear_stress(
-            work.H, points.weights, points.mu, points.lam, work.J, work.trace, work.linear, work.P
-        )
+        nonlinear_stress(work.H, points.weights, points.law, work.J, work.part, work.linear, work.P)
         smallest = work.J.min()
         if not smallest > 0.0:
             return tissue.INVERTED, smallest
-        energy = added_energy(
-            points.weights, points.mu, points.lam, work.J, work.trace, work.linear
-        )
+        energy = added_energy(points.weights, points.law, work.J, work.part, work.linear)
         energy += recall(past, points, work)
         project(points.gradients, work.P, residual)
         for i in range(len(u)):

@@ -51,11 +51,12 @@ def _recall_nothing(past, points, work):
 
 
 def _recall(past, points, work):
-    # the traces have served; their room is that of the energies
+    # the parts of the elastic energy have served; their room is that of the past's
     add_past_stress(
-        work.H, points.weights, points.mu, work.J, past.B, past.S, past.loss[0], work.trace, work.P
-    )
-    return np.dot(points.weights, work.trace)
+        work.H, points.weights, points.law.mu, work.J, past.B, past.S, past.loss[0], work.part,
+        work.P,
+    )  # fmt: skip
+    return np.dot(points.weights, work.part)
 
 
 def soften(past, q, residual):

@@ -275,7 +275,7 @@ def local_problem(solver, k, slot):
     return bind_compiled(
         Problem(
             bind_compiled(points_of(models.points, k)),
-            bind_compiled(begin_step(solver.past, models.points.mu[k], k, slot)),
+            bind_compiled(begin_step(solver.past, models.points.law.mu[k], k, slot)),
             bind_compiled(
                 Contact(
                     models.tip, models.surface, scratch.x, models.nodes[nodes],

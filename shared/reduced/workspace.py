@@ -82,7 +82,7 @@ def new_work(r: int, count: int) -> Work:
         H=np.zeros(9 * count, np.float32),
         P=np.zeros(9 * count, np.float32),
         J=np.zeros(count),
-        trace=np.zeros(count),
+        part=np.zeros(count),
         linear=np.zeros(count),
         stepped=np.zeros(r, np.float32),
         latest=np.zeros(r),

@@ -11,6 +11,7 @@ from palpate.offline.fem.mesh import build_mesh
 from palpate.offline.fem.model import FullModel
 from palpate.offline.run.workshop import Load, Workshop
 from palpate.offline.scenes import find_scene
+from palpate.shared.mechanics.neo_hookean import NeoHookeanTissue
 from palpate.shared.mechanics.tissue import lame
 from palpate.shared.mechanics.viscosity import step_weights
 
@@ -29,7 +30,8 @@ def body(element, divisions=(2, 2, 2), size=(3.0, 3.0, 3.0), prony=PRONY):
         update={"element": element, "divisions": divisions, "size": size}
     )
     mesh = build_mesh(scene.model_copy(update={"geometry": geometry}))
-    return FullModel(mesh, element, YOUNG, POISSON, prony)
+    tissue = NeoHookeanTissue(law="neo-hookean", young=YOUNG, poisson=POISSON, prony=prony)
+    return FullModel(mesh, element, tissue)
 
 
 def top_load(model, force):
@@ -173,7 +175,7 @@ def test_convergence_in_the_step_is_of_second_order():
 def test_stored_energy_returns_to_zero_and_dissipation_is_never_negative():
     """Over 50 random histories of a small body, with sudden and slow changes of its load."""
     model, rng = body("hex8", divisions=(3, 3, 3)), np.random.default_rng(4)
-    mu, scale, force = model.mu[0], 0.0, np.zeros(model.mesh.nodes.size)
+    mu, scale, force = model.law.mu[0], 0.0, np.zeros(model.mesh.nodes.size)
 
     def step(history, means, load, dt):
         """Go on; return the history, the stored energy and the dissipated power."""

@@ -6,9 +6,11 @@ import pytest
 from palpate.offline.fem.mesh import build_mesh
 from palpate.offline.fem.model import FullModel, TipContact
 from palpate.offline.scenes import find_scene
+from palpate.shared.mechanics.neo_hookean import NeoHookeanTissue
 from palpate.shared.mechanics.sphere import tip_of, tip_surface
 
 YOUNG, POISSON = 15.0, 0.45
+TISSUE = NeoHookeanTissue(law="neo-hookean", young=YOUNG, poisson=POISSON)
 
 
 def pressed_block(radius, size, divisions):
@@ -16,7 +18,7 @@ def pressed_block(radius, size, divisions):
     scene = find_scene("quick")
     geometry = scene.geometry.model_copy(update={"size": size, "divisions": divisions})
     mesh = build_mesh(scene.model_copy(update={"geometry": geometry}))
-    model = FullModel(mesh, "hex20", YOUNG, POISSON)
+    model = FullModel(mesh, "hex20", TISSUE)
     surface = tip_surface(mesh.nodes, mesh.faces, mesh.accessible, radius)
     contact = TipContact(model, surface, tip_of(radius, YOUNG))
     return model, contact, np.array([size[0] / 2, size[1] / 2, size[2]])

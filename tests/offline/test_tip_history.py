@@ -6,6 +6,7 @@ import pytest
 from palpate.offline.fem.mesh import build_mesh
 from palpate.offline.fem.model import FullModel, TipContact
 from palpate.offline.scenes import find_scene
+from palpate.shared.mechanics.neo_hookean import NeoHookeanTissue
 from palpate.shared.mechanics.sphere import tip_of, tip_surface
 
 PRONY = ((0.25, 0.1), (0.25, 1.0))
@@ -19,7 +20,8 @@ def block():
     scene = find_scene("quick")
     geometry = scene.geometry.model_copy(update={"size": (8.0, 8.0, 6.0), "divisions": (3, 3, 2)})
     mesh = build_mesh(scene.model_copy(update={"geometry": geometry}))
-    model = FullModel(mesh, "hex20", YOUNG, POISSON, PRONY)
+    tissue = NeoHookeanTissue(law="neo-hookean", young=YOUNG, poisson=POISSON, prony=PRONY)
+    model = FullModel(mesh, "hex20", tissue)
     surface = tip_surface(mesh.nodes, mesh.faces, mesh.accessible, RADIUS)
     return model, TipContact(model, surface, tip_of(RADIUS, YOUNG))
 

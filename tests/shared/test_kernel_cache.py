@@ -9,14 +9,14 @@ from palpate.shared import PACKAGES, kernel_sources
 
 
 @pytest.mark.parametrize(
-    "first", ["palpate.shared.mechanics.tissue", "palpate.offline.fem.model", "numba"]
+    "first", ["palpate.shared.mechanics.laws", "palpate.offline.fem.model", "numba"]
 )
 def test_kernels_are_cached_by_the_state_of_the_sources_whatever_is_imported_first(first):
     environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
     script = f"""
 import {first}
-from palpate.shared.mechanics import tissue
-print(tissue.tangent.stats.cache_path)
+from palpate.shared.mechanics import laws
+print(laws.tangent.stats.cache_path)
 """
     run = subprocess.run(
         [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True

@@ -132,6 +132,8 @@ def test_load_scene_knows_its_folder(tmp_path) -> None:
         ("0.45", "0.45\nprony = [[0.5, 0.0]]", r"tissue.prony.0.1 = 0.0: .*greater than 0"),
         ("0.45", "0.45\nprony = [[0.5]]", r"tissue.prony.0.1 = .*required"),
         ("young = 15.0", "young = true", r"tissue.young = True: .*valid number"),
+        ("neo-hookean", "hooke", r"tissue: .*'hooke'.*'neo-hookean', 'mooney-rivlin'"),
+        ("neo-hookean", "mooney-rivlin", r"tissue.c10: missing \(factor of the first inv.*, kPa\)"),
         ("[10.0, 8, 5.0]", "[10.0, -8, 5.0]", r"geometry.size.1 = -8: .*greater than 0"),
         ("[10.0, 8, 5.0]", "[10.0, 8]", r"geometry.size.2"),
         ("[4, 4, 2]", "[4, 0, 2]", r"geometry.divisions.1 = 0: .*greater than or equal to 1"),
@@ -174,8 +176,8 @@ def test_an_empty_scene_is_told_all_that_it_lacks() -> None:
         parse_scene("")
     missing = [line.split(":")[0].strip() for line in str(error.value).splitlines()[1:]]
     assert missing == [
-        "name", "geometry.kind", "tissue.law", "tissue.young", "tissue.poisson", "support.side",
-        "surface.side", "endoscope.radius", "endoscope.max_tilt", "load.max_indentation",
+        "name", "geometry.kind", "tissue.law", "support.side", "surface.side", "endoscope.radius",
+        "endoscope.max_tilt", "load.max_indentation",
     ]  # fmt: skip
 
 

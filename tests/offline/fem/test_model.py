@@ -14,6 +14,7 @@ from palpate.shared.geometry.elements import HEX_EDGES
 from palpate.shared.geometry.quadrature import surface_quadrature
 from palpate.shared.mechanics import tissue
 from palpate.shared.mechanics.footprint import footprint
+from palpate.shared.mechanics.neo_hookean import NeoHookeanTissue
 
 YOUNG, POISSON = 15.0, 0.45
 HEX8 = ("hex8", "hex8-mean-dilatation", "hex8-fbar")
@@ -51,7 +52,8 @@ def free(mesh: Mesh) -> Mesh:
 
 
 def full_model(mesh, element, poisson=POISSON):
-    return FullModel(mesh, element, YOUNG, poisson)
+    tissue = NeoHookeanTissue(law="neo-hookean", young=YOUNG, poisson=poisson)
+    return FullModel(mesh, element, tissue)
 
 
 def internal_force(model, displacement):
@@ -208,7 +210,7 @@ def test_uniaxial_tension(element, stretch, rng):
     model = full_model(mesh, element)
     u = solve_prescribed(model, dofs, values)
 
-    mu, lam = model.mu[0], model.lam[0]
+    mu, lam = model.law.at(0)
 
     def pulled(lateral):
         """Nominal stresses (lateral, axial) of the law at principal stretches."""

@@ -150,7 +150,6 @@ def test_no_load_moves_nothing(workshop, queries):
 
 
 def test_points_that_share_a_dilatation_are_refused(workshop):
-    scene = workshop.scene
-    other = FullModel(workshop.mesh, "hex8-mean-dilatation", scene.tissue.young, 0.49)
+    other = FullModel(workshop.mesh, "hex8-mean-dilatation", workshop.scene.tissue)
     with pytest.raises(ValueError, match="dilatation"):
         Galerkin(SimpleNamespace(model=other), np.zeros((len(other.free), 4)))

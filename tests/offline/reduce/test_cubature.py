@@ -105,8 +105,8 @@ def test_linear_forces_are_those_of_the_rest_stiffness(rng):
     u[model.free] = rng.standard_normal((len(model.free), 5))
     nodal = u.reshape(-1, 3, 5)[model.connectivity]
     gradients = np.einsum("enim,eqnj->eqijm", nodal, model.gradients).reshape(-1, 9, 5)
-    mu, lam = np.repeat([model.mu, model.lam], model.weights.shape[1], axis=1)
+    law = model.law.at(np.repeat(np.arange(len(model.weights)), model.weights.shape[1]))
     states = rng.standard_normal((3, 5))
-    points = linear_forces(gradients.astype(np.float32), model.weights.ravel(), mu, lam, states)
+    points = linear_forces(gradients.astype(np.float32), model.weights.ravel(), law, states)
     exact = u[model.free].T @ (model.rest_stiffness @ u[model.free]) @ states.T
     np.testing.assert_allclose(points.sum(axis=0).reshape(5, 3), exact, rtol=1e-3)

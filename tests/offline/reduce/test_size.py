@@ -14,7 +14,8 @@ from palpate.offline.reduce.size import (
     choose,
     ladder,
 )
-from palpate.shared.scene import Budget, Tissue, Tolerance
+from palpate.shared.mechanics.neo_hookean import NeoHookeanTissue
+from palpate.shared.scene import Budget, Tolerance
 
 BUDGET = Budget(query=150e-6)
 
@@ -115,7 +116,8 @@ def test_a_looser_tolerance_is_served_by_fewer_samples():
 
 def test_the_less_compressible_the_more_points():
     sizes = [
-        ladder(Tissue(law="neo-hookean", young=15.0, poisson=p)) for p in (0.3, 0.45, 0.49, 0.499)
+        ladder(NeoHookeanTissue(law="neo-hookean", young=15.0, poisson=p))
+        for p in (0.3, 0.45, 0.49, 0.499)
     ]
     assert sizes[0] == sizes[1] == LADDER
     for own in zip(*sizes[1:], strict=True):

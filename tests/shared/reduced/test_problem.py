@@ -21,7 +21,9 @@ from palpate.shared.reduced.points import LANES, STATE, Points
 from palpate.shared.reduced.problem import Problem, Work, descend
 from palpate.shared.reduced.terms import Contact, Dead, Elastic, reaction
 
-YOUNG, POISSON, RADIUS = 15.0, 0.45, 2.0
+from ..mechanics.material_point import TISSUES
+
+RADIUS = 2.0
 PRONY = ((0.3, 0.05), (0.2, 1.0))
 
 COURSE = ((0.5, 0.02), (1.0, 0.05), (1.0, 0.5), (0.3, 0.0), (0.6, 0.1))
@@ -63,12 +65,13 @@ def factorise(problem, q):
 class Twins:
     """The full model of a block, and a local model of it with every quadrature point."""
 
-    def __init__(self, in_time, modes):
+    def __init__(self, tissue, in_time, modes):
         scene = find_scene("quick")
         size = {"size": (8.0, 8.0, 6.0), "divisions": (3, 3, 2), "element": "hex8"}
         geometry = scene.geometry.model_copy(update=size)
         self.mesh = mesh = build_mesh(scene.model_copy(update={"geometry": geometry}))
-        self.model = model = FullModel(mesh, "hex8", YOUNG, POISSON, PRONY if in_time else ())
+        tissue = tissue.model_copy(update={"prony": PRONY if in_time else ()})
+        self.model = model = FullModel(mesh, "hex8", tissue)
         self.in_time, self.history, self.q = in_time, model.at_rest, np.zeros(modes)
         values, vectors = np.linalg.eigh(model.rest_stiffness.toarray())
         nodal = np.zeros((3 * len(mesh.nodes), modes), np.float32)
@@ -77,14 +80,14 @@ class Twins:
         u = nodal.reshape(-1, 3, modes)[mesh.elements]
         G = np.einsum("eqaj,eair->eqijr", model.gradients, u).reshape(-1, LANES, 9, modes)
         self.count = model.weights.size
-        self.mu = np.repeat(model.mu, model.weights.shape[1])
+        law = model.law.at(np.repeat(np.arange(len(model.weights)), model.weights.shape[1]))
+        self.mu = law.mu
         self.points = bind(
             Points(
                 gradients=G.transpose(3, 0, 2, 1).reshape(modes, -1).astype(np.float32),
                 steps=np.ones(modes, np.float32),
                 weights=model.weights.ravel(),
-                mu=self.mu,
-                lam=np.repeat(model.lam, model.weights.shape[1]),
+                law=law,
             )
         )
         fields, latest = np.zeros((2, 9 * self.count), np.float32), np.zeros(modes)
@@ -137,8 +140,8 @@ class Pressed(Twins):
 
     search = np.inf, 400, True, press.ROUND_OFF
 
-    def __init__(self, in_time, modes):
-        super().__init__(in_time, modes)
+    def __init__(self, tissue, in_time, modes):
+        super().__init__(tissue, in_time, modes)
         vectors = np.zeros((3, modes))
         self.f, self.external, _ = vectors
         self.inverse, self.origin = np.zeros((modes, modes)), np.zeros((2, modes))
@@ -167,11 +170,11 @@ class Touched(Twins):
 
     search = 0.0, 100, False, touch.ROUND_OFF
 
-    def __init__(self, in_time, modes):
-        super().__init__(in_time, modes)
+    def __init__(self, tissue, in_time, modes):
+        super().__init__(tissue, in_time, modes)
         mesh, r = self.mesh, modes
         surface = tip_surface(mesh.nodes, mesh.faces, mesh.accessible, RADIUS)
-        self.contact = TipContact(self.model, surface, tip_of(RADIUS, YOUNG))
+        self.contact = TipContact(self.model, surface, tip_of(RADIUS, tissue.young))
         faces, rows = len(surface.faces), 3 * surface.faces.shape[1]
         self.x, self.latest, self.factor = np.zeros(3), np.zeros(r), np.zeros((r, r))
         self.load = bind(
@@ -251,7 +254,17 @@ def assert_close(found, expected, tolerance=ACCURATE):
 @pytest.mark.parametrize("in_time", [False, True], ids=["at-once", "in-time"])
 @pytest.mark.parametrize("kind", [Pressed, Touched], ids=["dead", "tip"])
 def test_all_points_make_the_galerkin_model_and_all_modes_the_full_one(kind, in_time, modes, rng):
-    twins = kind(in_time, modes)
+    compare(kind(TISSUES["neo-hookean"], in_time, modes), rng)
+
+
+@pytest.mark.parametrize("law", [law for law in TISSUES if law != "neo-hookean"])
+def test_so_it_is_with_every_other_law(law, rng):
+    compare(Touched(TISSUES[law], True, 24), rng)
+
+
+def compare(twins, rng):
+    """Go through a course and compare energy, force and reaction in and off equilibrium."""
+    modes = len(twins.q)
     B, q, residual, force = twins.B, twins.q, np.zeros(modes), np.zeros(len(twins.B))
     for share, dt in COURSE:
         problem = twins.solve(share, dt)
@@ -264,14 +277,14 @@ def test_all_points_make_the_galerkin_model_and_all_modes_the_full_one(kind, in_
             expected += model.potential(B @ away, force)[0]
             assert_close(residual, B.T @ force)
             assert energy == pytest.approx(expected, rel=2e-4)
-            if kind is Touched:
+            if isinstance(twins, Touched):
                 found = twins.reaction(problem)
                 for one, other in zip(found, twins.galerkin_reaction(model), strict=True):
                     assert_close(one, other)
         if modes == len(B):
             answer = twins.full_answer(share, dt)
             assert_close(twins.displacement, answer.displacement)
-            if kind is Touched:
+            if isinstance(twins, Touched):
                 assert_close(found[0], answer.force)
                 assert_close(found[1], answer.tangent)
         twins.remember(dt)

@@ -1,0 +1,40 @@
+"""Laws at a point, in terms of NumPy; every law with the constants of a scene that comes along."""
+
+import numpy as np
+
+from palpate.offline.scenes import find_scene, shipped_scenes
+from palpate.shared.mechanics import laws
+
+TISSUES = {tissue.law: tissue for tissue in (find_scene(name).tissue for name in shipped_scenes())}
+
+
+def law_of(name):
+    """Parameters of a law, numbers."""
+    return laws.law_of(TISSUES[name], 1).at(0)
+
+
+def stress(law, F):
+    """Energy density and stress (3, 3) of a deformation gradient (3, 3)."""
+    J, part, P = law.first_piola(tuple(F.ravel()))
+    return law.energy(J, part), np.reshape(P, (3, 3))
+
+
+def tangent(law, F):
+    """Material tangent (9, 9)."""
+    A = np.empty((9, 9))
+    laws.tangent(law, tuple(F.ravel()), A)
+    return A
+
+
+def deformation(rng, size=0.4, least=0.2):
+    """Deformation gradient of a size in each component, det F at least so large."""
+    while True:
+        F = np.eye(3) + rng.uniform(-size, size, (3, 3))
+        if np.linalg.det(F) > least:
+            return F
+
+
+def isochoric_invariants(F):
+    """Invariants of the isochoric part of ``F^T F``, and det F."""
+    squares, J = np.linalg.svd(F, compute_uv=False) ** 2, np.linalg.det(F)
+    return squares.sum() / J ** (2 / 3), J ** (2 / 3) * (1 / squares).sum(), J
