@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 
 from palpate.shared.compiled import by_type
+from palpate.shared.mechanics.demiray import DemirayTissue
 from palpate.shared.mechanics.mooney_rivlin import MooneyRivlinTissue
 from palpate.shared.mechanics.neo_hookean import NeoHookeanTissue
 from palpate.shared.mechanics.tensors import store, unit
@@ -23,6 +24,7 @@ from palpate.shared.mechanics.tissue import Law, equivalent, lame
 AnyTissue = (
     NeoHookeanTissue
     | MooneyRivlinTissue
+    | DemirayTissue
 )  # fmt: skip
 
 LAWS: list[Any] = [tissue.parameters for tissue in get_args(AnyTissue)]

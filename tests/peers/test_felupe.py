@@ -67,6 +67,12 @@ def mooney_rivlin(C, J, eye, inverse, mu, c01):
     return S + 2 * c01 * J ** (-4 / 3) * (first * eye - C - 2 / 3 * second * inverse)
 
 
+def demiray(C, J, eye, inverse, mu, b):
+    """The same."""
+    growth = np.exp(b * (J ** (-2 / 3) * trace(C) - 3))
+    return mu * growth * J ** (-2 / 3) * (eye - trace(C) / 3 * inverse)
+
+
 def separated(isochoric, mu, lam, *constants):
     """Laws of separate isochoric and volumetric stress, whose derivative is by differences."""
 
@@ -90,6 +96,7 @@ def separated(isochoric, mu, lam, *constants):
 LAWS = {
     "neo-hookean": neo_hookean,
     "mooney-rivlin": partial(separated, mooney_rivlin),
+    "demiray": partial(separated, demiray),
 }
 
 
