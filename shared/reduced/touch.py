@@ -27,24 +27,25 @@ from palpate.shared.compiled import bind_compiled, by_type
 from palpate.shared.geometry.surface import UPRIGHT, SurfaceIndex, locate
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import TIP_DEPTH
-from palpate.shared.mechanics.sphere import HARDNESS, Tip, TipSurface, Touching
+from palpate.shared.mechanics.sphere import Tip, TipSurface, Touching
 from palpate.shared.reduced.blend import MAX_ACTIVE, Active, activate, weight_gradients
+from palpate.shared.reduced.contact_search import (
+    MAX_ITERATIONS,
+    TOLERANCE,
+    along_the_way_in,
+    to_minimum,
+)
 from palpate.shared.reduced.corrections import Tangent
 from palpate.shared.reduced.features import TIP_FEATURES, residual_features, tip_features
 from palpate.shared.reduced.outcome import Outcome
 from palpate.shared.reduced.past import Remembering, begin_step, end_step
 from palpate.shared.reduced.points import PointTables, back_substitute, points_of
-from palpate.shared.reduced.problem import Problem, Work, descend
+from palpate.shared.reduced.problem import Problem, Work
 from palpate.shared.reduced.terms import Contact, Elastic, reaction
 
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
 Ints = NDArray[np.int64]
-
-TOLERANCE = 0.001
-"""Residual before the last correction relative to the response, both in the energy norm of the
-rest state.  The last correction reduces it to about its square; it is applied but not evaluated.
-The tangent on the tool is that before it: in hard contact 1 % of it is a matter of micrometres."""
 
 LEAST_SHARE = 0.1
 """Weight of a model below which its residual may not be larger still: that counts by weight."""
@@ -55,24 +56,9 @@ serves again.  In time both change at every step, and forming the tangent takes 
 rest.  The contact's part never serves again: it is far stiffer and changes as fast as the tip
 moves."""
 
-SLIGHT = 0.05
-"""Depth in radii of the tip below which an answer need not be nearer to equilibrium, in that norm,
-than one so deep: where contact begins Newton's method is slow, and the force next to nothing."""
-
-MAX_ITERATIONS = 40
-
 SKIN = 0.02
 """Distance from the surface, in radii of the tip, at which contact is looked for: the triangles
 that say where the surface is cut its curves."""
-
-ROUND_OFF = 1e-6
-"""Relative error of the energy: gradients are summed in single precision."""
-
-MOST_SADDLES, NUDGE = 3, 0.02
-"""Saddles that one search leaves at most, and by how much of the response."""
-
-RAMP = 8
-"""Steps of the way in when an equilibrium cannot be found in one jump."""
 
 
 class TouchModels(NamedTuple):
@@ -243,7 +229,7 @@ def _solve(solver, k, slot, x, most):
         problem, q, scratch.newton, max(depth, 0.0), tolerance, most
     )
     if status != newton.CONVERGED and depth > 0.0 and most == MAX_ITERATIONS:
-        status, more, energy, smallest = _along_the_way_in(
+        status, more, energy, smallest = along_the_way_in(
             problem, q, scratch.newton, depth, outcome.upward, most
         )
         iterations += more
@@ -369,85 +355,6 @@ def first_guess(models, k, x, depth, features, q):
         row = models.guess[k, f]
         for j in range(len(q)):
             q[j] += features[f] * row[j]
-
-
-# --- the search ----------------------------------------------------------------------------------
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _response(tip, depth):
-    """About a tenth of the least response to a tip so deep, in the energy norm."""
-    return 0.1 * depth * tip.radius * math.sqrt(tip.stiffness / HARDNESS)
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def solve_contact(problem, q, work, depth, tolerance, most):
-    """Equilibrium near q, in place: (status, iterations, energy, smallest det F).
-
-    The tolerance is relative to the response, which is not known before; the depth says what it may
-    be.
-    """
-    tip = problem.load.tip
-    energy, smallest = newton.potential(problem, q, work[0])
-    status, iterations = newton.CONVERGED, 0
-    least = _response(tip, SLIGHT * tip.radius)
-    size = max(math.sqrt(np.dot(q, q)), _response(tip, depth), least)
-    while True:
-        status, more, energy, smallest = descend(
-            problem, q, work, energy, smallest, tolerance * size, 0.0, most, False, ROUND_OFF
-        )
-        iterations += more
-        found = math.sqrt(np.dot(q, q))
-        if status != newton.CONVERGED or size <= 2.0 * found or size <= least:
-            return status, iterations, energy, smallest
-        size = max(found, least)
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def to_minimum(problem, q, work, depth, tolerance, most):
-    """As ``solve_contact``, but never in a saddle, and with the tangent at q factorised.
-
-    Where tissue snaps, equilibria end in saddles; from one the search goes on the way down.
-    """
-    status, iterations, energy, smallest = solve_contact(problem, q, work, depth, tolerance, most)
-    saddles = 0
-    while status == newton.CONVERGED and not newton.factorise(problem, q, 0.0):
-        saddles += 1
-        if saddles > MOST_SADDLES or iterations >= most:
-            return newton.STALLED, iterations, energy, smallest
-        _leave_saddle(problem, q, work)
-        status, more, energy, smallest = solve_contact(problem, q, work, depth, tolerance, most)
-        iterations += more
-    return status, iterations, energy, smallest
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _leave_saddle(problem, q, work):
-    """Move q, a saddle, along the eigenvector of the least eigenvalue of the tangent."""
-    tangent = problem.correction.whole
-    K = np.tril(tangent)
-    K += np.tril(tangent, -1).T
-    down = NUDGE * math.sqrt(np.dot(q, q)) * np.linalg.eigh(K)[1][:, 0]
-    ahead, _ = newton.potential(problem, q + down, work[3])
-    back, _ = newton.potential(problem, q - down, work[3])
-    q += down if ahead < back else -down
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _along_the_way_in(problem, q, work, depth, normal, most):
-    """As ``to_minimum``, from rest in steps along the way in, for where a jump fails."""
-    at = problem.load.x
-    away = depth * normal
-    at += away
-    q[:] = 0.0
-    problem.correction.formed[:] = np.inf
-    status, iterations, energy, smallest = newton.CONVERGED, 0, 0.0, 1.0
-    for _ in range(RAMP):
-        if status == newton.CONVERGED:
-            at -= away / RAMP
-            status, more, energy, smallest = to_minimum(problem, q, work, depth, TOLERANCE, most)
-            iterations += more
-    return status, iterations, energy, smallest
 
 
 # --- what is kept --------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from palpate.shared.compiled import bind, bind_compiled
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.sphere import room_for, tip_of, tip_surface
 from palpate.shared.mechanics.viscosity import step_weights
-from palpate.shared.reduced import press, touch
+from palpate.shared.reduced import contact_search, press
 from palpate.shared.reduced.corrections import Secants, Tangent, forget_secants
 from palpate.shared.reduced.past import begin_step, end_step, opened, remembering
 from palpate.shared.reduced.points import LANES, STATE, Points
@@ -168,7 +168,7 @@ class Pressed(Twins):
 class Touched(Twins):
     """Under the rigid tip, solved by tangents."""
 
-    search = 0.0, 100, False, touch.ROUND_OFF
+    search = 0.0, 100, False, contact_search.ROUND_OFF
 
     def __init__(self, tissue, in_time, modes):
         super().__init__(tissue, in_time, modes)

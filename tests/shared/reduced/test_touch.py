@@ -12,7 +12,7 @@ from palpate.shared.errors import QueryError
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.sphere import tip_of
 from palpate.shared.model import ReducedModel
-from palpate.shared.reduced import touch
+from palpate.shared.reduced import contact_search, touch
 from palpate.shared.reduced.terms import Elastic
 from palpate.shared.reduced.workspace import touch_workspace
 
@@ -242,11 +242,11 @@ class Ridge:
 
 def test_a_search_does_not_end_in_a_saddle(monkeypatch):
     for name in ("solve_contact", "_leave_saddle", "_response"):
-        monkeypatch.setattr(touch, name, getattr(touch, name).py_func)
-    monkeypatch.setattr(touch, "descend", newton.descend)
+        monkeypatch.setattr(contact_search, name, getattr(contact_search, name).py_func)
+    monkeypatch.setattr(contact_search, "descend", newton.descend)
     problem, q, work = Ridge(), np.array([0.0, 2.0]), np.zeros((4, 2))
     search = problem, q, work, 0.1, 1e-6, 100
-    assert touch.solve_contact(*search)[0] == newton.CONVERGED
+    assert contact_search.solve_contact(*search)[0] == newton.CONVERGED
     np.testing.assert_allclose(q, [0.0, 3.0], atol=1e-4)  # by symmetry
-    assert touch.to_minimum.py_func(*search)[0] == newton.CONVERGED
+    assert contact_search.to_minimum.py_func(*search)[0] == newton.CONVERGED
     np.testing.assert_allclose(np.abs(q), [1.0, 3.0], atol=1e-4)
