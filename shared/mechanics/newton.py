@@ -37,7 +37,7 @@ def correct(system, residual, step):
     system.correct(residual, step)
 
 
-def newton(system, u, work, target, reuse, max_iterations, factorised, round_off=1e-9):
+def newton(system, u, work, target, reuse, max_iterations, factorised, round_off=1e-9, noise=0.0):
     """Find the equilibrium of ``system`` near ``u``, in place.
 
     Parameters
@@ -59,6 +59,8 @@ def newton(system, u, work, target, reuse, max_iterations, factorised, round_off
     round_off : float
         Relative error with which the system knows its energy; where strains are small, it is a
         difference of large numbers.
+    noise : float
+        Absolute error of the energy, which does not vanish with the load.
 
     Returns
     -------
@@ -74,13 +76,15 @@ def newton(system, u, work, target, reuse, max_iterations, factorised, round_off
     """
     energy, smallest = potential(system, u, work[0])
     return descend(
-        system, u, work, energy, smallest, target, reuse, max_iterations, factorised, round_off
-    )
+        system, u, work, energy, smallest, target, reuse, max_iterations, factorised, round_off,
+        noise,
+    )  # fmt: skip
 
 
 def descend(
-    system, u, work, energy, smallest, target, reuse, max_iterations, factorised, round_off
-):
+    system, u, work, energy, smallest, target, reuse, max_iterations, factorised, round_off,
+    noise=0.0,
+):  # fmt: skip
     """As ``newton`` from a ``u`` whose potential is known and whose residual is in ``work[0]``."""
     residual, step, trial, trial_residual = work[0], work[1], work[2], work[3]
     if not smallest > 0:  # beyond an inverted element there is neither residual nor tangent
@@ -104,7 +108,7 @@ def descend(
             np.multiply(step, length, trial)
             np.add(trial, u, trial)
             trial_energy, trial_smallest = potential(system, trial, trial_residual)
-            allowed = SUFFICIENT_DECREASE * length * slope + round_off * abs(energy)
+            allowed = SUFFICIENT_DECREASE * length * slope + round_off * abs(energy) + noise
             if trial_energy - energy <= allowed:
                 break
             length *= 0.5
