@@ -218,14 +218,12 @@ def validate(tip: bool, queries: int, histories: int | None, **settings: Any) ->
     Both solve new random loads, positions of the tip, or histories of either, over the whole range
     of the artifact. Errors are relative L2 norms as fractions; of histories over all moments.
     """
-    from palpate.offline.validate.histories import validate_histories
-    from palpate.offline.validate.loads import validate
-    from palpate.offline.validate.tip import validate_touches
-    from palpate.offline.validate.tip_histories import validate_courses
+    from palpate.offline.validate.against_full import against_full
+    from palpate.offline.validate.kinds import HISTORIES, LOADS, TIP, TIP_HISTORIES
 
     if histories is not None:
-        return (validate_courses if tip else validate_histories)(count=histories, **settings)
-    return (validate_touches if tip else validate)(queries=queries, **settings)
+        return against_full(kind=TIP_HISTORIES if tip else HISTORIES, count=histories, **settings)
+    return against_full(kind=TIP if tip else LOADS, count=queries, **settings)
 
 
 @click.command()

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.offline.fem.model import NoEquilibrium
-from palpate.offline.run.workshop import Load, Workshop
-from palpate.offline.validate.norms import relative
+from palpate.offline.fem.norms import relative
+from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.vtu import write_vtu
 from palpate.shared.answer import describe
 from palpate.shared.artifact import read_artifact
@@ -74,14 +74,14 @@ def solve(
     report["timing"] = {"solve_us": solve_us, "recover_us": recover_us}
     if not (full_model or vtu):
         return report
-    workshop = Workshop.of_artifact(read_artifact(artifact))
+    problem = FullProblem.of_artifact(read_artifact(artifact))
     load = Load(solution.contact_point, solution.direction, pressure)
     fields = {"displacement": moved, "von_mises": stress}
     if full_model:
-        exact, full_us = _timed(lambda: workshop.solve(load))
-        exact_stress = workshop.von_mises(exact.displacement)
+        exact, full_us = _timed(lambda: problem.solve(load))
+        exact_stress = problem.von_mises(exact.displacement)
         errors = moved - exact.displacement, stress - exact_stress
-        kept = workshop.beyond_clamped_layer
+        kept = problem.beyond_clamped_layer
         report["full_model"] = {
             "error": {
                 "displacement": relative(moved, exact.displacement),
@@ -96,8 +96,8 @@ def solve(
         fields = {"displacement": exact.displacement, "von_mises": exact_stress}
         fields |= {"displacement_error": errors[0], "von_mises_error": errors[1]}
     if vtu:
-        mesh = workshop.mesh
-        fields |= {"load": workshop.load_vector(load), "clamped": mesh.clamped}
+        mesh = problem.mesh
+        fields |= {"load": problem.load_vector(load), "clamped": mesh.clamped}
         write_vtu(vtu, mesh.nodes, mesh.elements, fields)
     return report
 

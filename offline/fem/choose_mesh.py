@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from palpate.offline.fem.mesh import build_mesh
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.refine import refined
 from palpate.offline.reduce.sampling import spread_points
 from palpate.offline.run.streams import Stage, stream
-from palpate.offline.run.workshop import Workshop
 from palpate.shared.scene import Block, Divisions, Scene, SceneError, divisions_of, parse_scene
 
 Array = NDArray[np.float64]
@@ -106,21 +106,21 @@ def _candidates(scene: Scene) -> list[Divisions]:
 
 def _try(scene: Scene) -> MeshTrial:
     """Press a mesh and one of more than six times its degrees of freedom at the same places."""
-    workshop, reference = Workshop(scene), Workshop(refined(scene))
+    problem, reference = FullProblem(scene), FullProblem(refined(scene))
     rng = stream(scene.seed, Stage.MESH_CHOICE)
     errors = []
-    for point in spread_points(workshop.surface, PLACES, rng):
-        x, normal, _ = workshop.surface.project(point)
-        moved, exact = (_moved(body, x, normal) for body in (workshop, reference))
+    for point in spread_points(problem.surface, PLACES, rng):
+        x, normal, _ = problem.surface.project(point)
+        moved, exact = (_moved(body, x, normal) for body in (problem, reference))
         errors.append(abs(moved / exact - 1))
     return MeshTrial(
-        divisions_of(scene.geometry), workshop.mesh.nodes.size, float(np.percentile(errors, 95))
+        divisions_of(scene.geometry), problem.mesh.nodes.size, float(np.percentile(errors, 95))
     )
 
 
-def _moved(workshop: Workshop, x: Array, normal: Array) -> float:
+def _moved(problem: FullProblem, x: Array, normal: Array) -> float:
     """Mean displacement under a footprint of unit pressure, along the normal; linear elasticity."""
-    nodal = workshop.unit_load_at(x, normal)
-    load = (nodal[:, None] * normal).reshape(-1)[workshop.model.free]
-    u = workshop.model.solve_linear(load[:, None])[:, 0]
+    nodal = problem.unit_load_at(x, normal)
+    load = (nodal[:, None] * normal).reshape(-1)[problem.model.free]
+    u = problem.model.solve_linear(load[:, None])[:, 0]
     return float(load @ u) / float(nodal.sum())

@@ -1,29 +1,29 @@
 """The full finite element model: finite strain, total Lagrangian, quasi-static.
 
-It gives ``mechanics.newton`` its potential, tangent and correction on the free degrees of freedom
-(dof = 3 node + axis, clamped nodes left out) and answers loads on its surface.
+Its unknowns are the free degrees of freedom (dof = 3 node + axis, clamped nodes left out).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from palpate.offline.fem import assembly
-from palpate.offline.fem.linear_solver import NotPositiveDefinite, sparse_solver
+from palpate.offline.fem.linear_solver import SparseSolver, sparse_solver
 from palpate.offline.fem.mesh import Mesh
+from palpate.offline.fem.potential import Potential
+from palpate.offline.fem.terms import AppliedLoad, DeadLoad, Past, PastStress, Term, advanced
 from palpate.shared.errors import PalpateError
 from palpate.shared.geometry.quadrature import volume_quadrature
-from palpate.shared.mechanics import newton, sphere, viscosity
+from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.laws import AnyTissue, law_of
-from palpate.shared.mechanics.sphere import Tip, TipSurface, Touching, room_for
 from palpate.shared.mechanics.tensors import SYMMETRIC
+from palpate.shared.mechanics.viscosity import step_weights
 from palpate.shared.scene import ElementName, Scene
 
 Array = NDArray[np.float64]
@@ -33,14 +33,21 @@ POINTWISE: tuple[ElementName, ...] = ("hex8", "hex20")
 one by one, so only the full model has those."""
 
 TOLERANCE = 1e-9
-"""Residual of an equilibrium relative to the load, both in the Euclidean norm of nodal forces."""
+"""Residual of an equilibrium relative to the load or to the force of the past, whichever is larger,
+in the Euclidean norm of nodal forces."""
 
 ROUND_OFF = 1e-13
-"""Of forces, relative to those that deform the whole body."""
+"""Of forces, relative to those that deform the whole body: no residual need be smaller."""
+
+NOISE = 1e-16
+"""Of the energy, relative to that which deforms the whole body: it is a sum over all points."""
 
 MAX_ITERATIONS = 40
 KEEP_TANGENT = 0.05
 """A factorisation costs ten corrections here, so a tangent serves while it gains a digit."""
+
+SMALLEST_STEP = 1 / 64
+"""Fraction of a load below which a load step is given up."""
 
 
 class NoEquilibrium(PalpateError):
@@ -49,100 +56,31 @@ class NoEquilibrium(PalpateError):
 
 @dataclass(frozen=True)
 class Equilibrium:
-    """A converged state of the full model."""
-
-    displacement: Array  # (nodes, 3) mm
-    iterations: int
-    load_steps: int
-    min_jacobian: float
-
-
-@dataclass(frozen=True)
-class TipEquilibrium(Equilibrium):
-    """A converged state under a rigid tip."""
-
-    force: Array  # (3,) mN, on the tool
-    tangent: Array  # (3, 3) mN/mm, derivative of the force in the tip's position
-    penetration: float  # mm, largest
-    energy: float  # mN mm, stored in tissue and penalty
-
-
-@dataclass(frozen=True)
-class History:
-    """What tissue remembers; see ``mechanics.viscosity``."""
-
-    displacement: Array  # (nodes, 3) mm, the last
-    points: Array  # (terms + 1, e, q, 6), at quadrature points
-
-
-def predicted(history: History, weights: viscosity.Weights) -> Array:
-    """``B`` of ``mechanics.viscosity`` (e, q, 6) at the end of a step with these weights."""
-    points = history.points
-    B = np.empty(points.shape[1:])
-    loss = viscosity.predict(points.reshape(len(points), -1), weights, B.reshape(-1))
-    B[..., :3] -= loss
-    return B
-
-
-class TipContact:
-    """A rigid tip, somewhere, against the full model's surface.
+    """A converged state of the full model.
 
     Attributes
     ----------
-    tip : Tip
-    position : ndarray, shape (3,), mm
-        Centre of the tip.
+    displacement : ndarray, shape (nodes, 3), mm
+    energy : float, mN mm
+        Potential energy there, of tissue and load.
+    past : Past
+        To go on from.
+    iterations, load_steps : int
+    min_jacobian : float
+        Smallest det F at the quadrature points.
+    force, tangent, penetration
+        What the tool feels; see ``Reaction``.
     """
 
-    def __init__(self, model: FullModel, surface: TipSurface, tip: Tip) -> None:
-        self.tip = tip
-        self.surface = surface
-        self.position = np.full(3, np.inf)
-        self._near = np.arange(len(surface.faces), dtype=np.int32)
-        self._touching: Touching = room_for(surface, len(surface.faces))
-        self._slots = model.face_slots(surface.faces)
-
-    def potential(self, displacement: Array, force: Array) -> float:
-        """Energy of the penalty (mN mm); adds its gradient to ``force`` (3 nodes,) mN."""
-        count, energy, self.deepest = self._touch(displacement, sphere.FORCE)
-        faces = self.surface.faces[self._touching.face[:count]]
-        np.subtract.at(force.reshape(-1, 3), faces, self._touching.force[:count])
-        return energy
-
-    def stiffen(self, displacement: Array, data: Array, convex: bool) -> None:
-        """Add the contact's tangent at a displacement (3 nodes,), or its convex part."""
-        count, _, _ = self._touch(displacement, sphere.CONVEX if convex else sphere.STIFFNESS)
-        assembly.scatter_faces(
-            self._touching.stiffness[:count], self._slots[self._touching.face[:count]], data
-        )
-
-    def reaction(self, displacement: Array) -> tuple[Array, Array, Array]:
-        """Force (3,) mN on the tool, and how it couples with the tissue.
-
-        Returns
-        -------
-        force : ndarray, shape (3,)
-        own : ndarray, shape (3, 3), mN/mm
-            Second derivative of the potential in the tip's position.
-        coupling : ndarray, shape (3 nodes, 3), mN/mm
-            Minus the mixed one.
-        """
-        count, _, _ = self._touch(displacement, sphere.STIFFNESS)
-        K = self._touching.stiffness[:count].copy()
-        for i, j in ((1, 0), (2, 0), (2, 1)):
-            K[:, i, j] = K[:, j, i]
-        coupling = np.zeros((len(displacement) // 3, 3, 3))
-        faces = self.surface.faces[self._touching.face[:count]]
-        np.add.at(coupling, faces, np.einsum("fijab->faij", K))
-        force = -self._touching.force[:count].sum(axis=(0, 1))
-        return force, self._touching.own, coupling.reshape(len(displacement), 3)
-
-    def _touch(self, displacement: Array, wanted: float) -> tuple[int, float, float]:
-        found: tuple[int, float, float] = sphere.touch(
-            self.tip, self.surface, self._near, self.position, displacement.reshape(-1, 3),
-            self._touching, wanted,
-        )  # fmt: skip
-        return found
+    displacement: Array
+    energy: float
+    past: Past
+    iterations: int
+    load_steps: int
+    min_jacobian: float
+    force: Array
+    tangent: Array
+    penetration: float
 
 
 @dataclass
@@ -154,13 +92,14 @@ class FullModel:
     mesh : Mesh
     element : {"hex8", "hex8-mean-dilatation", "hex8-fbar", "hex20"}
     tissue : AnyTissue
-        Only ``step`` and ``touch_step`` know of its time: ``solve`` and ``touch`` answer instantly.
+    terms : tuple of Term
+        What belongs to the tissue beside its elasticity, whatever the load.
     """
 
     mesh: Mesh
     element: ElementName
     tissue: AnyTissue
-    _load: Array = field(init=False, repr=False)
+    terms: tuple[Term, ...] = ()
 
     @classmethod
     def of(cls, scene: Scene, mesh: Mesh) -> FullModel:
@@ -174,44 +113,34 @@ class FullModel:
         self.connectivity = np.ascontiguousarray(mesh.elements, dtype=np.int32)
         self.law = law_of(self.tissue, len(mesh.elements))
         self.prony = self.tissue.prony
-        self._theta = self._theta_points()
-        self._slots, self.pattern = self._sparsity()
-        self._load = np.zeros(len(self.free))
-        self._full = np.zeros(3 * len(mesh.nodes))
-        self._force = np.zeros_like(self._full)
-        self._data = np.zeros(self.pattern.nnz)
-        self._work = np.zeros((4, len(self.free)))
-        self._solver = sparse_solver(self.pattern)
-        self._at_rest = False
-        self._contact: TipContact | None = None
-        self._past: Array | None = None
+        self.slots, self.pattern = self._sparsity()
+        self.solver = sparse_solver(self.pattern)
 
     @cached_property
     def relaxed(self) -> FullModel:
         """The model of what the tissue is after an infinite time, elastic."""
         if not self.prony:
             return self
-        other = replace(self, tissue=self.tissue.model_copy(update={"prony": ()}))
-        other._past = predicted(self.at_rest, viscosity.step_weights(self.prony, np.inf))
-        return other
+        lost = PastStress(self, self.at_rest, step_weights(self.prony, np.inf))
+        elastic = self.tissue.model_copy(update={"prony": ()})
+        return replace(self, tissue=elastic, terms=(*self.terms, lost))
 
-    @property
-    def at_rest(self) -> History:
+    @cached_property
+    def at_rest(self) -> Past:
         """Tissue that nothing has happened to."""
-        return History(
+        return Past(
             np.zeros((len(self.mesh.nodes), 3)),
             np.zeros((len(self.prony) + 1, *self.weights.shape, SYMMETRIC)),
         )
 
-    def _theta_points(self) -> tuple[Array, Array] | None:
+    @cached_property
+    def _theta(self) -> tuple[Array, Array]:
         """Gradients and weights of the points whose J make up an element's dilatation."""
+        weights = self.weights / self.weights.sum(axis=1, keepdims=True)
         if self.element == "hex8-mean-dilatation":
-            return self.gradients, self.weights / self.weights.sum(axis=1, keepdims=True)
-        if self.element == "hex8-fbar":
-            weights = self.weights / self.weights.sum(axis=1, keepdims=True)
-            mean = np.einsum("eq,eqai->eai", weights, self.gradients)
-            return np.ascontiguousarray(mean[:, None]), np.ones((len(mean), 1))
-        return None
+            return self.gradients, weights
+        mean = np.einsum("eq,eqai->eai", weights, self.gradients)
+        return np.ascontiguousarray(mean[:, None]), np.ones((len(mean), 1))
 
     def _sparsity(self) -> tuple[NDArray[np.int32], csr_matrix]:
         """CSR pattern of the free dofs and the slot in it of every element matrix entry."""
@@ -243,6 +172,14 @@ class FullModel:
         slots = np.searchsorted(filled, rows * n + cols)
         return np.where((rows >= 0) & (cols >= 0), slots, -1).astype(np.int32)
 
+    @property
+    def _elasticity(self) -> tuple[Any, ...]:
+        """What the loops of ``assembly`` over the elements have in common."""
+        mesh = self.connectivity, self.gradients, self.weights
+        if self.element in POINTWISE:
+            return *mesh, self.law
+        return *mesh, *self._theta, self.law
+
     def internal(self, displacement: Array, force: Array) -> tuple[float, float]:
         """Write the internal force (3 nodes,) mN of a displacement (3 nodes,) mm.
 
@@ -252,15 +189,14 @@ class FullModel:
             Stored energy (mN mm) and smallest det F.
         """
         force[:] = 0.0
-        args = (self.connectivity, self.gradients, self.weights)
-        if self._theta is None:
-            energy, smallest = assembly.standard_residual(*args, self.law, displacement, force)
-        else:
-            energy, smallest = assembly.dilatation_residual(
-                *args, *self._theta, self.law, displacement, force
-            )
-        if self._past is not None and smallest > 0.0:
-            energy += assembly.viscous_residual(*args, self.law.mu, self._past, displacement, force)
+        loop: Any = (
+            assembly.standard_residual
+            if self.element in POINTWISE
+            else assembly.dilatation_residual
+        )
+        energy, smallest = loop(*self._elasticity, displacement, force)
+        if smallest > 0.0:
+            energy += sum(term.add_force(displacement, force) for term in self.terms)
         return energy, smallest
 
     def internal_free(self, u: Array) -> Array:
@@ -271,18 +207,52 @@ class FullModel:
         PalpateError
             If the displacement inverts an element.
         """
-        self._full[self.free] = u
-        _, smallest = self.internal(self._full, self._force)
+        displacement = self.filled(u)
+        force = np.empty_like(displacement)
+        _, smallest = self.internal(displacement, force)
         if not smallest > 0:
             raise PalpateError("displacement: it inverts an element")
-        return self._force[self.free]
+        return force[self.free]
+
+    def filled(self, u: Array) -> Array:
+        """Displacement (3 nodes,) mm from that of the free dofs."""
+        displacement = np.zeros(3 * len(self.mesh.nodes))
+        displacement[self.free] = u
+        return displacement
+
+    def stiffness(self, displacement: Array) -> csr_matrix:
+        """Tangent stiffness (mN/mm) of the free dofs at a displacement (3 nodes,) mm."""
+        data = np.zeros(self.pattern.nnz)
+        self.add_stiffness(displacement, data)
+        return self.matrix(data)
+
+    def matrix(self, data: Array) -> csr_matrix:
+        """Matrix of the free dofs that holds ``data`` (nnz,)."""
+        return csr_matrix((data, self.pattern.indices, self.pattern.indptr), copy=False)
+
+    def add_stiffness(self, displacement: Array, data: Array) -> None:
+        """Add the tangent stiffness of the tissue; see ``Term``."""
+        loop: Any = (
+            assembly.standard_tangent if self.element in POINTWISE else assembly.dilatation_tangent
+        )
+        loop(*self._elasticity, displacement, self.slots, data)
+        for term in self.terms:
+            term.add_stiffness(displacement, data, False)
+
+    @cached_property
+    def rest_stiffness(self) -> csr_matrix:
+        """Stiffness (mN/mm) of the free dofs at rest."""
+        return self.stiffness(np.zeros(3 * len(self.mesh.nodes)))
+
+    @cached_property
+    def _rest_solver(self) -> SparseSolver:
+        solver = sparse_solver(self.pattern)
+        solver.factorise(self.rest_stiffness.data)
+        return solver
 
     def solve_linear(self, loads: Array) -> Array:
         """Linear response (free dofs, k) mm to loads (free dofs, k) mN: rest stiffness."""
-        if not self._at_rest:
-            self.factorise(np.zeros(len(self.free)), 0.0)
-            self._at_rest = True
-        return self._solver.solve(loads)
+        return self._rest_solver.solve(loads)
 
     def relative_residuals(self, displacements: Array, loads: Array) -> Array:
         """What displacements (k, free dofs) mm leave of loads (k, free dofs) mN, relative to them.
@@ -300,249 +270,61 @@ class FullModel:
         own = np.sum(displacements.T * (self.rest_stiffness @ displacements.T), axis=0)
         return np.where(sound, np.sqrt(energies / own), np.inf)
 
-    def stiffness(self, displacement: Array) -> csr_matrix:
-        """Tangent stiffness (mN/mm) of the free dofs; the next call overwrites the matrix."""
-        self._data[:] = 0.0
-        args = (self.connectivity, self.gradients, self.weights)
-        rest = (self.law, displacement, self._slots, self._data)
-        if self._theta is None:
-            assembly.standard_tangent(*args, *rest)
-        else:
-            assembly.dilatation_tangent(*args, *self._theta, *rest)
-        if self._past is not None:
-            assembly.viscous_tangent(
-                *args, self.law.mu, self._past, displacement, self._slots, self._data
-            )
-        return csr_matrix((self._data, self.pattern.indices, self.pattern.indptr), copy=False)
-
-    @cached_property
-    def rest_stiffness(self) -> csr_matrix:
-        """Stiffness (mN/mm) of the free dofs at rest, where nothing has happened before."""
-        data, past = self._data, self._past
-        self._data = np.zeros_like(data)
-        if self.prony:
-            self._past = None
-        try:
-            return self.stiffness(np.zeros_like(self._full))
-        finally:
-            self._data, self._past = data, past
-
-    # what mechanics.newton asks for ------------------------------------------------------------
-
-    def potential(self, u: Array, residual: Array) -> tuple[float, float]:
-        """Total potential energy (mN mm), its gradient (mN) and the smallest det F."""
-        self._full[self.free] = u
-        energy, smallest = self.internal(self._full, self._force)
-        if self._contact is not None:
-            energy += self._contact.potential(self._full, self._force)
-        np.subtract(self._force[self.free], self._load, out=residual)
-        return energy - float(self._load @ u), smallest
-
-    def factorise(self, u: Array, shift: float) -> bool:
-        """Factorise the tangent plus ``shift`` times the rest stiffness, if that is definite."""
-        self._full[self.free] = u
-        matrix = self.stiffness(self._full)
-        if self._contact is not None:
-            self._contact.stiffen(self._full, matrix.data, shift > 0)
-        data = matrix.data + shift * self.rest_stiffness.data if shift else matrix.data
-        self._at_rest = False
-        try:
-            self._solver.factorise(data)
-        except NotPositiveDefinite:
-            return False
-        return True
-
-    def correct(self, residual: Array, step: Array) -> None:
-        """Newton's step for a residual, by the last factorisation."""
-        np.negative(self._solver.solve(residual), out=step)
-
-    # ---------------------------------------------------------------------------------------------
-
     def solve(
         self,
-        load: Array,
+        load: AppliedLoad | Array,
+        past: Past | None = None,
+        dt: float = 0.0,
         start: Array | None = None,
         reuse: float = KEEP_TANGENT,
-        smallest_step: float = 1 / 64,
-        least: float = 1e-12,
+        smallest_step: float = SMALLEST_STEP,
     ) -> Equilibrium:
-        """Equilibrium under a dead load, in one jump if that converges, else in load steps.
+        """Equilibrium under a load, in one jump if that converges, else in load steps.
 
         Parameters
         ----------
-        load : ndarray, shape (nodes, 3), mN
+        load : AppliedLoad or ndarray, shape (nodes, 3), mN
+            Nodal forces are a dead load.
+        past : Past, optional
+            Of the tissue before it is loaded; rest if absent.
+        dt : float, s
+            Since the end of the past.  May be 0, for a sudden change, or infinite.
         start : ndarray, shape (nodes, 3), mm, optional
-            First guess; rest if absent.
+            First guess; the last displacement of the past if absent.
         reuse : float
             See ``mechanics.newton.newton``.
         smallest_step : float
             Fraction of the load below which a step is given up.
-        least : float, mN
-            Residual that counts as equilibrium under any load, however small.
 
         Raises
         ------
         NoEquilibrium
         """
-        full_load = load.reshape(-1)[self.free]
-
-        def apply(fraction: float) -> None:
-            np.multiply(full_load, fraction, out=self._load)
-
-        target = max(TOLERANCE * float(np.linalg.norm(full_load)), least)
-        return self._follow(apply, target, start, reuse, smallest_step, "pressure")[0]
-
-    def step(
-        self, history: History, load: Array, dt: float, start: Array | None = None
-    ) -> tuple[Equilibrium, History]:
-        """Equilibrium under a dead load ``dt`` after the end of a history, and the longer history.
-
-        Parameters
-        ----------
-        history : History
-        load : ndarray, shape (nodes, 3), mN
-        dt : float, s
-            May be 0, for a sudden change, or infinite.
-        start : ndarray, shape (nodes, 3), mm, optional
-            First guess; the history's last displacement if absent.
-
-        Raises
-        ------
-        NoEquilibrium
-        """
-        if start is None:
-            start = history.displacement
-        with self._remembering(history, dt) as weights:
-            found = self.solve(load, start, least=self._least_residual(history))
-        return found, self.advanced(history, found.displacement, weights)
-
-    def touch_step(
-        self,
-        history: History,
-        contact: TipContact,
-        position: Array,
-        approach: Array,
-        dt: float,
-        start: Array | None = None,
-    ) -> tuple[TipEquilibrium, History]:
-        """Equilibrium under a rigid tip ``dt`` after the end of a history, and the longer history.
-
-        For ``history``, ``dt`` (s) and ``start`` see ``step``, for the tip see ``touch``. Force and
-        tangent are those of the end of the step, the energy is that of its potential.
-
-        Raises
-        ------
-        NoEquilibrium
-        """
-        if start is None:
-            start = history.displacement
-        with self._remembering(history, dt) as weights:
-            found = self.touch(contact, position, approach, start)
-        return found, self.advanced(history, found.displacement, weights)
-
-    @contextmanager
-    def _remembering(self, history: History, dt: float) -> Iterator[viscosity.Weights]:
-        """Solve with what a history exerts ``dt`` after its end; gives the weights of the step."""
-        weights = viscosity.step_weights(self.prony, dt)
-        self._past = predicted(history, weights)
-        try:
-            yield weights
-        finally:
-            self._past, self._at_rest = None, False
-
-    def advanced(
-        self, history: History, displacement: Array, weights: viscosity.Weights
-    ) -> History:
-        """History that has gone a step further, to a displacement (nodes, 3) mm."""
-        points = history.points.copy()
-        m = np.empty(points.shape[1:])
-        assembly.drive(self.connectivity, self.gradients, displacement.reshape(-1), m)
-        viscosity.advance(m.reshape(-1), weights, points.reshape(len(points), -1))
-        return History(displacement, points)
-
-    def _least_residual(self, history: History) -> float:
-        """Residual (mN) that counts as equilibrium: small beside what the past exerts, or none."""
-        force = np.zeros_like(self._full)
-        assembly.viscous_residual(
-            self.connectivity, self.gradients, self.weights, self.law.mu, self._past,
-            history.displacement.reshape(-1), force,
-        )  # fmt: skip
-        none = ROUND_OFF * self.tissue.young * self.weights.sum() ** (2 / 3)
-        return max(TOLERANCE * float(np.linalg.norm(force[self.free])), float(none))
-
-    def touch(
-        self,
-        contact: TipContact,
-        position: Array,
-        approach: Array,
-        start: Array | None = None,
-        smallest_step: float = 1 / 64,
-    ) -> TipEquilibrium:
-        """Equilibrium under a rigid tip, in one jump if that converges, else in steps of its way.
-
-        Parameters
-        ----------
-        contact : TipContact
-            Made for this model; keeps where the tip is.
-        position : ndarray, shape (3,), mm
-            Centre of the tip.
-        approach : ndarray, shape (3,), mm
-            The way the tip has come: it began at ``position - approach``, without contact.
-        start : ndarray, shape (nodes, 3), mm, optional
-            First guess; rest if absent.
-        smallest_step : float
-            Fraction of the way below which a step is given up.
-
-        Raises
-        ------
-        NoEquilibrium
-        """
-
-        def apply(fraction: float) -> None:
-            contact.position[:] = position - (1.0 - fraction) * approach
-
-        # the force is not known before; that which dents the tissue by the tip's radius is
-        target = TOLERANCE * self.tissue.young * contact.tip.radius**2
-        self._contact = contact
-        self._load[:] = 0.0
-        try:
-            found, energy = self._follow(apply, target, start, KEEP_TANGENT, smallest_step, "depth")
-            u = found.displacement.reshape(-1)
-            self.factorise(u[self.free], 0.0)
-            force, own, coupling = contact.reaction(u)
-            coupling = coupling[self.free]
-            tangent = coupling.T @ self._solver.solve(coupling) - own
-        finally:
-            self._contact = None
-        return TipEquilibrium(
-            **vars(found),
-            force=force,
-            tangent=tangent,
-            penetration=contact.deepest,
-            energy=energy,
-        )
-
-    def _follow(
-        self,
-        apply: Callable[[float], None],
-        target: float,
-        start: Array | None,
-        reuse: float,
-        smallest_step: float,
-        field: str,
-    ) -> tuple[Equilibrium, float]:
-        """Equilibrium at the end of a path of loads, and its energy; ``apply`` sets a fraction."""
-        u = np.zeros(len(self.free)) if start is None else start.reshape(-1)[self.free].copy()
-        converged, reached, step = u.copy() if start is None else np.zeros_like(u), 0.0, 1.0
-        total = steps = 0
+        if isinstance(load, np.ndarray):
+            load = DeadLoad(load.reshape(-1))
+        before = self.at_rest if past is None else past
+        weights = step_weights(self.prony, dt)
+        tissue: list[Term] = []
+        if self.prony and (past is not None or dt > 0.0):
+            tissue = [PastStress(self, before, weights)]
+        if start is None and past is not None:
+            start = past.displacement
+        volume = float(self.weights.sum())
+        young = self.tissue.young
+        floor, noise = ROUND_OFF * young * volume ** (2 / 3), NOISE * young * volume
+        target = max(TOLERANCE * max(term.size for term in (load, *tissue)), floor)
+        u, converged = np.zeros((2, len(self.free)))
+        if start is not None:
+            u[:] = start.reshape(-1)[self.free]
+        iterations, load_steps, reached, step = 0, 0, 0.0, 1.0
         while reached < 1.0:
             fraction = min(1.0, reached + step)
-            apply(fraction)
-            status, iterations, energy, smallest = newton.newton(
-                self, u, self._work, target, reuse, MAX_ITERATIONS, False
-            )
-            total += iterations
-            steps += 1
+            potential = Potential(self, [load.at(fraction), *tissue])
+            status, made, energy, smallest = newton.newton(
+                potential, u, np.empty((4, len(u))), target, reuse, MAX_ITERATIONS, False,
+                noise=noise,
+            )  # fmt: skip
+            iterations, load_steps = iterations + made, load_steps + 1
             if status == newton.CONVERGED:
                 converged[:], reached, step = u, fraction, 2.0 * step
                 continue
@@ -550,9 +332,16 @@ class FullModel:
             if step < smallest_step:
                 raise NoEquilibrium(
                     f"load: no equilibrium found beyond {100 * reached:.0f} % of it; "
-                    f"lower the {field}"
+                    f"lower the {load.lower}"
                 )
             u[:] = converged
-        displacement = np.zeros(3 * len(self.mesh.nodes))
-        displacement[self.free] = u
-        return Equilibrium(displacement.reshape(-1, 3), total, steps, smallest), energy
+        displacement = self.filled(u).reshape(-1, 3)
+        return Equilibrium(
+            displacement=displacement,
+            energy=energy,
+            past=advanced(self, before, displacement, weights),
+            iterations=iterations,
+            load_steps=load_steps,
+            min_jacobian=smallest,
+            **load.reaction(potential, displacement.reshape(-1))._asdict(),
+        )

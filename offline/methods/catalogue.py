@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from palpate.offline.fem.model import FullModel
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods.cubatures import PointForces, point_forces
 from palpate.offline.methods.deim import Deim, PlainNewton, force_modes, sample
 from palpate.offline.methods.full import Full, Remeshed
@@ -28,7 +29,6 @@ from palpate.offline.methods.spaces import Inner, krylov, mass, modal, pod, stat
 from palpate.offline.methods.tensor_mass import TensorMass
 from palpate.offline.reduce.ritz import TANGENTIAL
 from palpate.offline.reduce.sampling import spread_points, tangents
-from palpate.offline.run.workshop import Workshop
 from palpate.shared.errors import PalpateError
 from palpate.shared.model import ReducedModel
 from palpate.shared.scene import Scene
@@ -65,7 +65,7 @@ class Training:
         Whether the methods that can are built to remember what happened before.
     """
 
-    workshop: Workshop
+    problem: FullProblem
     snapshots: Snapshots
     atlas: ReducedModel | None = None
     seed: int = 0
@@ -75,11 +75,11 @@ class Training:
     @property
     def model(self) -> FullModel:
         """The full model, to train with."""
-        return self.workshop.model
+        return self.problem.model
 
     def own_model(self) -> FullModel:
         """A full model that nobody else solves with, so that it keeps its factorisation."""
-        return FullModel.of(self.workshop.scene, self.workshop.mesh)
+        return FullModel.of(self.problem.scene, self.problem.mesh)
 
     def rng(self, *stage: int) -> np.random.Generator:
         """Random numbers of a stage, the same whatever was built before."""
@@ -92,12 +92,12 @@ class Training:
 
     @cached_property
     def _footprints(self) -> Array:
-        return spread_points(self.workshop.surface, FOOTPRINTS, self.rng())
+        return spread_points(self.problem.surface, FOOTPRINTS, self.rng())
 
     def loads(self, footprints: int) -> Array:
         """Unit pressures (free dofs, 3 footprints) along each axis, spread over the surface."""
         points = self._footprints[:footprints]
-        unit = [np.kron(self.workshop.unit_load(x)[0][:, None], np.eye(3)) for x in points]
+        unit = [np.kron(self.problem.unit_load(x)[0][:, None], np.eye(3)) for x in points]
         return np.hstack(unit)[self.model.free]
 
     def pod(self, size: int, inner: Inner = "energy") -> Array:
@@ -107,12 +107,12 @@ class Training:
     @cached_property
     def compliance(self) -> Array:
         """All modes of the linear responses to what can load the surface."""
-        return compliance(self.workshop)
+        return compliance(self.problem)
 
     def point_forces(self, basis: Array) -> PointForces:
         """What a cubature of a basis is fitted to."""
-        cases = [Case.of(self.workshop, load) for load in self.snapshots.loads[:CASES]]
-        return point_forces(Galerkin(self.workshop, basis), cases, self.rng(basis.shape[1]))
+        cases = [Case.of(self.problem, load) for load in self.snapshots.loads[:CASES]]
+        return point_forces(Galerkin(self.problem, basis), cases, self.rng(basis.shape[1]))
 
 
 def build(name: str, size: float, training: Training) -> Method:
@@ -134,7 +134,7 @@ def build(name: str, size: float, training: Training) -> Method:
 
 
 def _every_point(training: Training, basis: Array) -> Method:
-    return Galerkin(training.workshop, basis, in_time=training.in_time)
+    return Galerkin(training.problem, basis, in_time=training.in_time)
 
 
 def _krylov(size: int, training: Training, moments: int = MOMENTS) -> Method:
@@ -146,50 +146,50 @@ def _pod_ecm(size: int, training: Training, points: int = POINTS_PER_MODE) -> Me
     basis = training.pod(size)
     forces = training.point_forces(basis)
     cubature = forces.by_point(points * basis.shape[1], training.rng(size))
-    return Galerkin(training.workshop, basis, cubature)
+    return Galerkin(training.problem, basis, cubature)
 
 
 def _pod_ecsw(size: int, training: Training) -> Method:
     basis = training.pod(size)
     forces = training.point_forces(basis)
     cubature = forces.by_element(ELEMENTS_PER_MODE * basis.shape[1], training.rng(size))
-    return Galerkin(training.workshop, basis, cubature)
+    return Galerkin(training.problem, basis, cubature)
 
 
 def _deim(size: int, training: Training, per_mode: int = 1) -> Method:
     model, basis = training.model, training.pod(size)
     snapshots = training.snapshots.displacements[:, model.free].astype(float)
     modes = force_modes(model, snapshots, basis.shape[1])
-    return Deim(training.workshop, basis, modes, sample(modes, per_mode))
+    return Deim(training.problem, basis, modes, sample(modes, per_mode))
 
 
 # --- a basis for the load at hand ----------------------------------------------------------------
 
 
 def _ritz_at_hand(size: int, training: Training) -> Method:
-    model, M, nodes = training.own_model(), training.mass, len(training.workshop.mesh.nodes)
+    model, M, nodes = training.own_model(), training.mass, len(training.problem.mesh.nodes)
 
     def space(case: Case) -> Array:
         return krylov(model, M, case.load(nodes).reshape(-1, 1)[model.free], size)
 
-    return GalerkinAtHand(training.workshop, size, space)
+    return GalerkinAtHand(training.problem, size, space)
 
 
 def _derivatives(size: int, training: Training) -> Method:
-    model, workshop = training.own_model(), training.workshop
+    model, problem = training.own_model(), training.problem
 
     def space(case: Case) -> Array:
-        return static_derivatives(model, loads_about(workshop, case)[model.free], size)
+        return static_derivatives(model, loads_about(problem, case)[model.free], size)
 
-    return GalerkinAtHand(workshop, size, space)
+    return GalerkinAtHand(problem, size, space)
 
 
-def loads_about(workshop: Workshop, case: Case) -> Array:
+def loads_about(problem: FullProblem, case: Case) -> Array:
     """The load of a case and two across it, (3 n, 3) mN.
 
     Those across turn every contact's force to the side, as far as it is tilted in use.
     """
-    total = np.zeros((len(workshop.mesh.nodes), 3, 3))
+    total = np.zeros((len(problem.mesh.nodes), 3, 3))
     for contact, share in zip(case.contacts, case.shares, strict=True):
         frame = np.array([contact.direction, *tangents(contact.direction)])
         frame[1:] *= TANGENTIAL
@@ -205,12 +205,12 @@ def _shipped(size: int, training: Training, way: Way = "cold") -> Method:
         raise PalpateError("artifact: the training context has none")
     if way == "cold" and training.in_time:
         way = "in time"
-    return Shipped(training.workshop, training.atlas, way)
+    return Shipped(training.problem, training.atlas, way)
 
 
 def _full(factor: float, training: Training) -> Method:
     if factor == 1:
-        return Full(training.workshop)
+        return Full(training.problem)
     if training.scene is None:
         raise PalpateError("full: other meshes need the scene with its files")
     return Remeshed(training.scene, factor)
@@ -222,7 +222,7 @@ BUILDERS: dict[str, Callable[[int, Training], Method]] = {
     "krylov": _krylov,
     "pod": lambda size, t: _every_point(t, t.pod(size)),
     "pod-euclidean": lambda size, t: _every_point(t, t.pod(size, "euclidean")),
-    "pod, no line search": lambda size, t: PlainNewton(t.workshop, t.pod(size)),
+    "pod, no line search": lambda size, t: PlainNewton(t.problem, t.pod(size)),
     "pod-ecm": _pod_ecm,
     "pod-ecm, 1 point a mode": partial(_pod_ecm, points=1),
     "pod-ecsw": _pod_ecsw,
@@ -230,8 +230,8 @@ BUILDERS: dict[str, Callable[[int, Training], Method]] = {
     "pod-gappy": partial(_deim, per_mode=SAMPLES_PER_MODE),
     "ritz-at-hand": _ritz_at_hand,
     "derivatives": _derivatives,
-    "linear": lambda size, t: Linear(t.workshop, t.compliance[:, :size]),
-    "regression": lambda size, t: Regression(t.workshop, t.pod(size), t.snapshots),
+    "linear": lambda size, t: Linear(t.problem, t.compliance[:, :size]),
+    "regression": lambda size, t: Regression(t.problem, t.pod(size), t.snapshots),
     "artifact": _shipped,
     "artifact, warm": partial(_shipped, way="warm"),
     "artifact, tip": partial(_shipped, way="tip"),
@@ -240,7 +240,7 @@ BUILDERS: dict[str, Callable[[int, Training], Method]] = {
 
 MESHED: dict[str, Callable[[float, Training], Method]] = {
     "full": _full,
-    "mass-spring": lambda factor, t: MassSpring(t.workshop, scaled(t.workshop.scene, factor)),
-    "tensor-mass": lambda factor, t: TensorMass(t.workshop, scaled(t.workshop.scene, factor)),
+    "mass-spring": lambda factor, t: MassSpring(t.problem, scaled(t.problem.scene, factor)),
+    "tensor-mass": lambda factor, t: TensorMass(t.problem, scaled(t.problem.scene, factor)),
 }
 """Methods with a mesh of their own, whose size is the factor on the divisions of the scene's."""

@@ -83,7 +83,7 @@ def point_forces(reduced: Galerkin, cases: Iterable[Case], rng: np.random.Genera
             looks /= np.sqrt(LOOKS) * np.linalg.norm(q)
             if stress_points(reduced.content, state) > 0.0:
                 columns.append(_contributions(reduced, looks))
-    weights = reduced.workshop.model.weights
+    weights = reduced.problem.model.weights
     contributions = np.hstack(columns)[: weights.size]
     return PointForces(contributions, weights.ravel(), weights.shape[1])
 

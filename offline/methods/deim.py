@@ -27,6 +27,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from palpate.offline.fem.model import FullModel
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods.galerkin import (
     TOLERANCE,
     Content,
@@ -37,7 +38,6 @@ from palpate.offline.methods.galerkin import (
     stress_points,
 )
 from palpate.offline.methods.method import Answer, Case
-from palpate.offline.run.workshop import Workshop
 from palpate.shared.compiled import bind
 from palpate.shared.reduced.points import STATE, project
 
@@ -133,7 +133,7 @@ class PlainNewton(Galerkin):
 
     Parameters
     ----------
-    workshop, basis, cubature
+    problem, basis, cubature
         See ``Galerkin``.
     functions : ndarray, shape (3 nodes, m), mm, optional
         Test functions; those of the basis if absent, which is Galerkin's method.
@@ -141,12 +141,12 @@ class PlainNewton(Galerkin):
 
     def __init__(
         self,
-        workshop: Workshop,
+        problem: FullProblem,
         basis: Array,
         cubature: Cubature | None = None,
         functions: Array | None = None,
     ) -> None:
-        super().__init__(workshop, basis, cubature)
+        super().__init__(problem, basis, cubature)
         self.label, points = "no line search", self.content.points
         test = np.zeros_like(points.gradients)
         if functions is None:
@@ -176,13 +176,13 @@ class Deim(PlainNewton):
         Of the force.
     """
 
-    def __init__(self, workshop: Workshop, basis: Array, modes: Array, samples: Samples) -> None:
-        model, dofs = workshop.model, workshop.model.free[samples.dofs]
+    def __init__(self, problem: FullProblem, basis: Array, modes: Array, samples: Samples) -> None:
+        model, dofs = problem.model, problem.model.free[samples.dofs]
         touched = np.isin(model.connectivity, dofs // 3).any(axis=1)
         own = np.arange(model.weights.shape[1])
         points = (len(own) * np.flatnonzero(touched)[:, None] + own).ravel()
         functions = np.zeros((3 * len(model.mesh.nodes), basis.shape[1]))
         functions[dofs] = (basis.T @ modes @ samples.fit).T
         cubature = Cubature(points, model.weights.ravel()[points])
-        super().__init__(workshop, basis, cubature, functions)
+        super().__init__(problem, basis, cubature, functions)
         self.label = f"{basis.shape[1]} modes, {len(dofs)} sampled dofs"

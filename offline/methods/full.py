@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.fem.model import History, NoEquilibrium
+from palpate.offline.fem.model import NoEquilibrium
+from palpate.offline.fem.problem import FullProblem, Load
+from palpate.offline.fem.terms import Past
 from palpate.offline.methods.lattice import coordinates, interpolation, lattice
 from palpate.offline.methods.method import Answer, Case, Method
-from palpate.offline.run.workshop import Load, Workshop
 from palpate.shared.scene import Scene, divisions_of
 
 Array = NDArray[np.float64]
@@ -17,29 +18,29 @@ Array = NDArray[np.float64]
 class Full(Method):
     """Newton's method on every free degree of freedom, from the last answer."""
 
-    def __init__(self, workshop: Workshop) -> None:
-        super().__init__(workshop, len(workshop.model.free), "full")
+    def __init__(self, problem: FullProblem) -> None:
+        super().__init__(problem, len(problem.model.free), "full")
 
-    def at_rest(self) -> History:
+    def at_rest(self) -> Past:
         """See ``Method``."""
-        return self.workshop.model.at_rest
+        return self.problem.model.at_rest
 
-    def step(self, state: History, case: Case, dt: float = 0.0) -> Answer:
+    def step(self, state: Past, case: Case, dt: float = 0.0) -> Answer:
         """See ``Method``."""
         load = case.load(len(state.displacement))
         try:
-            found, after = self.workshop.model.step(state, load, dt)
+            found = self.problem.model.solve(load, state, dt)
         except NoEquilibrium:
             return Answer(state, False)
-        return Answer(after, True, found.iterations)
+        return Answer(found.past, True, found.iterations)
 
-    def field(self, state: History) -> Array:
+    def field(self, state: Past) -> Array:
         """See ``Method``."""
         return state.displacement
 
-    def von_mises(self, state: History) -> Array:
+    def von_mises(self, state: Past) -> Array:
         """See ``Method``."""
-        return self.workshop.von_mises_after(state)
+        return self.problem.von_mises(state.displacement, state)
 
 
 def divided(scene: Scene, factor: float) -> Scene:
@@ -65,10 +66,10 @@ class Remeshed(Method):
 
     def __init__(self, scene: Scene, factor: float) -> None:
         other = divided(scene, factor)
-        self._other = Workshop(other)
+        self._other = FullProblem(other)
         label = f"mesh of {' x '.join(map(str, divisions_of(other.geometry)))}"
-        super().__init__(Workshop(scene), len(self._other.model.free), label)
-        at = coordinates(self.workshop.mesh, lattice(scene))
+        super().__init__(FullProblem(scene), len(self._other.model.free), label)
+        at = coordinates(self.problem.mesh, lattice(scene))
         self._to_scene = interpolation(at, lattice(other), self._other.mesh.elements)
 
     def step(self, state: Array | None, case: Case, dt: float = 0.0) -> Answer:
@@ -86,7 +87,7 @@ class Remeshed(Method):
         The accessible surface of the other mesh ends at other faces: projected onto that, a
         contact on the rim would move.
         """
-        x, normal, _ = self.workshop.surface.project(contact.position)
+        x, normal, _ = self.problem.surface.project(contact.position)
         nodal = self._other.unit_load_at(x, normal)
         return contact.pressure * nodal[:, None] * contact.direction
 

@@ -15,10 +15,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from palpate.offline.fem.model import POINTWISE, FullModel, History
+from palpate.offline.fem.model import POINTWISE, FullModel
+from palpate.offline.fem.problem import FullProblem
+from palpate.offline.fem.terms import Past
 from palpate.offline.methods.method import Answer, Case, Method
 from palpate.offline.reduce.viscous import deviatoric_stiffness
-from palpate.offline.run.workshop import Workshop
 from palpate.shared.compiled import bind, bind_compiled
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.tensors import SYMMETRIC
@@ -192,18 +193,18 @@ class Galerkin(Method):
 
     def __init__(
         self,
-        workshop: Workshop,
+        problem: FullProblem,
         basis: Array,
         cubature: Cubature | None = None,
         in_time: bool = False,
         accurate: float = TOLERANCE,
     ) -> None:
-        model, m = workshop.model, basis.shape[1]
+        model, m = problem.model, basis.shape[1]
         if model.element not in POINTWISE:
             raise ValueError(f"{model.element}: its points share a dilatation")
         cubature = cubature or Cubature.full(model)
         self.points, self._accurate = cubature.points, accurate
-        super().__init__(workshop, m, f"{m} modes, {len(self.points)} points")
+        super().__init__(problem, m, f"{m} modes, {len(self.points)} points")
         element = self.points // model.weights.shape[1]
         rows, count = -(-m // 4) * 4, -(-len(self.points) // LANES) * LANES
         fill = (0, count - len(self.points))
@@ -231,7 +232,7 @@ class Galerkin(Method):
 
     def adopt(self, basis: Array) -> None:
         """Take another basis of no more modes."""
-        model, m, content = self.workshop.model, basis.shape[1], self.content
+        model, m, content = self.problem.model, basis.shape[1], self.content
         content.modes[model.free, :m] = basis
         content.modes[:, m:] = 0.0
         content.points.gradients[m:] = 0.0
@@ -242,7 +243,7 @@ class Galerkin(Method):
 
     def gradients_of(self, functions: Array, out: Field) -> None:
         """Write the gradients of displacements (3 nodes, m) mm at the points."""
-        model = self.workshop.model
+        model = self.problem.model
         point_gradients(model.connectivity, model.gradients, self.points, functions, out)
 
     def at_rest(self) -> Array | None:
@@ -257,7 +258,7 @@ class Galerkin(Method):
 
     def step(self, state: Array | None, case: Case, dt: float = 0.0) -> Answer:
         """See ``Method``."""
-        past, prony = self.content.past, self.workshop.model.prony
+        past, prony = self.content.past, self.problem.model.prony
         if isinstance(past, Remembering):
             for own, weights in zip(past.time, step_weights(prony, dt), strict=True):
                 own[:] = weights
@@ -283,23 +284,24 @@ class Galerkin(Method):
         """See ``Method``."""
         if state is None or not isinstance(self.content.past, Remembering):
             return super().von_mises(state)
-        return self.workshop.von_mises_after(self.history(state))
+        past = self.history(state)
+        return self.problem.von_mises(past.displacement, past)
 
     def opened(self, record: Array) -> Memory:
         """Views of a record."""
         points = self.content.points
-        sizes = len(self.workshop.model.prony), len(points.gradients), len(points.weights)
+        sizes = len(self.problem.model.prony), len(points.gradients), len(points.weights)
         memory: Memory = opened(record, *sizes)
         return memory
 
-    def history(self, record: Array) -> History:
+    def history(self, record: Array) -> Past:
         """A record as the full model's history, without the means that only energies need."""
-        elements, own = self.workshop.model.weights.shape
+        elements, own = self.problem.model.weights.shape
         histories = self.opened(record).points
         terms = len(histories)
         tiles = histories.reshape(terms, -1, SYMMETRIC, LANES).transpose(0, 1, 3, 2)
         points = tiles.reshape(terms, -1, SYMMETRIC)[:, : elements * own].astype(float)
-        return History(self.field(record), points.reshape(terms, elements, own, SYMMETRIC))
+        return Past(self.field(record), points.reshape(terms, elements, own, SYMMETRIC))
 
     def tangent(self, q: Array) -> Array:
         """Tangent (r, r) of elastic tissue at coordinates."""
@@ -323,13 +325,13 @@ class GalerkinAtHand(Galerkin):
         Gives the basis (free dofs, <= size) of a case.
     """
 
-    def __init__(self, workshop: Workshop, size: int, space: Callable[[Case], Array]) -> None:
-        super().__init__(workshop, np.zeros((len(workshop.model.free), size)))
+    def __init__(self, problem: FullProblem, size: int, space: Callable[[Case], Array]) -> None:
+        super().__init__(problem, np.zeros((len(problem.model.free), size)))
         self._space, self.label = space, f"{size} vectors of the load at hand"
 
     def step(self, state: Any, case: Case, dt: float = 0.0) -> Answer:
         """See ``Method``."""
-        free = self.workshop.model.free
+        free = self.problem.model.free
         basis = self._space(case) if case.forces.any() else np.empty((len(free), 0))
         self.adopt(basis)
         answer = super().step(None, case)
@@ -339,6 +341,6 @@ class GalerkinAtHand(Galerkin):
     def field(self, state: Any) -> Array:
         """See ``Method``."""
         basis, q = state
-        u = np.zeros(self.workshop.mesh.nodes.size)
-        u[self.workshop.model.free] = basis @ q
+        u = np.zeros(self.problem.mesh.nodes.size)
+        u[self.problem.model.free] = basis @ q
         return u.reshape(-1, 3)

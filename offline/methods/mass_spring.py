@@ -24,10 +24,10 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods.lattice import Divisions, Ints
 from palpate.offline.methods.relaxation import Relaxed
 from palpate.offline.methods.tetrahedra import Tetrahedra, edges_of, stiffness
-from palpate.offline.run.workshop import Workshop
 
 Array = NDArray[np.float64]
 
@@ -59,16 +59,16 @@ class MassSpring(Relaxed):
 
     forcing = 0.1
 
-    def __init__(self, workshop: Workshop, divisions: Divisions) -> None:
-        mesh = Tetrahedra.of(workshop, divisions)
+    def __init__(self, problem: FullProblem, divisions: Divisions) -> None:
+        mesh = Tetrahedra.of(problem, divisions)
         ends = edges_of(mesh.both_cuts)
-        super().__init__(workshop, mesh, mesh.both_cuts, f"{len(ends)} springs")
+        super().__init__(problem, mesh, mesh.both_cuts, f"{len(ends)} springs")
         self.ends = ends.astype(np.int32)
         self._vectors = mesh.nodes[ends[:, 1]] - mesh.nodes[ends[:, 0]]
         self._lengths = np.linalg.norm(self._vectors, axis=1)
         pairs = ends, ends[:, ::-1]
         self._ranks = np.stack([self.stencil.ranks(pair) for pair in pairs], axis=1)
-        self.stiffness = identify(mesh.nodes, mesh.both_cuts, ends, workshop.scene.tissue.young)
+        self.stiffness = identify(mesh.nodes, mesh.both_cuts, ends, problem.scene.tissue.young)
         self.factor = self.stiffening()
         self.stiffness *= self.factor
 

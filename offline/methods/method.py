@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.run.workshop import Load, Workshop
+from palpate.offline.fem.problem import FullProblem, Load
 
 Array = NDArray[np.float64]
 
@@ -43,9 +43,9 @@ class Case:
     radius: float | None = None
 
     @classmethod
-    def of(cls, workshop: Workshop, *contacts: Load) -> Case:
+    def of(cls, problem: FullProblem, *contacts: Load) -> Case:
         """Case of one or more pressed footprints on a scene's body."""
-        return cls.pressed(contacts, [workshop.unit_load(x.position)[0] for x in contacts])
+        return cls.pressed(contacts, [problem.unit_load(x.position)[0] for x in contacts])
 
     @classmethod
     def pressed(
@@ -115,7 +115,7 @@ class Method(ABC):
 
     Parameters
     ----------
-    workshop : Workshop
+    problem : FullProblem
         Of the scene.
     unknowns : int
         Numbers solved for in a step.
@@ -123,8 +123,8 @@ class Method(ABC):
         Describes the size of the method, for people.
     """
 
-    def __init__(self, workshop: Workshop, unknowns: int, label: str) -> None:
-        self.workshop, self.unknowns, self.label = workshop, unknowns, label
+    def __init__(self, problem: FullProblem, unknowns: int, label: str) -> None:
+        self.problem, self.unknowns, self.label = problem, unknowns, label
 
     def at_rest(self) -> Any:
         """State of a body to which nothing has happened: None, unless a method remembers more."""
@@ -149,11 +149,11 @@ class Method(ABC):
 
     def displacement(self, state: Any) -> Array:
         """Nodal displacement (n, 3) mm of an answer, or at rest."""
-        return np.zeros_like(self.workshop.mesh.nodes) if state is None else self.field(state)
+        return np.zeros_like(self.problem.mesh.nodes) if state is None else self.field(state)
 
     def von_mises(self, state: Any) -> Array:
         """Nodal von Mises stress (n,) kPa."""
-        return self.workshop.von_mises(self.displacement(state))
+        return self.problem.von_mises(self.displacement(state))
 
     def solve(self, case: Case) -> Answer:
         """Answer a case from rest: one step of no time."""

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.methods.galerkin import reduce_load
 from palpate.offline.methods.method import Answer, Case, Method, Snapshots
 from palpate.offline.reduce.ritz import energy_pod
-from palpate.offline.run.workshop import Load, Workshop
 
 Array = NDArray[np.float64]
 
@@ -22,38 +22,38 @@ HELD_BACK = 5
 """One in this many samples is held back to choose kernel and lengths by."""
 
 
-def compliance(workshop: Workshop) -> Array:
+def compliance(problem: FullProblem) -> Array:
     """Modes (free dofs, m) of the linear responses to whatever can load the surface.
 
     All of them hold every response exactly, and the leading ones the smooth responses to
     footprints.  Since they are orthonormal in the energy at rest, ``V V^T f`` is the best
     approximation of ``K^-1 f`` in them: a query needs nothing else.
     """
-    model = workshop.model
-    nodes = np.unique(workshop.body.boundary.nodes[_within_reach(workshop)])
+    model = problem.model
+    nodes = np.unique(problem.body.boundary.nodes[_within_reach(problem)])
     loaded = np.flatnonzero(np.isin(model.free // 3, nodes))
     unit = np.zeros((len(model.free), len(loaded)))
     unit[loaded, np.arange(len(loaded))] = 1.0
     return energy_pod(model, model.solve_linear(unit), len(loaded))[0]
 
 
-def _within_reach(workshop: Workshop) -> NDArray[np.int64]:
+def _within_reach(problem: FullProblem) -> NDArray[np.int64]:
     """Integration points of the boundary that some footprint can cover."""
-    vertices = cKDTree(workshop.surface.vertices)
+    vertices = cKDTree(problem.surface.vertices)
     # no point of a triangle is farther from a vertex than its longest edge
-    corners = workshop.surface.vertices[workshop.surface.triangles]
+    corners = problem.surface.vertices[problem.surface.triangles]
     edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
-    distance, _ = vertices.query(workshop.body.boundary.points)
-    return np.flatnonzero(distance <= workshop.scene.endoscope.radius + edge)
+    distance, _ = vertices.query(problem.body.boundary.points)
+    return np.flatnonzero(distance <= problem.scene.endoscope.radius + edge)
 
 
 class _InModes(Method):
     """Whatever gives coordinates of modes (free dofs, m) mm, which are the state."""
 
-    def __init__(self, workshop: Workshop, basis: Array, label: str) -> None:
-        super().__init__(workshop, basis.shape[1], label)
-        self._modes = np.zeros((workshop.mesh.nodes.size, self.unknowns))
-        self._modes[workshop.model.free] = basis
+    def __init__(self, problem: FullProblem, basis: Array, label: str) -> None:
+        super().__init__(problem, basis.shape[1], label)
+        self._modes = np.zeros((problem.mesh.nodes.size, self.unknowns))
+        self._modes[problem.model.free] = basis
 
     def field(self, state: Array) -> Array:
         """See ``Method``."""
@@ -71,8 +71,8 @@ class Linear(_InModes):
         The leading modes of ``compliance``.
     """
 
-    def __init__(self, workshop: Workshop, basis: Array) -> None:
-        super().__init__(workshop, basis, f"{basis.shape[1]} modes")
+    def __init__(self, problem: FullProblem, basis: Array) -> None:
+        super().__init__(problem, basis, f"{basis.shape[1]} modes")
 
     def step(self, state: Array | None, case: Case, dt: float = 0.0) -> Answer:
         """See ``Method``."""
@@ -159,10 +159,10 @@ class Regression(_InModes):
         Orthonormal in the energy at rest.
     """
 
-    def __init__(self, workshop: Workshop, basis: Array, snapshots: Snapshots) -> None:
+    def __init__(self, problem: FullProblem, basis: Array, snapshots: Snapshots) -> None:
         label = f"{basis.shape[1]} modes of {len(snapshots.loads)} samples"
-        super().__init__(workshop, basis, label)
-        model = workshop.model
+        super().__init__(problem, basis, label)
+        model = problem.model
         coordinates = snapshots.displacements[:, model.free] @ (model.rest_stiffness @ basis)
         given = np.array([_features(load) for load in snapshots.loads])
         self._interpolant = fit_interpolant(given, coordinates)

@@ -21,11 +21,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods.lattice import Ints
 from palpate.offline.methods.method import Answer, Case, Method
 from palpate.offline.methods.tetrahedra import Tetrahedra, edges_of
 from palpate.offline.reduce.sampling import random_points
-from palpate.offline.run.workshop import Workshop
 from palpate.shared.mechanics.tensors import cofactor, det, load, scale, store
 
 Array = NDArray[np.float64]
@@ -76,8 +76,8 @@ class Relaxed(Method):
 
     forcing: float
 
-    def __init__(self, workshop: Workshop, mesh: Tetrahedra, elements: Ints, label: str) -> None:
-        super().__init__(workshop, 3 * mesh.free, label)
+    def __init__(self, problem: FullProblem, mesh: Tetrahedra, elements: Ints, label: str) -> None:
+        super().__init__(problem, 3 * mesh.free, label)
         self.mesh = mesh
         self.stencil = Stencil(edges_of(elements), len(mesh.nodes), mesh.free)
         self._load = np.zeros((3, len(mesh.nodes)))
@@ -106,13 +106,13 @@ class Relaxed(Method):
 
         It minimises the sum of squared differences from the full model, over loads and nodes.
         """
-        model, mesh = self.workshop.model, self.mesh
-        rng = np.random.default_rng(self.workshop.scene.seed)
+        model, mesh = self.problem.model, self.mesh
+        rng = np.random.default_rng(self.problem.scene.seed)
         self.linearise(np.zeros((3, len(mesh.nodes))))
         own, step = np.zeros((3, len(mesh.nodes))), np.zeros((3, mesh.free))
         both, square = 0.0, 0.0
-        for point in random_points(self.workshop.surface, LOADS, rng):
-            weights, normal = self.workshop.unit_load(point)
+        for point in random_points(self.problem.surface, LOADS, rng):
+            weights, normal = self.problem.unit_load(point)
             load = -weights[:, None] * normal
             wanted = np.zeros(load.size)
             wanted[model.free] = model.solve_linear(load.ravel()[model.free])

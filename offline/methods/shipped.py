@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods.method import Answer, Case, Method
-from palpate.offline.run.workshop import Workshop
 from palpate.shared.answer import Answer as Found
 from palpate.shared.errors import QueryError
 from palpate.shared.model import ReducedModel
@@ -34,11 +34,11 @@ class Shipped(Method):
         points, asked as if there were no past.
     """
 
-    def __init__(self, workshop: Workshop, atlas: ReducedModel, way: Way = "cold") -> None:
+    def __init__(self, problem: FullProblem, atlas: ReducedModel, way: Way = "cold") -> None:
         label = {"cold": "artifact", "in time": "artifact"}.get(way, f"artifact, {way}")
         tips = atlas.models.tips
         unknowns = tips.modes if way == "tip" and tips is not None else atlas.models.mix
-        super().__init__(workshop, unknowns.shape[-1], label)
+        super().__init__(problem, unknowns.shape[-1], label)
         self._atlas, self._way = atlas, way
         self._warm = None if way == "cold" else atlas.new_warm()
 

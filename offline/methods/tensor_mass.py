@@ -16,10 +16,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods.lattice import Divisions
 from palpate.offline.methods.relaxation import Relaxed
 from palpate.offline.methods.tetrahedra import Tetrahedra, stiffness
-from palpate.offline.run.workshop import Workshop
 
 Array = NDArray[np.float64]
 
@@ -44,11 +44,11 @@ class TensorMass(Relaxed):
 
     forcing = 1e-4  # single precision reaches no less
 
-    def __init__(self, workshop: Workshop, divisions: Divisions) -> None:
-        mesh = Tetrahedra.of(workshop, divisions)
+    def __init__(self, problem: FullProblem, divisions: Divisions) -> None:
+        mesh = Tetrahedra.of(problem, divisions)
         label = f"linear, {len(mesh.elements)} tetrahedra"
-        super().__init__(workshop, mesh, mesh.elements, label)
-        K = stiffness(mesh.nodes, mesh.elements, workshop.scene.tissue.young, POISSON)
+        super().__init__(problem, mesh, mesh.elements, label)
+        K = stiffness(mesh.nodes, mesh.elements, problem.scene.tissue.young, POISSON)
         blocks = K.tobsr((3, 3))
         a, b = np.repeat(np.arange(len(mesh.nodes)), np.diff(blocks.indptr)), blocks.indices
         rank = self.stencil.ranks(np.stack([a, b], axis=1))

@@ -15,6 +15,7 @@ from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.sparse.linalg import splu
 
 from palpate.offline.fem.mesh import Mesh
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods.lattice import (
     SAME,
     Divisions,
@@ -28,7 +29,6 @@ from palpate.offline.methods.lattice import (
     shape_functions,
 )
 from palpate.offline.methods.method import Case
-from palpate.offline.run.workshop import Workshop
 from palpate.shared.errors import PalpateError
 from palpate.shared.geometry.elements import gauss, quadrilateral, shape
 from palpate.shared.mechanics.tissue import lame
@@ -80,7 +80,7 @@ class Tetrahedra:
     carrier: csr_matrix
 
     @classmethod
-    def of(cls, workshop: Workshop, divisions: Divisions) -> Tetrahedra:
+    def of(cls, problem: FullProblem, divisions: Divisions) -> Tetrahedra:
         """Cut the body of a scene, ``divisions`` (3,) cells along the axes of its lattice.
 
         Raises
@@ -88,7 +88,7 @@ class Tetrahedra:
         PalpateError
             If the map turns a tetrahedron inside out.
         """
-        mesh, own = workshop.mesh, lattice(workshop.scene)
+        mesh, own = problem.mesh, lattice(problem.scene)
         held, N = shape_functions(grid(divisions), own, mesh.elements)
         nodes = np.einsum("qa,qai->qi", N, mesh.nodes[held])
         # on a clamped face the functions of the other nodes vanish

@@ -20,6 +20,9 @@ from palpate.shared.reduced.points import LANES, add_past_stress, nonlinear_stre
 
 Array = NDArray[np.float64]
 
+RESIDUAL_DAMPING = 0.15
+"""Of the fit of the residuals' logs: they scatter about any smooth function."""
+
 EXACT = 1e-9
 """Relative residual that needs no further point."""
 
@@ -243,3 +246,15 @@ def damped_fit(A: Array, B: Array, damping: float = 1e-4) -> Array:
     A = A / scale
     normal = A.T @ A + damping**2 * len(A) * np.eye(A.shape[1])
     return np.asarray(solve(normal, A.T @ B, assume_a="pos")) / scale[:, None]
+
+
+def fit_of_residuals(A: Array, residuals: Array) -> Array:
+    """Logs of residuals (k,) as sums of features A (k, f), the first of which is one; (f,).
+
+    Residuals that are zero or infinite do not count.
+    """
+    kept = (residuals > 0) & np.isfinite(residuals)
+    logs = np.log(residuals[kept])
+    fitted = damped_fit(A[kept], (logs - logs.mean())[:, None], RESIDUAL_DAMPING)[:, 0]
+    fitted[0] += logs.mean()
+    return fitted

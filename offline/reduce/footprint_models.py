@@ -2,37 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.fem.model import FullModel
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.cubature import (
     combined,
     compress,
     damped_fit,
+    fit_of_residuals,
     nonlinear_forces,
     nonnegative,
     point_forces,
     with_linear_forces,
 )
-from palpate.offline.reduce.ritz import RITZ_VECTORS, Footprint, local_modes, whole_numbers
+from palpate.offline.reduce.patches import PatchResult, PatchTask, RegionResult, local_models
+from palpate.offline.reduce.ritz import RITZ_VECTORS, local_modes, whole_numbers
 from palpate.offline.reduce.sampling import cone, fewer, tangents
-from palpate.offline.reduce.tip_models import TipResult, compile_tip_query, train_tip
-from palpate.shared.geometry.surface import Surface
-from palpate.shared.local_models import Body, LocalModels
+from palpate.offline.reduce.tip_models import compile_tip_query, train_tip
+from palpate.shared.local_models import LocalModels
 from palpate.shared.mechanics import newton
-from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH, footprint, pressure_limit
+from palpate.shared.mechanics.footprint import LIMIT_FIELDS, pressure_limit
 from palpate.shared.mechanics.tissue import Law
 from palpate.shared.reduced.features import (
-    CHANGES,
     CHANGING,
-    LOAD_FEATURES,
     RESIDUAL_FEATURES,
-    TANGENT_FEATURES,
     residual_features,
 )
 from palpate.shared.reduced.outcome import PRESS_FEATURES
@@ -40,7 +38,7 @@ from palpate.shared.reduced.points import LANES, STATE, increments, linearise
 from palpate.shared.reduced.press import place, press
 from palpate.shared.reduced.terms import Elastic
 from palpate.shared.reduced.workspace import press_workspace
-from palpate.shared.scene import Scene, Size
+from palpate.shared.scene import Scene
 from palpate.shared.tables import press_models
 
 Array = NDArray[np.float64]
@@ -69,9 +67,6 @@ FAINT = 0.1
 
 RESIDUAL_LOADS = 64
 
-RESIDUAL_DAMPING = 0.15
-"""Of the fit of their logs: they scatter about any smooth function."""
-
 DEFECT_LOADS, DEFECT_DAMPING = 240, 0.1
 """Equilibria that the defect is fitted to, and the damping of the fit: undamped it goes astray at
 the ends of the range, where it is largest."""
@@ -91,92 +86,6 @@ This, ``LOADS`` and ``RESIDUAL_LOADS`` are for the usual tolerance; see ``reduce
 """
 
 
-@dataclass(frozen=True)
-class RegionResult:
-    """Basis of a region, (M, 3 n) int16 in steps (M,), and what patches learn from.
-
-    ``orthonormal`` (M, M) holds, as columns in the basis, modes orthonormal in the energy of the
-    rest state; ``ritz`` (k, M, 19 or more) are Ritz vectors in those, of the relaxed tissue last.
-    """
-
-    basis: NDArray[np.int16]
-    steps: NDArray[np.float32]
-    orthonormal: NDArray[np.float32]
-    ritz: NDArray[np.float32]
-
-    def truncate(self, modes: int) -> RegionResult:
-        """The leading modes; ``orthonormal`` is triangular, so its leading block stays right."""
-        return RegionResult(
-            self.basis[:modes],
-            self.steps[:modes],
-            self.orthonormal[:modes, :modes],
-            self.ritz[:, :modes],
-        )
-
-
-@dataclass(frozen=True)
-class PatchTask:
-    """What a patch is trained from.
-
-    Attributes
-    ----------
-    centre, normal : ndarray, shape (3,)
-    pressure : float, kPa
-        Scale of the load.
-    footprints : list of Footprint
-        In and round the patch; it learns from their Ritz vectors.
-    contacts, normals : ndarray, shape (c, 3)
-        Contact points the patch answers for.
-    ranges : ndarray, shape (c, LIMIT_FIELDS)
-        Load range there.
-    extent, blend : float, mm
-    size : Size
-    seed : int
-    """
-
-    centre: Array
-    normal: Array
-    pressure: float
-    footprints: list[Footprint]
-    contacts: Array
-    normals: Array
-    ranges: Array
-    extent: float
-    blend: float
-    size: Size
-    seed: int
-
-
-@dataclass(frozen=True)
-class PatchResult:
-    """A trained patch; shapes as in ``shared.tables.LocalModels``."""
-
-    frame: Array
-    whole: NDArray[np.int16]
-    mix: NDArray[np.float32]
-    points: NDArray[np.int32]
-    weights: Array
-    defect: NDArray[np.float16]
-    guess: NDArray[np.float16]
-    directions: NDArray[np.float16]
-    change: NDArray[np.float16]
-    residual: Array
-    tip: TipResult | None = None
-
-    def arrays(self) -> dict[str, Any]:
-        """All by name, those under the tip after ``tip_``."""
-        tip = {} if self.tip is None else vars(self.tip)
-        own = {name: value for name, value in vars(self).items() if name != "tip"}
-        return own | {f"tip_{name}": value for name, value in tip.items()}
-
-    @classmethod
-    def of(cls, arrays: Mapping[str, Any]) -> PatchResult:
-        """Inverse of ``arrays``."""
-        tip = {k.removeprefix("tip_"): v for k, v in arrays.items() if k.startswith("tip_")}
-        own = {k: v for k, v in arrays.items() if not k.startswith("tip_")}
-        return cls(**own, tip=TipResult(**tip) if tip else None)
-
-
 class Sample(NamedTuple):
     """Answer of a local model to a training load."""
 
@@ -192,10 +101,11 @@ class Sample(NamedTuple):
 class LocalTrainer:
     """One local model by itself, which solves training loads by the compiled query."""
 
-    def __init__(self, scene: Scene, body: Body, surface: Surface, models: LocalModels) -> None:
+    def __init__(self, problem: FullProblem, models: LocalModels) -> None:
+        scene, surface = problem.scene, problem.surface
         self.radius = scene.endoscope.radius
         self.models = models
-        self.tables = press_models(body, models, scene)
+        self.tables = press_models(problem.body, models, scene)
         no_limit = np.tile(np.eye(LIMIT_FIELDS)[1:4].sum(0), (len(surface.vertices), 1))
         no_limit[:, 0] = NO_LIMIT
         self._workspace = press_workspace(
@@ -260,139 +170,77 @@ class LocalTrainer:
         return np.asarray(q @ self.nodal_modes).reshape(-1, 3)
 
 
-def compile_query(scene: Scene, body: Body, surface: Surface) -> None:
+def compile_query(problem: FullProblem) -> None:
     """Compile what local models are trained and queried with, on a model of nothing."""
-    models = LocalModels(
-        basis=np.zeros((1, LANES, 3 * len(body.nodes)), np.int16),
-        steps=np.zeros((1, LANES), np.float32),
-        region=np.zeros(1, np.int32),
-        centres=surface.vertices[:1],
-        frames=np.eye(3)[None],
-        pressures=np.ones(1),
-        whole=np.zeros((1, LANES, LANES), np.int16),
-        mix=np.zeros((1, LANES, LANES), np.float32),
-        point_from=np.array([0, 1]),
-        points=np.zeros(1, np.int32),
-        weights=np.ones(1),
-        defect=np.zeros((1, LOAD_FEATURES, LANES), np.float32),
-        guess=np.zeros((1, LOAD_FEATURES, LANES), np.float32),
-        directions=np.zeros((1, CHANGING, LANES), np.float32),
-        change=np.zeros((1, TANGENT_FEATURES, CHANGES), np.float32),
-        residuals=np.zeros((1, RESIDUAL_FEATURES)),
-        extent=1.0,
-        blend=1.0,
-        tips=None,
+    surface = problem.surface
+    stored, factors = np.zeros((LANES, LANES), np.int16), np.zeros((LANES, LANES), np.float32)
+    basis = RegionResult(
+        np.zeros((LANES, problem.mesh.nodes.size), np.int16), factors[0], factors, factors[None]
     )
-    trainer = LocalTrainer(scene, body, surface, models)
+    nothing = PatchResult.untrained(np.eye(3), stored, factors, np.zeros(1, np.int32), np.ones(1))
+    own = np.zeros(1, np.int32), surface.vertices[:1], np.ones(1)
+    models = local_models([basis], *own, [nothing], 1.0, 1.0)
+    trainer = LocalTrainer(problem, models)
     trainer.solve(surface.vertices[0], surface.normals[0], 0.0)
-    if scene.endoscope.tip:
-        compile_tip_query(body, surface, models, scene.tissue.prony)
+    if problem.scene.endoscope.tip:
+        compile_tip_query(problem, models)
 
 
 def train_patch(
-    scene: Scene,
-    model: FullModel,
-    body: Body,
-    surface: Surface,
-    region: RegionResult,
-    task: PatchTask,
+    problem: FullProblem, region: RegionResult, task: PatchTask, tip: bool = True
 ) -> PatchResult:
-    """Train one patch.
+    """Train one patch; a task for ``run.workers``.
 
     Parameters
     ----------
-    scene : Scene
-    model : FullModel
-    body : Body
-    surface : Surface
-        Accessible.
+    problem : FullProblem
     region : RegionResult
         With the Ritz vectors of the task's footprints.
     task : PatchTask
+    tip : bool
+        Whether under the tip, too, if the scene has one.
     """
-    rng = np.random.default_rng(task.seed)
-    weights = model.weights.ravel()
+    rng, scene = np.random.default_rng(task.seed), problem.scene
+    weights = problem.model.weights.ravel()
     frame = np.array([task.normal, *tangents(task.normal)])
     ritz = region.ritz.astype(np.float64)
     leading = local_modes(_expected(scene, ritz, task, rng), task.size.modes)
     whole, mix = whole_numbers(region.orthonormal @ leading, region.orthonormal)
     # stored in these and in half precision, so trained in it
-    everywhere = PatchResult(
-        frame=frame,
-        whole=whole,
-        mix=mix,
-        points=np.arange(len(weights), dtype=np.int32),
-        weights=weights,
-        defect=np.zeros((LOAD_FEATURES, task.size.modes), np.float16),
-        guess=np.zeros((LOAD_FEATURES, task.size.modes), np.float16),
-        directions=np.zeros((CHANGING, task.size.modes), np.float16),
-        change=np.zeros((TANGENT_FEATURES, CHANGES), np.float16),
-        residual=np.zeros(RESIDUAL_FEATURES),
-    )
-    galerkin = local_trainer(scene, body, surface, region, task, everywhere)
+    numbers = np.arange(len(weights), dtype=np.int32)
+    everywhere = PatchResult.untrained(frame, whole, mix, numbers, weights)
+    galerkin = local_trainer(problem, region, task, everywhere)
     contributions = _training_forces(galerkin, scene, task, rng)[: len(weights)]
     most = task.size.cubature_points
     equations = max(most, fewer(EQUATIONS, scene.tolerance))
     points, chosen = _cubature(contributions, weights, equations, most, rng)
     result = replace(everywhere, points=points.astype(np.int32), weights=chosen)
-    reduced = local_trainer(scene, body, surface, region, task, result)
+    reduced = local_trainer(problem, region, task, result)
     defect = _fit_defect(galerkin, reduced, scene, task, rng)
     result = replace(result, defect=defect.astype(np.float16))
-    reduced = local_trainer(scene, body, surface, region, task, result)
+    reduced = local_trainer(problem, region, task, result)
     samples = _answered(reduced, scene, task, random_load, GUESS_LOADS, rng)
     directions, change = _fit_tangent(reduced, samples[:TANGENT_LOADS])
-    residual = _fit_residual(model, reduced, body, scene, task, frame, rng)
-    tip = None
-    if scene.endoscope.tip:
-        tip = train_tip(
-            model, body, surface, weights, reduced.models, region.orthonormal,
-            task.contacts, task.normals, task.ranges[:, TIP_DEPTH], rng,
-        )  # fmt: skip
+    residual = _fit_residual(problem, reduced, task, frame, rng)
+    touched = None
+    if tip and scene.endoscope.tip:
+        touched = train_tip(problem, task, reduced.models, region.orthonormal, rng)
     return replace(
         result,
         guess=_fit_guess(samples).astype(np.float16),
         directions=directions.astype(np.float16),
         change=change.astype(np.float16),
         residual=residual,
-        tip=tip,
+        tip=touched,
     )
 
 
 def local_trainer(
-    scene: Scene,
-    body: Body,
-    surface: Surface,
-    region: RegionResult,
-    task: PatchTask,
-    result: PatchResult,
+    problem: FullProblem, region: RegionResult, task: PatchTask, result: PatchResult
 ) -> LocalTrainer:
     """A patch by itself, ready to be solved."""
-    return LocalTrainer(
-        scene,
-        body,
-        surface,
-        LocalModels(
-            basis=region.basis[None],
-            steps=region.steps[None],
-            region=np.zeros(1, np.int32),
-            centres=task.centre[None],
-            frames=result.frame[None],
-            pressures=np.array([task.pressure]),
-            whole=result.whole[None],
-            mix=result.mix[None],
-            point_from=np.array([0, len(result.points)]),
-            points=result.points,
-            weights=result.weights,
-            defect=result.defect[None].astype(np.float32),
-            guess=result.guess[None].astype(np.float32),
-            directions=result.directions[None].astype(np.float32),
-            change=result.change[None].astype(np.float32),
-            residuals=np.zeros((1, RESIDUAL_FEATURES)),
-            extent=task.extent,
-            blend=task.blend,
-            tips=None,
-        ),
-    )
+    own = np.zeros(1, np.int32), task.centre[None], np.array([task.pressure])
+    return LocalTrainer(problem, local_models([region], *own, [result], task.extent, task.blend))
 
 
 def _expected(scene: Scene, ritz: Array, task: PatchTask, rng: np.random.Generator) -> Array:
@@ -415,34 +263,28 @@ def _expected(scene: Scene, ritz: Array, task: PatchTask, rng: np.random.Generat
 
 
 def _fit_residual(
-    model: FullModel,
+    problem: FullProblem,
     reduced: LocalTrainer,
-    body: Body,
-    scene: Scene,
     task: PatchTask,
     frame: Array,
     rng: np.random.Generator,
 ) -> Array:
     """Log of the full model's relative residual (RESIDUAL_FEATURES,), by ``residual_features``."""
-    rows, states, loads = [], [], []
-    nodal, features = np.zeros(len(body.nodes)), np.zeros(RESIDUAL_FEATURES)
+    rows, states, loads, scene = [], [], [], problem.scene
+    features, free = np.zeros(RESIDUAL_FEATURES), problem.model.free
     for _ in range(fewer(RESIDUAL_LOADS, scene.tolerance)):
         x, direction, limit = _limit(scene, task, rng, border=False)
         share = np.sqrt(rng.random())
         sample = reduced.solve(x, direction, share * limit)
         if sample is not None:
-            footprint(body.boundary, sample.x, sample.normal, reduced.radius, nodal)
+            nodal = problem.unit_load_at(sample.x, sample.normal)
             residual_features(frame, task.centre, x, direction, share, features)
             rows.append(features.copy())
             states.append(sample.q)
             loads.append((share * limit * nodal[:, None] * direction).ravel())
     answers = np.array(states) @ reduced.nodal_modes
-    residuals = model.relative_residuals(answers[:, model.free], np.array(loads)[:, model.free])
-    kept = (residuals > 0) & np.isfinite(residuals)
-    logs = np.log(residuals[kept])
-    fitted = damped_fit(np.array(rows)[kept], (logs - logs.mean())[:, None], RESIDUAL_DAMPING)[:, 0]
-    fitted[0] += logs.mean()
-    return fitted
+    left = problem.model.relative_residuals(answers[:, free], np.array(loads)[:, free])
+    return fit_of_residuals(np.array(rows), left)
 
 
 def random_load(
@@ -558,7 +400,7 @@ def _fit_guess(samples: Sequence[Sample]) -> Array:
 def _fit_tangent(reduced: LocalTrainer, samples: Sequence[Sample]) -> tuple[Array, Array]:
     """Directions (CHANGING, r) in which equilibria change the tangent most, and how.
 
-    The change (TANGENT_FEATURES, CHANGES) is that of ``shared.tables.LocalModels``.
+    The change (TANGENT_FEATURES, CHANGES) is that of ``shared.local_models.LocalModels``.
     """
     changes = reduced.tangent_changes(np.array([s.q for s in samples]))
     U = np.linalg.svd(np.hstack(list(changes)), full_matrices=False)[0][:, :CHANGING]

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.validate.norms import statistics
+from palpate.offline.fem.norms import statistics
 from palpate.shared.mechanics.laws import AnyTissue
 from palpate.shared.mechanics.tissue import lame
 from palpate.shared.scene import Budget, Size, Tolerance

@@ -16,22 +16,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.offline.fem.model import FullModel, NoEquilibrium
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.cubature import (
     combined,
     damped_fit,
+    fit_of_residuals,
     nonnegative,
     point_forces,
     with_linear_forces,
 )
+from palpate.offline.reduce.patches import PatchTask, TipResult
 from palpate.offline.reduce.sampling import farthest
 from palpate.offline.reduce.transfer import FOLLOWED, NEXT, neighbours, overlaps
 from palpate.offline.reduce.viscous import deviatoric_of
-from palpate.shared.geometry.surface import Surface
 from palpate.shared.local_models import Body, LocalModels, LocalTips
 from palpate.shared.mechanics import newton
-from palpate.shared.mechanics.footprint import LIMIT_FIELDS
-from palpate.shared.mechanics.sphere import FORCE, room_for
-from palpate.shared.mechanics.sphere import touch as press_faces
+from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH
 from palpate.shared.mechanics.tissue import Law
 from palpate.shared.mechanics.viscosity import step_weights
 from palpate.shared.reduced.features import (
@@ -91,52 +91,33 @@ ANSWERS = 48
 """Answers of the trained model, and of how they change with the position, that the first guess is
 fitted to; they tell the residual in the full model, too."""
 
-RESIDUAL_DAMPING = 0.15
-"""Of the fit of the residuals' logs: they scatter about any smooth function."""
-
-
-@dataclass(frozen=True)
-class TipResult:
-    """A trained local model of the tip; shapes as in ``reduced.touch.LocalTips``."""
-
-    modes: NDArray[np.float32]
-    points: NDArray[np.int32]
-    weights: Array
-    guess: NDArray[np.float16]
-    residual: Array
-
 
 class TipTrainer:
     """One local model of the tip that solves training positions by the compiled query.
 
     Parameters
     ----------
-    body : Body
-    surface : Surface
-        Accessible.
+    problem : FullProblem
     models : LocalModels
         The local model by itself.
     tips : LocalTips
     tangent : LocalTips, optional
         With the same modes; its points serve the tangent.
-    prony : sequence of (float, float)
-        Of tissue that remembers.
     deviatoric : ndarray, shape (m, m), optional
-        Deviatoric part of its rest stiffness in the modes.
+        Deviatoric part of the rest stiffness in the modes, if the tissue is to remember.
     """
 
     def __init__(
         self,
-        body: Body,
-        surface: Surface,
+        problem: FullProblem,
         models: LocalModels,
         tips: LocalTips,
         tangent: LocalTips | None = None,
-        prony: Sequence[tuple[float, float]] = (),
         deviatoric: Array | None = None,
     ) -> None:
-        self.models = touch_models(body, models, tips, tangent)
-        self.radius = body.tip.radius
+        surface, prony = problem.surface, problem.model.prony
+        self.models = touch_models(problem.body, models, tips, tangent)
+        self.radius = problem.body.tip.radius
         self._prony = prony
         past: Elastic | Remembering = Elastic()
         if deviatoric is not None:
@@ -252,52 +233,38 @@ class _State:
 
 
 def train_tip(
-    model: FullModel,
-    body: Body,
-    surface: Surface,
-    weights: Array,
+    problem: FullProblem,
+    task: PatchTask,
     models: LocalModels,
     orthonormal: NDArray[np.float32],
-    contacts: Array,
-    normals: Array,
-    depths: Array,
     rng: np.random.Generator,
 ) -> TipResult:
     """Train one local model of the tip.
 
     Parameters
     ----------
-    model : FullModel
-        Of the tissue.
-    body : Body
-    surface : Surface
-        Accessible.
-    weights : ndarray, shape (quadrature points,), mm^3
+    problem : FullProblem
+    task : PatchTask
     models : LocalModels
         The patch by itself, trained for footprints.
     orthonormal : ndarray, shape (M, M)
         Orthonormal modes in the basis of its region.
-    contacts, normals : ndarray, shape (c, 3)
-        Points that it answers for.
-    depths : ndarray, shape (c,), mm
-        Largest depths there.
     """
+    model, weights = problem.model, problem.model.weights.ravel()
     count, most, nodal = (
         (HISTORY_MODES, HISTORY_POINTS, HISTORY_NODAL)
         if model.prony
         else (TIP_MODES, TIP_POINTS, NODAL)
     )
-    space = _generous(body, models, orthonormal, nodal)
+    space = _generous(problem.body, models, orthonormal, nodal)
     trainer = TipTrainer(
-        body,
-        surface,
+        problem,
         models,
         _untrained(space, np.arange(len(weights)), weights),
         _untrained(space, models.points, models.weights),
-        model.prony,
         deviatoric_of(model, models, space) if model.prony else None,
     )
-    pressed = _press(trainer, contacts, normals, depths, rng)
+    pressed = _press(trainer, task, rng)
     if not pressed:
         raise NoEquilibrium("endoscope.tip: no equilibrium found under it; is the load too large?")
     V = _modes(pressed, count)
@@ -311,15 +278,13 @@ def train_tip(
     # a first guess by what is known so far spares the answers that refine it half their iterations
     guess = _fit_guess(trainer.models, states)
     trained = _untrained(modes, points, chosen * weights[points], guess)
-    shares, answers = _answers(
-        TipTrainer(body, surface, models, trained), contacts, normals, depths, rng
-    )
+    shares, answers = _answers(TipTrainer(problem, models, trained), task, rng)
     return TipResult(
         modes=modes,
         points=trained.points,
         weights=trained.weights,
         guess=_fit_guess(trainer.models, answers).astype(np.float16),
-        residual=_fit_residual(model, body, models, trainer.models, modes, shares, answers),
+        residual=_fit_residual(problem, models, trainer.models, modes, shares, answers),
     )
 
 
@@ -339,19 +304,15 @@ def local_tips(model: FullModel, models: LocalModels, results: Sequence[TipResul
     )
 
 
-def compile_tip_query(
-    body: Body,
-    surface: Surface,
-    models: LocalModels,
-    prony: Sequence[tuple[float, float]],
-) -> None:
+def compile_tip_query(problem: FullProblem, models: LocalModels) -> None:
     """Compile what ``train_tip`` runs, on a model of nothing."""
     modes = np.zeros((models.basis.shape[1], 4))
     tips = _untrained(modes, models.points, models.weights)
-    over = surface.vertices[0] + 0.9 * body.tip.radius * surface.normals[0]
-    TipTrainer(body, surface, models, tips).solve(over)
-    if prony:
-        TipTrainer(body, surface, models, tips, None, prony, np.zeros((4, 4))).solve(over)
+    surface = problem.surface
+    over = surface.vertices[0] + 0.9 * problem.body.tip.radius * surface.normals[0]
+    TipTrainer(problem, models, tips).solve(over)
+    if problem.model.prony:
+        TipTrainer(problem, models, tips, None, np.zeros((4, 4))).solve(over)
 
 
 def _untrained(
@@ -397,18 +358,12 @@ def _generous(
     return (orthonormal @ Q).astype(np.float32)
 
 
-def _press(
-    trainer: TipTrainer,
-    contacts: Array,
-    normals: Array,
-    depths: Array,
-    rng: np.random.Generator,
-) -> list[_State]:
+def _press(trainer: TipTrainer, task: PatchTask, rng: np.random.Generator) -> list[_State]:
     """Push the tip in at contacts far apart, step by step to about the largest depth.
 
     On tissue that remembers it is also held, slid to another contact, and lifted.
     """
-    states: list[_State] = []
+    contacts, states = task.contacts, list[_State]()
     for i in farthest(contacts, min(PRESSED, len(contacts))):
         trainer.rest()
         steps = []
@@ -420,12 +375,17 @@ def _press(
             near = np.flatnonzero(np.linalg.norm(contacts - contacts[i], axis=1) < ASIDE)
             steps += [(rng.choice(near), rng.uniform(0.3, 0.9), QUICK), (i, 0.0, QUICK)]
         for at, share, dt in steps:
-            depth = float(share * depths[at])
-            state = trainer.solve(contacts[at] + (trainer.radius - depth) * normals[at], dt)
+            state = trainer.solve(_centre(trainer, task, at, share), dt)
             if state is None:
                 break
             states.append(state)
     return states
+
+
+def _centre(trainer: TipTrainer, task: PatchTask, contact: int, share: float) -> Array:
+    """Centre (3,) of the tip at a contact of the task, at a share of the largest depth there."""
+    depth = float(share * task.ranges[contact, TIP_DEPTH])
+    return np.asarray(task.contacts[contact] + (trainer.radius - depth) * task.normals[contact])
 
 
 def _modes(states: list[_State], count: int) -> Array:
@@ -474,19 +434,14 @@ def _fit_guess(models: TouchModels, states: list[_State]) -> Array:
 
 
 def _answers(
-    trained: TipTrainer,
-    contacts: Array,
-    normals: Array,
-    depths: Array,
-    rng: np.random.Generator,
+    trained: TipTrainer, task: PatchTask, rng: np.random.Generator
 ) -> tuple[list[float], list[_State]]:
     """Answers of a trained model all over its range, and their shares of the largest depth."""
     shares, answers = [], []
-    for i in rng.integers(len(contacts), size=ANSWERS):
+    for i in rng.integers(len(task.contacts), size=ANSWERS):
         share = np.sqrt(rng.random())
-        position = contacts[i] + (trained.radius - share * depths[i]) * normals[i]
         trained.rest()
-        answer = trained.solve(position)
+        answer = trained.solve(_centre(trained, task, i, share))
         if answer is not None:
             shares.append(share)
             answers.append(answer)
@@ -494,8 +449,7 @@ def _answers(
 
 
 def _fit_residual(
-    model: FullModel,
-    body: Body,
+    problem: FullProblem,
     models: LocalModels,
     placed: TouchModels,
     modes: NDArray[np.float32],
@@ -513,31 +467,20 @@ def _fit_residual(
     nodal = (models.steps[0][:, None] * modes).T @ models.basis[0].astype(np.float32)
     displacements = np.array([answer.q for answer in answers]) @ nodal
     positions = np.array([answer.position for answer in answers])
-    residuals = residuals_left(model, body, displacements, positions)
-    kept = (residuals > 0) & np.isfinite(residuals)
-    logs = np.log(residuals[kept])
-    fitted = damped_fit(rows[kept], (logs - logs.mean())[:, None], RESIDUAL_DAMPING)[:, 0]
-    fitted[0] += logs.mean()
-    return fitted
+    return fit_of_residuals(rows, residuals_left(problem, displacements, positions))
 
 
-def residuals_left(model: FullModel, body: Body, displacements: Array, positions: Array) -> Array:
+def residuals_left(problem: FullProblem, displacements: Array, positions: Array) -> Array:
     """Relative residuals (k,) in the full model of answers to positions of the tip.
 
     Parameters
     ----------
-    model : FullModel
-    body : Body
+    problem : FullProblem
     displacements : ndarray, shape (k, 3 n), mm
     positions : ndarray, shape (k, 3), mm
         Of the tip's centre.
     """
-    surface, nodes = body.touchable
-    faces = np.arange(len(surface.faces), dtype=np.int32)
-    touching, loads = room_for(surface, len(faces)), np.zeros_like(displacements)
-    for u, position, load in zip(displacements, positions, loads, strict=True):
-        moved = np.ascontiguousarray(u.reshape(-1, 3)[nodes])
-        count, _, _ = press_faces(body.tip, surface, faces, position, moved, touching, FORCE)
-        touched = nodes[surface.faces[touching.face[:count]]]
-        np.add.at(load.reshape(-1, 3), touched, touching.force[:count])
-    return model.relative_residuals(displacements[:, model.free], loads[:, model.free])
+    forces, free = np.zeros_like(displacements), problem.model.free
+    for u, position, force in zip(displacements, positions, forces, strict=True):
+        problem.tip_load(position).add_force(u, force)
+    return problem.model.relative_residuals(displacements[:, free], -forces[:, free])

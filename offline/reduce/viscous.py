@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,10 +10,24 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from palpate.offline.fem.model import FullModel
-from palpate.offline.reduce.transfer import region_basis
-from palpate.shared.local_models import LocalModels
+from palpate.offline.reduce.transfer import FOLLOWED, neighbours, overlaps, region_basis
+from palpate.shared.local_models import LocalModels, ViscousModels
 
 Array = NDArray[np.float64]
+
+
+def with_time(model: FullModel, models: LocalModels) -> LocalModels:
+    """The local models with what they need to remember, if the tissue does."""
+    if not model.prony:
+        return models
+    pairs = neighbours(models, FOLLOWED * models.extent)
+    soft = deviatoric_of_all(model, models, models.modes)
+    viscous = ViscousModels(soft, pairs, overlaps(model, models, models.modes, pairs))
+    if models.tips is None:
+        return replace(models, viscous=viscous)
+    tips = models.tips
+    tips = replace(tips, deviatoric=deviatoric_of_all(model, models, tips.modes))
+    return replace(models, viscous=viscous, tips=tips)
 
 
 def deviatoric_of_all(

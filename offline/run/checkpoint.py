@@ -1,6 +1,6 @@
 """Results of a training run on disk, so that a killed run goes on where it stopped.
 
-Each result is an HDF5 file of its own, written aside and moved into place: whatever the moment of
+Each result is a file of its own, written aside and moved into place: whatever the moment of
 a kill, a result is there or it is not.  The folder is named by a hash of everything the results
 depend on, so stale ones are never read.
 """
@@ -11,12 +11,8 @@ import hashlib
 import os
 import pickle
 import shutil
-from collections.abc import Mapping
 from pathlib import Path
-
-import h5py
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
 from palpate.shared.scene import Extrusion, Scene
 
@@ -57,32 +53,24 @@ class Checkpoint:
         self._folder.mkdir(parents=True, exist_ok=True)
 
     def _path(self, name: str) -> Path:
-        return self._folder / f"{name}.h5"
+        return self._folder / f"{name}.pickle"
 
-    def load(self, name: str) -> dict[str, NDArray[np.generic]] | None:
-        """Arrays of a result, None if it is not there."""
-        path = self._path(name)
-        if not path.is_file():
-            return None
-        with h5py.File(path, "r") as file:
-            return {key: value[()] for key, value in file.items()}
+    def __contains__(self, name: str) -> bool:
+        return self._path(name).is_file()
 
-    def store(self, name: str, arrays: Mapping[str, NDArray[np.generic]]) -> None:
-        """Keep a result."""
+    def load(self, name: str) -> Any:
+        """Read a result that is there."""
+        return pickle.loads(self._path(name).read_bytes())
+
+    def store(self, name: str, result: object) -> Path:
+        """Keep a result; return where, for workers to read it with ``pickle``."""
         path = self._path(name)
         temporary = path.with_suffix(".part")
-        with h5py.File(temporary, "w") as file:
-            for key, value in arrays.items():
-                file[key] = value
-        with temporary.open("rb") as written:
-            os.fsync(written.fileno())
-        temporary.replace(path)
-
-    def share(self, name: str, value: object) -> Path:
-        """Write a value where workers can read it, with ``pickle``; return its path."""
-        path = self._folder / f"{name}.pickle"
-        path.write_bytes(pickle.dumps(value))
-        return path
+        with temporary.open("wb") as file:
+            pickle.dump(result, file)
+            file.flush()
+            os.fsync(file.fileno())
+        return temporary.replace(path)
 
     def remove(self) -> None:
         """Forget everything: the artifact is written."""

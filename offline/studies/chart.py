@@ -33,20 +33,20 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from palpate.offline.fem.norms import relative
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods.catalogue import Training, build
 from palpate.offline.methods.full import Remeshed
 from palpate.offline.methods.method import Method, Snapshots, Steps
 from palpate.offline.methods.shipped import Shipped
 from palpate.offline.run.checkpoint import Checkpoint
 from palpate.offline.run.streams import Stage, stream
-from palpate.offline.run.workers import resume, worker_pool
-from palpate.offline.run.workshop import Workshop, open_artifact
+from palpate.offline.run.tables import write_csv
+from palpate.offline.run.workers import open_artifact, resume, worker_pool
 from palpate.offline.studies import chart_drawing as drawing
 from palpate.offline.studies import references as full
 from palpate.offline.studies.chart_drawing import SHIPPED, TWIN, Row
 from palpate.offline.studies.references import Fields
-from palpate.offline.studies.tables import write_csv
-from palpate.offline.validate.norms import relative
 from palpate.shared.artifact import read_artifact
 from palpate.shared.errors import PalpateError, QueryError
 from palpate.shared.model import ReducedModel
@@ -148,22 +148,19 @@ def chart(
         raise PalpateError(f"{artifact}: trained on another scene than {scene.name!r}")
     settings = snapshots, queries, seed
     checkpoint = full.kept_results(artifact, scene or atlas.scene, layout.name, settings)
-    workshop = Workshop.of_artifact(read_artifact(artifact))
+    problem = FullProblem.of_artifact(read_artifact(artifact))
     plan = plan or (PLAN_IN_TIME if scene is None else PLAN)
     if scene is not None:
-        plan = {**plan, "pod": sorted({*plan["pod"], Shipped(workshop, atlas).unknowns})}
-    references = _solved(atlas, workshop, artifact, scene, settings, checkpoint)
-    training = Training(workshop, references.snapshots, atlas, seed, scene, in_time=scene is None)
+        plan = {**plan, "pod": sorted({*plan["pod"], Shipped(problem, atlas).unknowns})}
+    references = _solved(atlas, problem, artifact, scene, settings, checkpoint)
+    training = Training(problem, references.snapshots, atlas, seed, scene, in_time=scene is None)
     measured: dict[str, Mapping[str, Any]] = {}
     # in this process: times are those of one core, and methods share what they learn from
     for name, size in tqdm([(name, size) for name, sizes in plan.items() for size in sizes]):
         key = f"{name} {size:g}"
-        kept = checkpoint.load(key)
-        if kept is None:
-            found = measure(training, references, name, size)
-            kept = {part: np.asarray(value) for part, value in found.items()}
-            checkpoint.store(key, kept)
-        measured[key] = kept
+        if key not in checkpoint:
+            checkpoint.store(key, measure(training, references, name, size))
+        measured[key] = checkpoint.load(key)
     usual = float(np.median([np.median(found["beside"]) for found in measured.values()]))
     rows = [_row(key, found, usual) for key, found in measured.items()]
     report = artifact.parent / atlas.name / "report"
@@ -176,7 +173,7 @@ def chart(
 
 def _solved(
     atlas: ReducedModel,
-    workshop: Workshop,
+    problem: FullProblem,
     artifact: Path,
     scene: Scene | None,
     settings: tuple[int, int, int],
@@ -188,7 +185,7 @@ def _solved(
     histories: dict[str, Steps] = {}
     for (name, stage), count in zip(stages.items(), counts, strict=True):
         rng = stream(atlas.scene.seed, stage, seed)
-        for i, steps in enumerate(full.random_steps(atlas, workshop, count, rng, scene is None)):
+        for i, steps in enumerate(full.random_steps(atlas, problem, count, rng, scene is None)):
             histories[f"{name} {i}"] = steps
     with worker_pool(open_artifact, artifact) as pool:
         found = full.full_histories(histories, pool, checkpoint)
@@ -201,11 +198,11 @@ def _solved(
             for i, (steps, _) in enumerate(queries[:REFINED_LOADS])
             if scene is not None
         }
-        finer = resume("refined mesh", pool, checkpoint, tasks, lambda u: {"u": u})
+        finer = resume("refined mesh", pool, checkpoint, tasks)
     return References(
         full.snapshots([histories[name] for name in learnt], list(learnt.values())),
         queries,
-        np.array([finer[name]["u"] for name in tasks]).reshape(-1, *workshop.mesh.nodes.shape),
+        np.array([finer[name] for name in tasks]).reshape(-1, *problem.mesh.nodes.shape),
     )
 
 
@@ -221,7 +218,7 @@ def measure(training: Training, references: References, name: str, size: float) 
         ``unknowns``, ``label``; per query ``displacement``, ``von_mises``, ``refined`` (errors) and
         ``converged``; per step that presses ``times`` (s) and ``beside`` (s), the artifact's times.
     """
-    workshop = training.workshop
+    problem = training.problem
     method, yardstick = build(name, size, training), build("artifact", 1, training)
     queries, finer = references.queries, references.refined
     if isinstance(method, Remeshed):
@@ -237,7 +234,7 @@ def measure(training: Training, references: References, name: str, size: float) 
         if states is not None:
             fields = Fields.of(method, states)
             twin = training.in_time and name == "artifact, warm"
-            errors[i] = fields.errors(workshop, at_once(workshop, steps) if twin else exact)
+            errors[i] = fields.errors(problem, at_once(problem, steps) if twin else exact)
             if i < len(finer):
                 from_finer[i] = relative(fields.displacements[-1], finer[i])
     from_finer[np.isnan(finer).any(axis=(1, 2))] = np.nan
@@ -246,7 +243,7 @@ def measure(training: Training, references: References, name: str, size: float) 
     least, beside = _times(method, yardstick, queries, np.concatenate(times))
     return {
         "unknowns": method.unknowns,
-        "label": method.label.encode(),
+        "label": method.label,
         "displacement": errors[:, 0],
         "von_mises": errors[:, 1],
         "refined": from_finer,
@@ -271,13 +268,13 @@ def play(method: Method, steps: Steps) -> tuple[list[Any] | None, Array]:
     return states if converged else None, np.array(seconds)
 
 
-def at_once(workshop: Workshop, steps: Steps) -> Fields:
+def at_once(problem: FullProblem, steps: Steps) -> Fields:
     """Fields of the full model without a past, each solution from the last."""
     u: list[Array] = []
     for case, _ in steps:
-        load = case.load(len(workshop.mesh.nodes))
-        u.append(workshop.model.solve(load, u[-1] if u else None).displacement)
-    return Fields.at_once(workshop, u)
+        load = case.load(len(problem.mesh.nodes))
+        u.append(problem.model.solve(load, start=u[-1] if u else None).displacement)
+    return Fields.at_once(problem, u)
 
 
 def _times(
@@ -305,8 +302,8 @@ def _row(key: str, found: Mapping[str, Any], usual: float) -> dict[str, Any]:
     row: dict[str, Any] = {
         "key": key,
         "family": key.rsplit(" ", 1)[0],
-        "label": found["label"].item().decode(),
-        "unknowns": int(found["unknowns"]),
+        "label": found["label"],
+        "unknowns": found["unknowns"],
         "time_us": float(1e6 * np.median(found["times"]) / np.median(found["beside"]) * usual),
     }
     for name in drawing.FIELDS:

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from palpate.offline.bench import STEP, tip_at, walk
-from palpate.offline.run.workshop import Load, Workshop
-from palpate.offline.validate.loads import unseen_loads
-from palpate.offline.validate.norms import relative
-from palpate.offline.validate.tip import OTHER_EQUILIBRIUM
+from palpate.offline.fem.model import NoEquilibrium
+from palpate.offline.fem.norms import relative
+from palpate.offline.fem.problem import FullProblem, Load, TipPosition
+from palpate.offline.validate.against_full import held_out_loads
+from palpate.offline.validate.compare import OTHER_EQUILIBRIUM
 from palpate.shared.artifact import read_artifact
 from palpate.shared.model import ReducedModel
 
@@ -45,14 +46,12 @@ def continuity(
         full model in none.
     """
     atlas = ReducedModel.load(artifact)
-    workshop = Workshop.of_artifact(read_artifact(artifact))
+    problem = FullProblem.of_artifact(read_artifact(artifact))
     rng = np.random.default_rng([seed, 8 if tip else 7])
     found = []
-    for start in tqdm(unseen_loads(atlas, paths, seed), desc="paths"):
+    for start in tqdm(held_out_loads(atlas, paths, seed), desc="paths"):
         loads = walk(atlas, start, steps + 1, rng)
-        full, reduced = np.diff(
-            (_forces if tip else _displacements)(atlas, workshop, loads), axis=1
-        )
+        full, reduced = np.diff((_forces if tip else _displacements)(atlas, problem, loads), axis=1)
         found.append([np.linalg.norm(x, axis=2).max(axis=1) for x in (reduced - full, full)])
     excess, change = np.hstack(found)
     kept = ~np.isnan(excess)
@@ -63,24 +62,30 @@ def continuity(
     }
 
 
-def _displacements(atlas: ReducedModel, workshop: Workshop, loads: Sequence[Load]) -> Array:
+def _displacements(atlas: ReducedModel, problem: FullProblem, loads: Sequence[Load]) -> Array:
     """Displacements (2, t, n, 3) mm of the full and the reduced model."""
     full: list[Array] = []
     for load in loads:
-        full.append(workshop.solve(load, full[-1] if full else None).displacement)
+        full.append(problem.solve(load, start=full[-1] if full else None).displacement)
     answers = [atlas.press(load.position, load.pressure, load.direction) for load in loads]
     return np.array([full, [atlas.displacement(answer) for answer in answers]], dtype=float)
 
 
-def _forces(atlas: ReducedModel, workshop: Workshop, loads: Sequence[Load]) -> Array:
+def _forces(atlas: ReducedModel, problem: FullProblem, loads: Sequence[Load]) -> Array:
     """Forces (2, t, 1, 3) of both models over the largest, nan where they are not comparable."""
     warm, before = atlas.new_warm(), None
     forces = np.full((2, len(loads), 1, 3), np.nan)
     for i, load in enumerate(loads):
         answer = atlas.touch(tip_at(atlas, load), warm=warm)
         reduced = atlas.displacement(answer).astype(float)
-        full = workshop.touch(answer.position, reduced if before is None else before)
-        before = full.displacement.astype(float) if full.displacement.size else None
-        if before is not None and relative(reduced, before) <= OTHER_EQUILIBRIUM:
+        try:
+            full = problem.solve(
+                TipPosition(answer.position), start=reduced if before is None else before
+            )
+        except NoEquilibrium:
+            before = None
+            continue
+        before = full.displacement
+        if relative(reduced, before) <= OTHER_EQUILIBRIUM:
             forces[:, i, 0] = full.force, answer.force
     return forces / np.nan_to_num(np.linalg.norm(forces, axis=3)).max()

@@ -19,15 +19,15 @@ from numpy.typing import NDArray
 
 from palpate.offline.bench import limit_at, walk
 from palpate.offline.fem.model import NoEquilibrium
+from palpate.offline.fem.norms import relative
+from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.fem.surface import accessible_surface
 from palpate.offline.methods.method import Case
+from palpate.offline.reduce.queries import random_loads
 from palpate.offline.reduce.sampling import cone, random_points
 from palpate.offline.run.checkpoint import Checkpoint
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.workers import resume
-from palpate.offline.run.workshop import Load, Workshop
-from palpate.offline.validate.loads import random_loads
-from palpate.offline.validate.norms import relative
 from palpate.shared.mechanics.footprint import footprint
 from palpate.shared.model import ReducedModel
 
@@ -143,15 +143,15 @@ class HardLoads:
 
     Parameters
     ----------
-    workshop : Workshop
+    problem : FullProblem
         Of the artifact's mesh.
     count : int
         Cases of each kind.
     """
 
-    def __init__(self, atlas: ReducedModel, workshop: Workshop, count: int, seed: int) -> None:
-        self._atlas, self._workshop, self._count, self._seed = atlas, workshop, count, seed
-        self._scene = workshop.scene
+    def __init__(self, atlas: ReducedModel, problem: FullProblem, count: int, seed: int) -> None:
+        self._atlas, self._problem, self._count, self._seed = atlas, problem, count, seed
+        self._scene = problem.scene
         self._poisson = self._scene.tissue.poisson
 
     @property
@@ -184,7 +184,7 @@ class HardLoads:
 
     def _loads(self, rng: np.random.Generator, count: int | None = None) -> list[Load]:
         atlas, count = self._atlas, self._count if count is None else count
-        return random_loads(atlas.surface, atlas.limits, atlas.scene, count, rng)
+        return random_loads(atlas, count, rng)
 
     def _through(self, *cases: Case, follow: bool = False) -> HardCase:
         """A case that is reached through others, all at once."""
@@ -192,7 +192,7 @@ class HardLoads:
         return HardCase(steps, self._poisson, follow, end_only=True)
 
     def _path(self, loads: Sequence[Load], follow: bool = False) -> HardCase:
-        return self._through(*(Case.of(self._workshop, load) for load in loads), follow=follow)
+        return self._through(*(Case.of(self._problem, load) for load in loads), follow=follow)
 
     def _in_tissue(self, poisson: float, rng: np.random.Generator) -> list[HardCase]:
         return [replace(self._path([load]), poisson=poisson) for load in self._loads(rng)]
@@ -229,7 +229,7 @@ class HardLoads:
 
     def _elsewhere(self, within: bool, rng: np.random.Generator) -> list[HardCase]:
         """Presses other parts of the free boundary, straight in."""
-        mesh, reach = self._workshop.mesh, self._scene.endoscope.reach
+        mesh, reach = self._problem.mesh, self._scene.endoscope.reach
         free = np.asarray(~mesh.clamped[mesh.faces].all(axis=1))
         surface, cases = accessible_surface(replace(mesh, accessible=free)), list[HardCase]()
         while len(cases) < self._count:
@@ -248,14 +248,14 @@ class HardLoads:
         return [self._pressed(x, project(x.position)[1], radius) for x in self._loads(rng)]
 
     def _pressed(self, load: Load, normal: Array, radius: float) -> HardCase:
-        nodal = np.zeros(len(self._workshop.mesh.nodes))
-        footprint(self._workshop.body.boundary, load.position, normal, radius, nodal)
+        nodal = np.zeros(len(self._problem.mesh.nodes))
+        footprint(self._problem.body.boundary, load.position, normal, radius, nodal)
         own = None if radius == self._scene.endoscope.radius else radius
         return self._through(Case.pressed((load,), [nodal], own))
 
     def _pairs(self, rng: np.random.Generator) -> list[HardCase]:
         pairs = zip(self._loads(rng), self._loads(rng), strict=True)
-        return [self._through(Case.of(self._workshop, *pair)) for pair in pairs]
+        return [self._through(Case.of(self._problem, *pair)) for pair in pairs]
 
     def _moves(self, step: float, rng: np.random.Generator) -> list[HardCase]:
         loads = self._loads(rng)
@@ -266,13 +266,13 @@ class HardLoads:
 
 
 @lru_cache(maxsize=1 + len(RATIOS))
-def tissue(workshop: Workshop, poisson: float) -> Workshop:
+def tissue(problem: FullProblem, poisson: float) -> FullProblem:
     """The same body of tissue of another Poisson's ratio."""
-    scene = workshop.scene
+    scene = problem.scene
     if poisson == scene.tissue.poisson:
-        return workshop
+        return problem
     other = scene.tissue.model_copy(update={"poisson": poisson})
-    return Workshop(scene.model_copy(update={"tissue": other}), workshop.mesh)
+    return FullProblem(scene.model_copy(update={"tissue": other}), problem.mesh)
 
 
 def several(pairs: Mapping[str, Sequence[Followed]], most: int) -> dict[str, list[Followed]]:
@@ -286,9 +286,9 @@ def several(pairs: Mapping[str, Sequence[Followed]], most: int) -> dict[str, lis
     return {name: own[:most] for name, own in followed.items()}
 
 
-def equilibria(workshop: Workshop, case: HardCase) -> Equilibria:
+def equilibria(problem: FullProblem, case: HardCase) -> Equilibria:
     """Full solutions of a hard case; a task for ``run.workers``."""
-    own = tissue(workshop, case.poisson)
+    own = tissue(problem, case.poisson)
     path = [step.load(len(own.mesh.nodes)) for step, _ in case.steps]
     load = path[-1]
     if not case.follow:
@@ -299,12 +299,12 @@ def equilibria(workshop: Workshop, case: HardCase) -> Equilibria:
     return Equilibria(_lead(own, path, 1.0), _lead(own, [load], 1.0))
 
 
-def _lead(workshop: Workshop, loads: Sequence[Array], finest: float) -> Array | None:
+def _lead(problem: FullProblem, loads: Sequence[Array], finest: float) -> Array | None:
     """Displacement (3 n,) mm at the end of a path of loads from nothing."""
     u = None
     for load in loads:
         try:
-            u = workshop.model.solve(load, u, smallest_step=finest).displacement
+            u = problem.model.solve(load, start=u, smallest_step=finest).displacement
         except NoEquilibrium:
             return None
     return None if u is None else u.ravel()
@@ -318,14 +318,8 @@ def all_equilibria(
         f"{name}-{i}": (equilibria, x) for name, own in cases.items() for i, x in enumerate(own)
     }
 
-    def pack(found: Equilibria) -> dict[str, Array]:
-        return {key: u for key, u in vars(found).items() if u is not None}
-
-    found = resume("full solutions", pool, checkpoint, tasks, pack)
+    found = resume("full solutions", pool, checkpoint, tasks)
     return {
-        name: [
-            (case, Equilibria(*(found[f"{name}-{i}"].get(key) for key in ("path", "jump"))))
-            for i, case in enumerate(own)
-        ]
+        name: [(case, found[f"{name}-{i}"]) for i, case in enumerate(own)]
         for name, own in cases.items()
     }

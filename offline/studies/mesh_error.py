@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from palpate.offline.fem.mesh import local_thickness
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.sampling import spread_points
-from palpate.offline.run.workshop import Workshop
+from palpate.offline.run.tables import write_csv
 from palpate.offline.scenes import find_scene
-from palpate.offline.studies.tables import write_csv
 from palpate.shared.scene import ElementName
 
 Array = NDArray[np.float64]
@@ -56,11 +56,11 @@ class Discretisation(NamedTuple):
         along, through, length = self.divisions
         return f"{self.element} {along}x{through}x{length} graded {self.grading:g}"
 
-    def body(self) -> Workshop:
+    def body(self) -> FullProblem:
         """The turbinate in this mesh."""
         scene = find_scene("turbinate")
         geometry = scene.geometry.model_copy(update=self._asdict())
-        return Workshop(scene.model_copy(update={"geometry": geometry}))
+        return FullProblem(scene.model_copy(update={"geometry": geometry}))
 
 
 REFERENCE = Discretisation("hex20", (26, 5, 26), 1.7)
@@ -86,15 +86,15 @@ Contact = tuple[Array, Array, float, float]
 
 
 def press(
-    body: Workshop, position: Array, normal: Array, pressure: float, start: Array | None = None
+    body: FullProblem, position: Array, normal: Array, pressure: float, start: Array | None = None
 ) -> tuple[float, float, Array]:
     """Press straight in: largest displacement, mean under the footprint (mm), and all (n, 3)."""
     nodal = body.unit_load_at(position, normal)
-    u = body.model.solve(-pressure * np.outer(nodal, normal), start).displacement
+    u = body.model.solve(-pressure * np.outer(nodal, normal), start=start).displacement
     return np.linalg.norm(u, axis=1).max(), np.linalg.norm(nodal @ u) / nodal.sum(), u
 
 
-def contacts(reference: Workshop, probe: Workshop) -> list[Contact]:
+def contacts(reference: FullProblem, probe: FullProblem) -> list[Contact]:
     """Contact points all over the reference's surface, with the pressures that ``probe`` needs."""
     surface, found = reference.surface, []
     for point in spread_points(surface, POINTS, np.random.default_rng(reference.scene.seed)):

@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from palpate.offline.run.workshop import Workshop
+from palpate.offline.fem.problem import FullProblem
+from palpate.offline.run.tables import write_csv
 from palpate.offline.studies.hard_cases import CONTROL
 from palpate.offline.studies.references import Fields
-from palpate.offline.studies.tables import write_csv
 
 MIDDLE = -0.12
 """Position of the bar in a cell of the map: above the middle."""
@@ -87,7 +87,7 @@ Table = Mapping[str, Mapping[str, Sequence[Result]]]
 
 
 def classify(
-    workshop: Workshop,
+    problem: FullProblem,
     found: Fields | None,
     trusted: bool,
     exact: Fields | None,
@@ -110,10 +110,10 @@ def classify(
         return Result(DIVERGED, nan=True)
     force = np.empty(found.displacements[0].size)
     inverted = any(
-        not workshop.model.internal(u.ravel(), force)[1] > 0.0 for u in found.displacements
+        not problem.model.internal(u.ravel(), force)[1] > 0.0 for u in found.displacements
     )
-    errors, right = _tolerated(workshop, found, exact)
-    another = not right and _tolerated(workshop, found, other)[1]
+    errors, right = _tolerated(problem, found, exact)
+    another = not right and _tolerated(problem, found, other)[1]
     if not trusted:
         outcome = RIGHT_FLAGGED if right else ANOTHER_FLAGGED if another else WRONG_FLAGGED
     elif inverted:
@@ -128,12 +128,12 @@ def classify(
 
 
 def _tolerated(
-    workshop: Workshop, found: Fields, exact: Fields | None
+    problem: FullProblem, found: Fields, exact: Fields | None
 ) -> tuple[tuple[float, float], bool]:
     """Errors of displacement and stress, NaN without a reference; whether they are tolerated."""
     if exact is None:
         return (float("nan"), float("nan")), False
-    errors, tolerance = found.errors(workshop, exact), workshop.scene.tolerance
+    errors, tolerance = found.errors(problem, exact), problem.scene.tolerance
     return errors, errors[0] <= tolerance.displacement and errors[1] <= tolerance.von_mises
 
 

@@ -41,12 +41,15 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from palpate.offline.fem.norms import relative
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods.full import Full
 from palpate.offline.methods.galerkin import Galerkin
 from palpate.offline.methods.method import Case, Method, Steps
 from palpate.offline.methods.spaces import krylov, mass, modal, pod
 from palpate.offline.pictures import require_pyvista
-from palpate.offline.run.workshop import Workshop
+from palpate.offline.reduce.load_range import load_range
+from palpate.offline.run.tables import write_csv
 from palpate.offline.scenes import find_scene
 from palpate.offline.studies import paper_pictures
 from palpate.offline.studies.paper_claims import (
@@ -56,8 +59,6 @@ from palpate.offline.studies.paper_claims import (
 )
 from palpate.offline.studies.references import Fields
 from palpate.offline.studies.relaxation import Phases, load_steps
-from palpate.offline.studies.tables import write_csv
-from palpate.offline.validate.norms import relative
 from palpate.shared.geometry.quadrature import surface_quadrature
 
 Array = NDArray[np.float64]
@@ -101,7 +102,7 @@ class Example:
         Where the load's centre is.
     """
 
-    workshop: Workshop
+    problem: FullProblem
     load: Array
     pressure: float
     at: Array
@@ -109,17 +110,17 @@ class Example:
     @property
     def name(self) -> str:
         """The scene's."""
-        return self.workshop.scene.name
+        return self.problem.scene.name
 
     @property
     def point(self) -> int:
         """The node P, nearest to the load's centre."""
-        return int(np.argmin(np.linalg.norm(self.workshop.mesh.nodes - self.at, axis=1)))
+        return int(np.argmin(np.linalg.norm(self.problem.mesh.nodes - self.at, axis=1)))
 
     @property
     def in_time(self) -> bool:
         """Whether the tissue knows time."""
-        return bool(self.workshop.model.prony)
+        return bool(self.problem.model.prony)
 
     def steps(self, levels: Sequence[tuple[float, float]]) -> Steps:
         """History of time steps (s) and shares of the load at their ends."""
@@ -140,19 +141,19 @@ class Example:
 
 def cube(scene: str, report: Path) -> dict[str, Any]:
     """Figure 1: the cube of a scene under compression; see ``compare``."""
-    workshop = Workshop(find_scene(scene))
-    left = 1.0 - sum(share for share, _ in workshop.model.prony)
-    return compare(covered(workshop, left * CUBE_PRESSURE), report)
+    problem = FullProblem(find_scene(scene))
+    left = 1.0 - sum(share for share, _ in problem.model.prony)
+    return compare(covered(problem, left * CUBE_PRESSURE), report)
 
 
-def covered(workshop: Workshop, pressure: float) -> Example:
+def covered(problem: FullProblem, pressure: float) -> Example:
     """Pressure (kPa) all over the flat top of a block."""
-    mesh = workshop.mesh
+    mesh = problem.mesh
     top = surface_quadrature(mesh.nodes, mesh.faces[mesh.accessible])
     areas = np.zeros(len(mesh.nodes))
     np.add.at(areas, top.nodes, top.areas[:, None] * top.shape)
     load = -pressure * areas[:, None] * top.normals[0]
-    return Example(workshop, load, pressure, top.points.mean(axis=0))
+    return Example(problem, load, pressure, top.points.mean(axis=0))
 
 
 def turbinate(scene: str, report: Path) -> dict[str, Any]:
@@ -161,15 +162,15 @@ def turbinate(scene: str, report: Path) -> dict[str, Any]:
     contours = not found.tissue.prony
     if contours:
         require_pyvista()
-    return compare(footprint(Workshop(found), MEDIAL), report, contours=contours)
+    return compare(footprint(FullProblem(found), MEDIAL), report, contours=contours)
 
 
-def footprint(workshop: Workshop, position: Sequence[float]) -> Example:
+def footprint(problem: FullProblem, position: Sequence[float]) -> Example:
     """A footprint pressed straight in, up to the pressure that is trained for there."""
-    at, *_ = workshop.surface.project(np.array(position))
-    areas, normal = workshop.unit_load(at)
-    pressure = float(workshop.load_range(at)[0])
-    return Example(workshop, -pressure * areas[:, None] * normal, pressure, at)
+    at, *_ = problem.surface.project(np.array(position))
+    areas, normal = problem.unit_load(at)
+    pressure = float(load_range(problem, at)[0])
+    return Example(problem, -pressure * areas[:, None] * normal, pressure, at)
 
 
 def compare(
@@ -206,13 +207,13 @@ def compare(
     if contours:
         path = report / f"paper_{example.name}_contours.png"
         errors = fields[CONTOUR_BASES].errors
-        radius = example.workshop.scene.endoscope.radius
-        paper_pictures.contours(path, example.workshop.mesh, errors, example.at, radius)
+        radius = example.problem.scene.endoscope.radius
+        paper_pictures.contours(path, example.problem.mesh, errors, example.at, radius)
     claims = {size: claims_of_figure_2(own) for size, own in fields.items()}
     return {
         "load": {
             "pressure_kPa": example.pressure,
-            "point_P_mm": example.workshop.mesh.nodes[example.point].tolist(),
+            "point_P_mm": example.problem.mesh.nodes[example.point].tolist(),
             "P_moves_mm": moved,
         },
         "figure_1": {f"{row['method']} {row['bases']}": row for row in rows},
@@ -223,14 +224,14 @@ def compare(
 
 def snapshots(example: Example) -> Array:
     """Full solutions (t, n, 3) mm of the history that POD learns from."""
-    full = Full(example.workshop)
+    full = Full(example.problem)
     states = full.follow(tqdm(example.training(), desc="snapshots"))
     return np.array([full.displacement(state) for state in states])
 
 
 def spaces(example: Example, training: Array, size: int) -> dict[str, Array]:
     """Bases of the three methods, (free dofs, <= size), nested."""
-    model = example.workshop.model
+    model = example.problem.model
     load = example.load.reshape(-1, 1)[model.free]
     return {
         "MOD": modal(model, size),
@@ -241,13 +242,13 @@ def spaces(example: Example, training: Array, size: int) -> dict[str, Array]:
 
 def measure(example: Example, training: Array, sizes: Sequence[int]) -> list[dict[str, Any]]:
     """Rows of the table: a method and number of bases each."""
-    workshop = example.workshop
-    methods: dict[tuple[str, int], Method] = {("full", 0): Full(workshop)}
+    problem = example.problem
+    methods: dict[tuple[str, int], Method] = {("full", 0): Full(problem)}
     for name, basis in spaces(example, training, max(sizes)).items():
         for size in sizes:
             if size <= basis.shape[1]:
                 own = basis[:, :size].copy()
-                methods[name, size] = Galerkin(workshop, own, in_time=example.in_time)
+                methods[name, size] = Galerkin(problem, own, in_time=example.in_time)
     full, *others = _in_turns(example, list(methods.values()))
     return [
         {"method": name, "bases": size} | _errors(example, found, full)
@@ -295,14 +296,14 @@ def _in_turns(example: Example, methods: Sequence[Method]) -> list[Timed]:
 
 def _errors(example: Example, found: Timed, full: Timed) -> dict[str, Any]:
     """Columns of the table; means and maxima are over histories."""
-    workshop, P = example.workshop, example.point
+    problem, P = example.problem, example.point
     pairs = list(zip(found.fields, full.fields, strict=True))
     points = [(own.displacements[:, P], exact.displacements[:, P]) for own, exact in pairs]
     worst = [
         np.linalg.norm(u - exact, axis=1).max() / np.linalg.norm(exact, axis=1).max()
         for u, exact in points
     ]
-    whole = np.array([own.errors(workshop, exact) for own, exact in pairs])
+    whole = np.array([own.errors(problem, exact) for own, exact in pairs])
     return {
         "error_at_P_mean": float(np.mean([relative(*pair) for pair in points])),
         "error_at_P_max": float(np.max(worst)),
@@ -317,9 +318,9 @@ def _errors(example: Example, found: Timed, full: Timed) -> dict[str, Any]:
 
 def field_errors(example: Example, training: Array, bases: int) -> FieldErrors:
     """Errors in POD bases: when the load has been held, or at the greatest load that is asked."""
-    workshop, in_time = example.workshop, example.in_time
-    basis = pod(workshop.model, training.reshape(len(training), -1), bases)
+    problem, in_time = example.problem, example.in_time
+    basis = pod(problem.model, training.reshape(len(training), -1), bases)
     steps = example.queries()[-1][: HELD + 1]
-    methods = Galerkin(workshop, basis, in_time=in_time, accurate=EXACT), Full(workshop)
+    methods = Galerkin(problem, basis, in_time=in_time, accurate=EXACT), Full(problem)
     fields = [Fields.of(method, method.follow(steps)[-1:]) for method in methods]
-    return FieldErrors.of(workshop, *fields)
+    return FieldErrors.of(problem, *fields)

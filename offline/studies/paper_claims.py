@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
-from palpate.offline.run.workshop import Workshop
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.studies.references import Fields
 
 Array = NDArray[np.float64]
@@ -82,7 +82,7 @@ class FieldErrors:
     near_support: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, workshop: Workshop, reduced: Fields, full: Fields) -> FieldErrors:
+    def of(cls, problem: FullProblem, reduced: Fields, full: Fields) -> FieldErrors:
         """Compare the fields of one moment."""
         (u, found), (exact, stress) = ((field[0] for field in fields) for fields in (reduced, full))
         values = {"displacement": np.linalg.norm(exact, axis=1), "von Mises stress": stress}
@@ -91,7 +91,7 @@ class FieldErrors:
             name: np.divide(error, value, out=np.full_like(value, np.nan), where=value > 0)
             for (name, value), error in zip(values.items(), off, strict=True)
         }
-        return cls(values, errors, ~workshop.beyond_clamped_layer)
+        return cls(values, errors, ~problem.beyond_clamped_layer)
 
 
 def claims_of_figure_2(errors: FieldErrors) -> dict[str, dict[str, Any]]:

@@ -5,20 +5,20 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.offline.fem.norms import relative
+from palpate.offline.fem.problem import FullProblem, Load, Step, TipPosition
 from palpate.offline.methods.full import Remeshed
 from palpate.offline.methods.method import Case, Method, Snapshots, Steps
+from palpate.offline.reduce.queries import random_histories, random_loads
 from palpate.offline.run.checkpoint import Checkpoint, content_key
 from palpate.offline.run.workers import resume
-from palpate.offline.run.workshop import Load, Workshop
-from palpate.offline.validate.histories import loads_of, random_histories
-from palpate.offline.validate.loads import random_loads
-from palpate.offline.validate.norms import relative
 from palpate.shared.errors import PalpateError
 from palpate.shared.model import ReducedModel
 from palpate.shared.scene import Scene
@@ -41,14 +41,14 @@ class Fields(NamedTuple):
         )
 
     @classmethod
-    def at_once(cls, workshop: Workshop, displacements: Sequence[Array]) -> Fields:
+    def at_once(cls, problem: FullProblem, displacements: Sequence[Array]) -> Fields:
         """Fields of tissue that remembers nothing, with displacements (3 n,) or (n, 3) mm."""
         u = np.reshape(displacements, (len(displacements), -1, 3))
-        return cls(u, np.array([workshop.von_mises(x) for x in u]))
+        return cls(u, np.array([problem.von_mises(x) for x in u]))
 
-    def errors(self, workshop: Workshop, exact: Fields) -> tuple[float, float]:
+    def errors(self, problem: FullProblem, exact: Fields) -> tuple[float, float]:
         """Relative L2 errors over the moments and all nodes, or those beyond the clamped layer."""
-        kept = workshop.beyond_clamped_layer
+        kept = problem.beyond_clamped_layer
         u, s = (field.astype(float) for field in exact)
         return relative(self.displacements, u), relative(self.stresses[:, kept], s[:, kept])
 
@@ -60,18 +60,14 @@ def kept_results(artifact: Path, scene: Scene, name: str, settings: object) -> C
 
 
 def random_steps(
-    atlas: ReducedModel, workshop: Workshop, count: int, rng: np.random.Generator, in_time: bool
+    atlas: ReducedModel, problem: FullProblem, count: int, rng: np.random.Generator, in_time: bool
 ) -> list[Steps]:
     """Random histories of footprints, or single loads, over the whole surface and range."""
     if in_time:
-        histories = [loads_of(presses) for presses in random_histories(atlas, count, rng)]
+        histories = random_histories(atlas, count, rng)
     else:
-        loads = random_loads(atlas.surface, atlas.limits, atlas.scene, count, rng)
-        histories = [([load], [0.0]) for load in loads]
-    return [
-        [(Case.of(workshop, load), dt) for load, dt in zip(*history, strict=True)]
-        for history in histories
-    ]
+        histories = [[load] for load in random_loads(atlas, count, rng)]
+    return [[(Case.of(problem, load), load.dt) for load in history] for history in histories]
 
 
 def full_histories(
@@ -89,20 +85,15 @@ def full_histories(
     tips : set of str
         Names of the histories of the rigid tip, whose contacts tell its centre.
     """
-
-    def task(name: str) -> tuple[Any, ...]:
-        loads = [case.contacts[0] for case, _ in histories[name]]
-        times = [dt for _, dt in histories[name]]
-        if name in tips:
-            return Workshop.follow_tip, np.array([load.position for load in loads]), times
-        return Workshop.follow, loads, times
-
-    def pack(found: Sequence[Any] | None) -> dict[str, Any]:
-        return {} if found is None else {"u": found[0], "s": found[1]}
-
-    tasks = {name: task(name) for name in histories}
-    found = resume("full histories", pool, checkpoint, tasks, pack)
-    return {name: Fields(own["u"], own["s"]) for name, own in found.items() if own}
+    queries: dict[str, list[Step]] = {}
+    for name, steps in histories.items():
+        contacts = [replace(case.contacts[0], dt=dt) for case, dt in steps]
+        queries[name] = [
+            TipPosition(load.position, load.dt) if name in tips else load for load in contacts
+        ]
+    tasks = {name: (FullProblem.reference, query) for name, query in queries.items()}
+    found = resume("full histories", pool, checkpoint, tasks)
+    return {name: Fields(own.u, own.s) for name, own in found.items() if own is not None}
 
 
 def snapshots(histories: Sequence[Steps], found: Sequence[Fields]) -> Snapshots:
@@ -118,14 +109,14 @@ _kept: dict[float, Remeshed] = {}
 """Refined meshes of a worker process, kept from one task to the next."""
 
 
-def refined(workshop: Workshop, scene: Scene, factor: float, load: Load) -> Array:
+def refined(problem: FullProblem, scene: Scene, factor: float, load: Load) -> Array:
     """Displacement (n, 3) mm of a scene's nodes in a finer mesh, nan without an equilibrium.
 
     A task for ``run.workers``, all of one scene.
     """
     if factor not in _kept:
         _kept[factor] = Remeshed(scene, factor)
-    answer = _kept[factor].solve(Case.of(workshop, load))
+    answer = _kept[factor].solve(Case.of(problem, load))
     if answer.converged:
         return _kept[factor].displacement(answer.state)
-    return np.full((len(workshop.mesh.nodes), 3), np.nan)
+    return np.full((len(problem.mesh.nodes), 3), np.nan)

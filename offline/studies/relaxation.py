@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.methods.full import Full
 from palpate.offline.methods.method import Case
 from palpate.offline.methods.shipped import Shipped
-from palpate.offline.run.workshop import Load, Workshop
-from palpate.offline.studies.tables import write_csv
+from palpate.offline.run.tables import write_csv
 from palpate.shared.artifact import read_artifact
 from palpate.shared.errors import QueryError
 from palpate.shared.model import ReducedModel
@@ -50,20 +50,20 @@ def relaxation(artifact: Path, position: Sequence[float] | None = None) -> dict[
     atlas = ReducedModel.load(artifact)
     if atlas.models.viscous is None:
         raise QueryError("scene", f"{atlas.name!r} is elastic: nothing relaxes")
-    workshop = Workshop.of_artifact(read_artifact(artifact))
+    problem = FullProblem.of_artifact(read_artifact(artifact))
     vertices = atlas.surface.vertices
     middle = vertices[np.linalg.norm(vertices - vertices.mean(axis=0), axis=1).argmin()]
     at = middle if position is None else np.array(position)
     x, normal, _, fields = atlas.surface.locate(at, atlas.limits)
     pressure = PRESSED * float(fields[0])
     steps = [
-        (Case.of(workshop, Load(x, -normal, share * pressure)), dt)
+        (Case.of(problem, Load(x, -normal, share * pressure)), dt)
         for dt, share in load_steps(PHASES)
     ]
-    reduced, full = Shipped(workshop, atlas, "in time"), Full(workshop)
+    reduced, full = Shipped(problem, atlas, "in time"), Full(problem)
     reduced.solve(steps[0][0])  # compiles
     answers = reduced.follow(steps)
-    exact = [workshop.under(x, state.displacement) for state in full.follow(tqdm(steps, "full"))]
+    exact = [problem.under(x, state.displacement) for state in full.follow(tqdm(steps, "full"))]
     moved = list(zip(exact, [answer.contact_displacement for answer in answers], strict=True))
     times, depth = np.cumsum([dt for _, dt in steps]), -np.array(moved) @ normal
     force = np.array([np.linalg.norm(answer.force) for answer in answers])

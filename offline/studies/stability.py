@@ -13,7 +13,6 @@ under a moving tool.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -24,20 +23,20 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from palpate.offline.fem.norms import relative
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods.catalogue import Training, build
 from palpate.offline.methods.method import Case, Method, Snapshots, Steps
+from palpate.offline.reduce.queries import random_loads
 from palpate.offline.run.checkpoint import Checkpoint
 from palpate.offline.run.streams import Stage, stream
-from palpate.offline.run.workers import worker_pool
-from palpate.offline.run.workshop import Workshop, open_artifact
+from palpate.offline.run.tables import write_csv
+from palpate.offline.run.workers import open_artifact, worker_pool
 from palpate.offline.studies import hard_cases, outcomes, references
 from palpate.offline.studies.hard_cases import Followed, HardCase
 from palpate.offline.studies.outcomes import Result, Table
 from palpate.offline.studies.references import Fields
-from palpate.offline.studies.tables import write_csv
 from palpate.offline.studies.trajectories import histories
-from palpate.offline.validate.loads import random_loads
-from palpate.offline.validate.norms import relative
 from palpate.shared.artifact import read_artifact
 from palpate.shared.errors import QueryError
 from palpate.shared.model import ReducedModel
@@ -125,15 +124,12 @@ def stability(
         jump end apart, of loads that are raised and that are lowered again, a kind each if there
         are any.
     """
-    atlas, workshop = ReducedModel.load(artifact), Workshop.of_artifact(read_artifact(artifact))
-    everything = hard_cases.HardLoads(atlas, workshop, cases, seed).cases()
+    atlas, problem = ReducedModel.load(artifact), FullProblem.of_artifact(read_artifact(artifact))
+    everything = hard_cases.HardLoads(atlas, problem, cases, seed).cases()
     chosen = {name: everything[name] for name in kinds or everything}
     tissues = sorted({case.poisson for own in chosen.values() for case in own})
-    loads = random_loads(
-        atlas.surface, atlas.limits, atlas.scene, learnt,
-        stream(atlas.scene.seed, Stage.STABILITY_SNAPSHOTS),
-    )  # fmt: skip
-    given = [Case.of(workshop, load) for load in loads]
+    loads = random_loads(atlas, learnt, stream(atlas.scene.seed, Stage.STABILITY_SNAPSHOTS))
+    given = [Case.of(problem, load) for load in loads]
     learning = {f"snapshots {p:g}": [HardCase(((x, 0.0),), p) for x in given] for p in tissues}
     settings = cases, seed, learnt, list(chosen)
     checkpoint = references.kept_results(artifact, atlas.scene, "stability", settings)
@@ -143,7 +139,7 @@ def stability(
     pairs |= hard_cases.several(pairs, cases)
     table: dict[str, dict[str, list[Result]]] = {}
     for poisson, solutions in zip(tissues, learning, strict=True):
-        own_tissue = hard_cases.tissue(workshop, poisson)
+        own_tissue = hard_cases.tissue(problem, poisson)
         training = _training(own_tissue, atlas, found[solutions])
         questions = {
             name: [_question(own_tissue, *pair) for pair in own]
@@ -203,13 +199,13 @@ def stability_in_time(
     atlas = ReducedModel.load(artifact)
     if atlas.models.viscous is None:
         raise QueryError("scene", f"{atlas.name!r} is elastic: it has no histories")
-    workshop = Workshop.of_artifact(read_artifact(artifact))
+    problem = FullProblem.of_artifact(read_artifact(artifact))
     with_tip = atlas.models.viscous_tips is not None
     wanted = [name for name in methods or METHODS_IN_TIME if with_tip or name != TIP]
     hard = {
         (tip, name): own
         for tip in sorted({name == TIP for name in wanted})
-        for name, own in histories(atlas, workshop, tip, cases, seed, many).items()
+        for name, own in histories(atlas, problem, tip, cases, seed, many).items()
         if kinds is None or name in kinds
     }
     settings = cases, seed, many, learnt, list(hard)
@@ -221,7 +217,7 @@ def stability_in_time(
         if not case.nonsense
     }
     rng = stream(atlas.scene.seed, Stage.STABILITY_IN_TIME_SNAPSHOTS)
-    made = references.random_steps(atlas, workshop, learnt, rng, in_time=True)
+    made = references.random_steps(atlas, problem, learnt, rng, in_time=True)
     learning = {f"snapshots {i}": steps for i, steps in enumerate(made)}
     tips = frozenset(name for name in tasks if name.startswith("True"))
     with worker_pool(open_artifact, artifact) as pool:
@@ -231,7 +227,7 @@ def stability_in_time(
         answers = [found.get(f"{tip} {name} {i}") for i in range(len(own))]
         questions[tip][name] = [Question(*pair) for pair in zip(own, answers, strict=True)]
     solved = references.snapshots(made, [found[name] for name in learning if name in found])
-    training = Training(workshop, solved, atlas, in_time=True)
+    training = Training(problem, solved, atlas, in_time=True)
     table = {}
     for name in tqdm(wanted, "methods"):
         every = LARGER if name == STEPS else 1
@@ -248,15 +244,15 @@ def stability_in_time(
 # --- what is asked -------------------------------------------------------------------------------
 
 
-def _training(workshop: Workshop, atlas: ReducedModel, found: Sequence[Followed]) -> Training:
+def _training(problem: FullProblem, atlas: ReducedModel, found: Sequence[Followed]) -> Training:
     solved = [(case.last.contacts[0], u.jump) for case, u in found if u.jump is not None]
     loads, displacements = zip(*solved, strict=True)
-    return Training(workshop, Snapshots(loads, np.stack(displacements)), atlas)
+    return Training(problem, Snapshots(loads, np.stack(displacements)), atlas)
 
 
-def _question(workshop: Workshop, case: HardCase, truth: Any) -> Question:
+def _question(problem: FullProblem, case: HardCase, truth: Any) -> Question:
     found = truth.path, truth.jump, truth.other
-    fields = [None if u is None else Fields.at_once(workshop, [u]) for u in found]
+    fields = [None if u is None else Fields.at_once(problem, [u]) for u in found]
     return Question(case, *fields)
 
 
@@ -280,14 +276,11 @@ def _kept(
 ) -> dict[str, list[Result]]:
     """A method's results by kind of case; kept, for some methods take their time."""
     name = f"answers {label}"
-    kept = checkpoint.load(name)
-    if kept is None:
-        found = answers([question for own in questions.values() for question in own])
-        text = json.dumps([vars(result) for result in found])
-        kept = {"results": np.array(text, dtype=bytes)}
-        checkpoint.store(name, kept)
-    rows = iter(json.loads(kept["results"].item()))
-    return {kind: [Result(**next(rows)) for _ in own] for kind, own in questions.items()}
+    if name not in checkpoint:
+        everything = [question for own in questions.values() for question in own]
+        checkpoint.store(name, answers(everything))
+    results = iter(checkpoint.load(name))
+    return {kind: [next(results) for _ in own] for kind, own in questions.items()}
 
 
 def _answers(
@@ -297,15 +290,15 @@ def _answers(
     every: int = 1,
 ) -> list[Result]:
     """What becomes of a method's answers; of the full model's jump if there is no method."""
-    workshop = training.workshop
+    problem = training.problem
     if named is None:
-        judge = partial(outcomes.classify, workshop)
+        judge = partial(outcomes.classify, problem)
         return [judge(q.jump, q.jump is not None, q.exact, q.other) for q in questions]
     method = build(*named, training)
-    return [_answer(method, workshop, question, every) for question in questions]
+    return [_answer(method, problem, question, every) for question in questions]
 
 
-def _answer(method: Method, workshop: Workshop, question: Question, every: int) -> Result:
+def _answer(method: Method, problem: FullProblem, question: Question, every: int) -> Result:
     """What becomes of a case, answered in steps as large as ``every`` of its steps."""
     case, exact = question.case, question.exact
     steps = case.brief if every > 1 and case.brief else case.steps
@@ -321,7 +314,7 @@ def _answer(method: Method, workshop: Workshop, question: Question, every: int) 
             if exact is not None:
                 exact = Fields(*(field[counted] for field in exact))
             found = Fields.of(method, states) if states else None
-            result = outcomes.classify(workshop, found, trusted, exact, question.other)
+            result = outcomes.classify(problem, found, trusted, exact, question.other)
             if states and case.brief:
                 result = replace(result, drift=_drift(method, case, states[-1]))
             return result

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.offline.bench import limit_at
+from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.methods.method import Case
+from palpate.offline.reduce.queries import LIFTED
 from palpate.offline.reduce.sampling import random_points_and_rim, tangents
 from palpate.offline.run.streams import Stage, stream
-from palpate.offline.run.workshop import Load, Workshop
 from palpate.offline.studies.hard_cases import HardCase
 from palpate.offline.studies.relaxation import load_steps
-from palpate.offline.validate.tip_histories import OFF
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.mechanics.tissue import Tissue
 from palpate.shared.model import ReducedModel
@@ -53,8 +53,8 @@ Maker = Callable[[Array], HardCase]
 class Presser:
     """Turns levels of a load at places into steps, by footprints or by the rigid tip."""
 
-    def __init__(self, atlas: ReducedModel, workshop: Workshop, tip: bool) -> None:
-        self._atlas, self._workshop, self.tip = atlas, workshop, tip
+    def __init__(self, atlas: ReducedModel, problem: FullProblem, tip: bool) -> None:
+        self._atlas, self._problem, self.tip = atlas, problem, tip
         self._cases: dict[tuple[float, ...], Case] = {}
 
     def __call__(self, at: Array, level: float, dt: float, tilt: float = 0.0) -> Step:
@@ -68,11 +68,11 @@ class Presser:
         atlas = self._atlas
         x, normal, _, fields = atlas.surface.locate(at, atlas.limits)
         if self.tip:
-            depth = level * fields[TIP_DEPTH] if level > 0.0 else -OFF
+            depth = level * fields[TIP_DEPTH] if level > 0.0 else -LIFTED
             return Case.of_tip(x + (atlas.scene.endoscope.radius - depth) * normal, -normal)
         lean = np.radians(tilt)
         direction = np.sin(lean) * tangents(normal)[0] - np.cos(lean) * normal
-        return Case.of(self._workshop, Load(x, direction, level * limit_at(atlas, x, direction)))
+        return Case.of(self._problem, Load(x, direction, level * limit_at(atlas, x, direction)))
 
     def aside(self, at: Array, distance: float) -> Array:
         """The place (3,) at a distance (mm) over the surface, always the same way."""
@@ -82,7 +82,7 @@ class Presser:
 
 
 def histories(
-    atlas: ReducedModel, workshop: Workshop, tip: bool, cases: int, seed: int, many: int
+    atlas: ReducedModel, problem: FullProblem, tip: bool, cases: int, seed: int, many: int
 ) -> dict[str, list[HardCase]]:
     """Histories of every kind by its name, in so many places; the longest of ``many`` steps in one.
 
@@ -91,7 +91,7 @@ def histories(
     rng = stream(atlas.scene.seed, Stage.HARD_CASES_IN_TIME, seed)
     # the first is on the rim
     places = list(random_points_and_rim(atlas.surface, cases, rng))
-    makers = _makers(Presser(atlas, workshop, tip), atlas.scene.tissue, rng, places, many)
+    makers = _makers(Presser(atlas, problem, tip), atlas.scene.tissue, rng, places, many)
     return {
         name: [make(at) for at in (places[-1:] if name.endswith("steps") else places)]
         for name, make in makers.items()

@@ -5,7 +5,7 @@ import pytest
 
 from palpate.offline import bench as timing
 from palpate.offline.bench import STEP, bench, walk
-from palpate.offline.validate.loads import unseen_loads
+from palpate.offline.validate.against_full import held_out_loads
 from palpate.shared.model import ReducedModel
 
 KINDS = ["cold_us", "warm_us", "surface_us", "fields_us", "full_us", "tip_us"]
@@ -29,7 +29,7 @@ def test_every_kind_of_query_is_timed(artifact):
 
 def test_a_walk_stays_on_the_surface_and_in_range(artifact, rng):
     atlas = ReducedModel.load(artifact)
-    for start in unseen_loads(atlas, 5, 0):
+    for start in held_out_loads(atlas, 5, 0):
         loads = walk(atlas, start, 300, rng)
         assert len(loads) == 300
         positions = np.array([load.position for load in loads])

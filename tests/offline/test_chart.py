@@ -8,7 +8,8 @@ import pytest
 from palpate.offline.scenes import find_scene
 from palpate.offline.studies import chart as study
 from palpate.offline.studies.chart_drawing import FULL, SHIPPED, TWIN, pareto
-from palpate.offline.validate.loads import validate
+from palpate.offline.validate.against_full import against_full
+from palpate.offline.validate.kinds import LOADS
 from palpate.shared.errors import PalpateError, QueryError
 from palpate.shared.model import ReducedModel
 
@@ -82,7 +83,7 @@ def test_the_mesh_s_error_shows_only_against_the_refined_one(report):
 
 
 def test_the_artifact_s_errors_are_those_of_validate(report, artifact):
-    validated, found = validate(artifact, QUERIES, 1), report["points"][SHIPPED]
+    validated, found = against_full(artifact, LOADS, QUERIES, 1), report["points"][SHIPPED]
     for field in ("displacement", "von_mises"):
         for statistic in ("p95", "max"):
             expected = pytest.approx(validated[field][statistic], rel=1e-4)

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from palpate.offline.fem.mesh import local_thickness
-from palpate.offline.run.workshop import Workshop
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.scenes import find_scene
 from palpate.offline.studies import paper, paper_claims, paper_pictures
 from palpate.offline.studies.relaxation import load_steps
@@ -23,7 +23,7 @@ PNG = b"\x89PNG\r\n\x1a\n"
 def coarse(name, *divisions):
     scene = find_scene(name)
     geometry = scene.geometry.model_copy(update={"divisions": divisions})
-    return Workshop(scene.model_copy(update={"geometry": geometry}))
+    return FullProblem(scene.model_copy(update={"geometry": geometry}))
 
 
 @pytest.fixture(autouse=True)
@@ -40,7 +40,7 @@ def pressed():
 @pytest.mark.parametrize(("name", "rounds"), [("cube", 3), ("cube-visco", 1)])
 def test_the_cube_under_compression(tmp_path, monkeypatch, name, rounds):
     divisions = (4, 4, 4) if name == "cube" else (2, 2, 2)
-    monkeypatch.setattr(paper, "Workshop", lambda scene: coarse(scene.name, *divisions))
+    monkeypatch.setattr(paper, "FullProblem", lambda scene: coarse(scene.name, *divisions))
     monkeypatch.setattr(paper, "ROUNDS", rounds)
     report = tmp_path / "new"
     arguments = ["study", "cube", name, "--report", str(report), "--json"]
@@ -86,9 +86,9 @@ def test_the_turbinate_under_a_footprint(tmp_path, pressed):
 
 def test_the_footprint_presses_as_hard_as_is_trained_for(pressed):
     largest = np.linalg.norm(paper.snapshots(pressed)[-1], axis=1).max()
-    allowed = pressed.workshop.scene.load.max_indentation
-    at, normal, _ = pressed.workshop.surface.project(np.array(paper.MEDIAL))
-    (thickness,) = local_thickness(pressed.workshop.mesh, at[None], normal[None])
+    allowed = pressed.problem.scene.load.max_indentation
+    at, normal, _ = pressed.problem.surface.project(np.array(paper.MEDIAL))
+    (thickness,) = local_thickness(pressed.problem.mesh, at[None], normal[None])
     assert largest == pytest.approx(allowed * thickness, rel=0.05)
 
 
@@ -107,11 +107,11 @@ def test_pod_is_asked_another_history_than_it_learns_from():
 
 
 def test_the_cube_bears_its_pressure_for_ever(monkeypatch):
-    monkeypatch.setattr(paper, "Workshop", lambda scene: coarse(scene.name, 2, 2, 2))
+    monkeypatch.setattr(paper, "FullProblem", lambda scene: coarse(scene.name, 2, 2, 2))
     monkeypatch.setattr(paper, "compare", lambda example, report: example)
     example = paper.cube("cube-visco", None)
     assert example.in_time
-    relaxed = example.workshop.model.relaxed.solve(example.load).displacement
+    relaxed = example.problem.model.relaxed.solve(example.load).displacement
     assert 0.5 < -relaxed[example.point, 2] < 2.0
     assert np.abs(relaxed[example.point, :2]).max() < 1e-3
 
@@ -126,7 +126,7 @@ def test_tenths_are_by_value():
 
 def test_contours(tmp_path, pressed):
     pytest.importorskip("pyvista")
-    mesh = pressed.workshop.mesh
+    mesh = pressed.problem.mesh
     error = np.where(mesh.clamped, np.nan, 10.0 ** -mesh.nodes[:, 0])
     out = tmp_path / "new" / "contours.png"
     paper_pictures.contours(out, mesh, {"displacement": error, "stress": error}, pressed.at, 2.0)

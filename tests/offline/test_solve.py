@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from palpate.offline.fem.model import NoEquilibrium
-from palpate.offline.run.workshop import Workshop
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.scenes import find_scene
 from palpate.offline.solve import solve
 from palpate.shared import query
@@ -19,8 +19,8 @@ DIRECTION = (0.2, 0.1, -1.0)
 
 
 @pytest.fixture(scope="module")
-def workshop(artifact):
-    return Workshop.of_artifact(read_artifact(artifact))
+def problem(artifact):
+    return FullProblem.of_artifact(read_artifact(artifact))
 
 
 @pytest.fixture(scope="module")
@@ -50,18 +50,18 @@ def test_the_report_is_that_of_the_atlas(artifact, pressure):
     json.dumps(report, allow_nan=False)
 
 
-def test_the_full_model_is_in_equilibrium_on_the_written_mesh(workshop, solved):
+def test_the_full_model_is_in_equilibrium_on_the_written_mesh(problem, solved):
     _, mesh = solved
-    np.testing.assert_array_equal(mesh.points, workshop.mesh.nodes)
-    np.testing.assert_array_equal(mesh.point_data["clamped"] != 0, workshop.mesh.clamped)
+    np.testing.assert_array_equal(mesh.points, problem.mesh.nodes)
+    np.testing.assert_array_equal(mesh.point_data["clamped"] != 0, problem.mesh.clamped)
     force, load = np.zeros(mesh.points.size), mesh.point_data["load"]
     displacement = mesh.point_data["displacement"]
-    workshop.model.internal(displacement.ravel(), force)
-    free = workshop.model.free
+    problem.model.internal(displacement.ravel(), force)
+    free = problem.model.free
     residual = (force - load.ravel())[free]
     assert np.linalg.norm(residual) < 1e-8 * np.linalg.norm(load)
-    assert np.abs(displacement[workshop.mesh.clamped]).max() == 0.0
-    np.testing.assert_allclose(mesh.point_data["von_mises"], workshop.von_mises(displacement))
+    assert np.abs(displacement[problem.mesh.clamped]).max() == 0.0
+    np.testing.assert_allclose(mesh.point_data["von_mises"], problem.von_mises(displacement))
 
 
 def test_load_and_force_agree(solved):
@@ -70,9 +70,9 @@ def test_load_and_force_agree(solved):
     np.testing.assert_allclose(report["force"], -pushed, rtol=1e-9)  # on the tool
 
 
-def test_the_errors_are_those_of_the_written_fields(workshop, solved):
+def test_the_errors_are_those_of_the_written_fields(problem, solved):
     report, mesh = solved
-    kept = workshop.beyond_clamped_layer
+    kept = problem.beyond_clamped_layer
     for name, nodes in (("displacement", slice(None)), ("von_mises", kept)):
         exact, off = mesh.point_data[name][nodes], mesh.point_data[f"{name}_error"][nodes]
         error = np.linalg.norm(off) / np.linalg.norm(exact)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from palpate.offline.fem.model import NoEquilibrium
+from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.methods.method import Case
-from palpate.offline.run.workshop import Load, Workshop
 from palpate.offline.scenes import find_scene
 from palpate.offline.studies import stability as study
 from palpate.offline.studies.hard_cases import (
@@ -148,18 +148,18 @@ def test_a_load_that_snapped_and_was_lowered_stays_on_its_branch():
 
 
 @pytest.fixture(scope="module")
-def workshop():
-    return Workshop(find_scene("quick"))
+def problem():
+    return FullProblem(find_scene("quick"))
 
 
-def test_an_answer_on_another_branch_is_told_apart_and_counts_as_silent(workshop):
-    x, normal, _ = workshop.surface.project(np.array([4.0, 5.5, 8.0]))
-    path, jump = (workshop.sample(Load(x, -normal, p)).ravel().astype(float) for p in (1.5, 1.0))
+def test_an_answer_on_another_branch_is_told_apart_and_counts_as_silent(problem):
+    x, normal, _ = problem.surface.project(np.array([4.0, 5.5, 8.0]))
+    path, jump = (problem.solve(Load(x, -normal, p)).displacement.ravel() for p in (1.5, 1.0))
 
     def outcome(u, trusted, truth):
-        question = study._question(workshop, None, truth)
-        found = study._question(workshop, None, Equilibria(u, u)).exact
-        return classify(workshop, found, trusted, question.exact, question.other).outcome
+        question = study._question(problem, None, truth)
+        found = study._question(problem, None, Equilibria(u, u)).exact
+        return classify(problem, found, trusted, question.exact, question.other).outcome
 
     truth = Equilibria(path, jump)
     outcomes = {

@@ -5,7 +5,7 @@ import csv
 import numpy as np
 import pytest
 
-from palpate.offline.run.workshop import Workshop
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.studies import trajectories
 from palpate.offline.studies.outcomes import OUTCOMES, REFUSED, RIGHT, RIGHT_FLAGGED
 from palpate.offline.studies.stability import LOADS, STEPS, TIP, stability_in_time
@@ -84,13 +84,13 @@ def test_every_cell_counts_its_cases(rows):
 
 def test_brief_histories_end_when_and_where_the_long_ones_do(visco_artifact):
     atlas = ReducedModel.load(visco_artifact)
-    workshop = Workshop.of_artifact(read_artifact(visco_artifact))
+    problem = FullProblem.of_artifact(read_artifact(visco_artifact))
 
     def seconds(steps):
         return sum(dt for _, dt in steps)
 
     for tip in (False, True):
-        found = histories(atlas, workshop, tip, CASES, SEED, MANY)
+        found = histories(atlas, problem, tip, CASES, SEED, MANY)
         long = {name: own[0] for name, own in found.items() if own[0].brief}
         assert len(long) == 3
         for name, case in long.items():

@@ -11,8 +11,9 @@ import h5py
 import numpy as np
 import pytest
 
+from palpate.offline.fem.problem import FullProblem
+from palpate.offline.reduce.footprint_models import compile_query
 from palpate.offline.run.checkpoint import content_key
-from palpate.offline.run.workshop import Workshop
 from palpate.offline.scenes import filled, find_scene
 from palpate.offline.train import is_of, train
 from palpate.shared.artifact import read_artifact
@@ -37,7 +38,7 @@ def start(path):
 
 def finished(path):
     """Results on disk, by path; parts of a write that was cut off do not count."""
-    return sorted((path.parent / f".{path.stem}.training").glob("*/*.h5"))
+    return sorted((path.parent / f".{path.stem}.training").glob("*/*.pickle"))
 
 
 def kill_after(process, path, name):
@@ -126,8 +127,8 @@ def test_nothing_is_left_beside_the_artifact(resumed):
 
 def test_one_compilation_serves_training_and_queries(artifact):
     atlas = ReducedModel.load(artifact)
-    workshop = Workshop.of_artifact(read_artifact(artifact))
-    workshop.compile_query()
+    problem = FullProblem.of_artifact(read_artifact(artifact))
+    compile_query(problem)
     atlas.press(atlas.surface.vertices[0], 0.1)
     queries = press.place, press.press, touch.place, touch.touch
     known = [len(query.signatures) for query in queries]

@@ -185,8 +185,8 @@ def our_step(model, load):
 
     def step(state):
         model.internal(state.ravel(), force)
-        model._solver.factorise(model.stiffness(state.ravel()).data)
-        return model._solver.solve((full_load - force)[model.free])
+        model.solver.factorise(model.stiffness(state.ravel()).data)
+        return model.solver.solve((full_load - force)[model.free])
 
     return step
 

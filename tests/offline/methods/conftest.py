@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
 
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods.catalogue import Training
 from palpate.offline.methods.method import Snapshots
-from palpate.offline.run.workshop import Workshop
-from palpate.offline.validate.loads import random_loads, unseen_loads
+from palpate.offline.reduce.queries import random_loads
+from palpate.offline.validate.against_full import held_out_loads
 from palpate.shared.artifact import read_artifact
 from palpate.shared.model import ReducedModel
 
@@ -17,20 +18,20 @@ def atlas(artifact):
 
 
 @pytest.fixture(scope="session")
-def workshop(artifact):
-    return Workshop.of_artifact(read_artifact(artifact))
+def problem(artifact):
+    return FullProblem.of_artifact(read_artifact(artifact))
 
 
 @pytest.fixture(scope="session")
-def training(atlas, workshop):
+def training(atlas, problem):
     rng = np.random.default_rng(0)
-    loads = random_loads(atlas.surface, atlas.limits, atlas.scene, SNAPSHOTS, rng)
-    solved = [workshop.solve(load).displacement.ravel() for load in loads]
-    return Training(workshop, Snapshots(loads, np.stack(solved)), atlas)
+    loads = random_loads(atlas, SNAPSHOTS, rng)
+    solved = [problem.solve(load).displacement.ravel() for load in loads]
+    return Training(problem, Snapshots(loads, np.stack(solved)), atlas)
 
 
 @pytest.fixture(scope="session")
-def queries(atlas, workshop):
+def queries(atlas, problem):
     """Return loads that no method has seen, and their full solutions (n, 3)."""
-    loads = unseen_loads(atlas, QUERIES, 1)
-    return [(load, workshop.solve(load).displacement) for load in loads]
+    loads = held_out_loads(atlas, QUERIES, 1)
+    return [(load, problem.solve(load).displacement) for load in loads]

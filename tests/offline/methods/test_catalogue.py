@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from palpate.offline.fem.norms import relative
+from palpate.offline.fem.problem import Load
 from palpate.offline.methods.catalogue import BUILDERS, MESHED, build
 from palpate.offline.methods.method import Case
-from palpate.offline.run.workshop import Load
-from palpate.offline.validate.loads import relative
 from palpate.shared.errors import PalpateError
 
 SIZE = 18
@@ -55,10 +55,10 @@ def test_the_list_here_is_whole():
 
 
 @pytest.mark.parametrize("name", ERRORS)
-def test_a_method_answers_unseen_loads(methods, workshop, queries, name):
+def test_a_method_answers_unseen_loads(methods, problem, queries, name):
     method, errors = methods[name], []
     for load, exact in queries:
-        answer = method.solve(Case.of(workshop, load))
+        answer = method.solve(Case.of(problem, load))
         found = method.displacement(answer.state)
         assert answer.converged
         assert found.shape == exact.shape
@@ -73,10 +73,10 @@ def test_a_method_has_the_size_asked_for(methods, name):
 
 
 @pytest.mark.parametrize("name", ERRORS)
-def test_two_contacts_are_answered_or_refused(methods, workshop, queries, name):
+def test_two_contacts_are_answered_or_refused(methods, problem, queries, name):
     loads = [load for load, _ in queries[:2]]
-    case, method = Case.of(workshop, *loads), methods[name]
-    exact = workshop.model.solve(sum(workshop.load_vector(load) for load in loads)).displacement
+    case, method = Case.of(problem, *loads), methods[name]
+    exact = problem.model.solve(sum(problem.load_vector(load) for load in loads)).displacement
     answer = method.solve(case)
     found = method.displacement(answer.state)
     assert answer.converged == answer.trusted == (name not in SINGLE)
@@ -87,25 +87,25 @@ def test_two_contacts_are_answered_or_refused(methods, workshop, queries, name):
 
 
 @pytest.mark.parametrize("name", ERRORS)
-def test_no_load_is_too_much_to_say_so(methods, workshop, queries, name):
+def test_no_load_is_too_much_to_say_so(methods, problem, queries, name):
     load = queries[0][0]
-    case = Case.of(workshop, Load(load.position, load.direction, 1e6 * load.pressure))
+    case = Case.of(problem, Load(load.position, load.direction, 1e6 * load.pressure))
     answer = methods[name].solve(case)
-    assert methods[name].displacement(answer.state).shape == (len(workshop.mesh.nodes), 3)
+    assert methods[name].displacement(answer.state).shape == (len(problem.mesh.nodes), 3)
     assert answer.converged == (name in BLIND)
 
 
-def test_the_artifact_does_not_vouch_for_a_load_beyond_its_range(methods, workshop, atlas, queries):
+def test_the_artifact_does_not_vouch_for_a_load_beyond_its_range(methods, problem, atlas, queries):
     load = queries[0][0]
     limit = atlas.press(load.position, load.pressure, load.direction).pressure_limit
     beyond = Load(load.position, load.direction, 1.2 * limit)
-    answer = methods["artifact"].solve(Case.of(workshop, beyond))
+    answer = methods["artifact"].solve(Case.of(problem, beyond))
     assert answer.converged
     assert not answer.trusted
 
 
-def test_a_method_is_the_same_whatever_was_built_before(training, methods, workshop, queries):
-    case = Case.of(workshop, queries[0][0])
+def test_a_method_is_the_same_whatever_was_built_before(training, methods, problem, queries):
+    case = Case.of(problem, queries[0][0])
     again = build("pod-ecm", SIZE, replace(training))
     np.testing.assert_array_equal(again.solve(case).state, methods["pod-ecm"].solve(case).state)
 

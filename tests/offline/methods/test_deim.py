@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from palpate.offline.fem.problem import Load
 from palpate.offline.methods.deim import Deim, Samples, force_modes, sample
 from palpate.offline.methods.galerkin import Galerkin
 from palpate.offline.methods.method import Case
-from palpate.offline.run.workshop import Load
-from palpate.offline.validate.loads import unseen_loads
+from palpate.offline.validate.against_full import held_out_loads
 
 MODES = 12
 
@@ -25,7 +25,7 @@ def modes(training):
 
 @pytest.fixture(scope="module")
 def galerkin(training, basis):
-    return Galerkin(training.workshop, basis)
+    return Galerkin(training.problem, basis)
 
 
 @pytest.fixture(scope="module")
@@ -33,13 +33,13 @@ def complete(training, basis):
     """Return the method with every dof sampled: Galerkin's, with plain Newton."""
     every = np.eye(len(training.model.free))
     samples = Samples(np.arange(len(every)), every)
-    return Deim(training.workshop, basis, every, samples)
+    return Deim(training.problem, basis, every, samples)
 
 
 def test_with_every_dof_sampled_it_is_galerkin_s_method(training, complete, galerkin, queries):
     assert len(complete.points) == training.model.weights.size
     for load, _ in queries:
-        case = Case.of(training.workshop, load)
+        case = Case.of(training.problem, load)
         found, exact = complete.solve(case), galerkin.solve(case)
         assert found.converged
         off = np.linalg.norm(found.state - exact.state)
@@ -76,11 +76,11 @@ def test_beyond_its_range_it_fails_where_galerkin_does_not_and_fits_fail_less(
     training, basis, modes, complete, galerkin
 ):
     cases = []
-    for load in unseen_loads(training.atlas, 40, 1):
+    for load in held_out_loads(training.atlas, 40, 1):
         beyond = Load(load.position, load.direction, 4 * load.pressure)
-        cases.append(Case.of(training.workshop, beyond))
+        cases.append(Case.of(training.problem, beyond))
     interpolated, fitted = (
-        Deim(training.workshop, basis, modes, sample(modes, per_mode)) for per_mode in (1, 3)
+        Deim(training.problem, basis, modes, sample(modes, per_mode)) for per_mode in (1, 3)
     )
     found = [
         sum(method.solve(case).converged for case in cases)

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.methods.full import Full
 from palpate.offline.methods.galerkin import Galerkin
 from palpate.offline.methods.method import Case
 from palpate.offline.methods.spaces import modal, pod
-from palpate.offline.run.workshop import Load, Workshop
 from palpate.offline.scenes import find_scene
 
 STEPS = ((0.5, 0.02), (1.0, 0.05), (1.0, 0.3), (1.0, 2.0), (0.2, 0.01), (0.0, 0.0), (0.0, 0.5))
@@ -15,17 +15,17 @@ STEPS = ((0.5, 0.02), (1.0, 0.05), (1.0, 0.3), (1.0, 2.0), (0.2, 0.01), (0.0, 0.
 
 
 @pytest.fixture(scope="module")
-def workshop():
+def problem():
     scene = find_scene("quick-visco")
     coarse = scene.geometry.model_copy(update={"divisions": (3, 3, 2)})
-    return Workshop(scene.model_copy(update={"geometry": coarse}))
+    return FullProblem(scene.model_copy(update={"geometry": coarse}))
 
 
 @pytest.fixture(scope="module")
-def cases(workshop):
+def cases(problem):
     down = np.array([0.3, 0.0, -1.0]) / np.hypot(0.3, 1.0)
     at = np.array([4.0, 5.5, 8.0])
-    return [Case.of(workshop, Load(at, down, 1.5 * share)) for share, _ in STEPS]
+    return [Case.of(problem, Load(at, down, 1.5 * share)) for share, _ in STEPS]
 
 
 def states(method, cases):
@@ -39,18 +39,18 @@ def states(method, cases):
 
 
 @pytest.fixture(scope="module")
-def exact(workshop, cases):
-    return states(Full(workshop), cases)
+def exact(problem, cases):
+    return states(Full(problem), cases)
 
 
 @pytest.fixture(scope="module")
-def in_its_own_modes(workshop, exact):
+def in_its_own_modes(problem, exact):
     known = np.array([state.displacement.ravel() for state in exact])
-    return Galerkin(workshop, pod(workshop.model, known, 8), in_time=True, accurate=1e-6)
+    return Galerkin(problem, pod(problem.model, known, 8), in_time=True, accurate=1e-6)
 
 
-def test_a_basis_that_holds_the_history_finds_it(workshop, cases, exact, in_its_own_modes):
-    method, full = in_its_own_modes, Full(workshop)
+def test_a_basis_that_holds_the_history_finds_it(problem, cases, exact, in_its_own_modes):
+    method, full = in_its_own_modes, Full(problem)
     found = states(method, cases)
     for name, off in (("displacement", 1e-4), ("von_mises", 1e-3)):
         ours, true = (
@@ -65,8 +65,8 @@ def test_it_remembers_at_the_points_what_the_full_model_does(cases, exact, in_it
     np.testing.assert_allclose(found, true, atol=1e-3 * np.abs(true).max())
 
 
-def test_few_modes_are_stiffer_and_a_step_changes_no_state(workshop, cases, exact):
-    method = Galerkin(workshop, modal(workshop.model, 6), in_time=True)
+def test_few_modes_are_stiffer_and_a_step_changes_no_state(problem, cases, exact):
+    method = Galerkin(problem, modal(problem.model, 6), in_time=True)
     first = method.at_rest()
     second = method.step(first, cases[0], 0.02).state
     assert not method.opened(first).q.any()
@@ -77,7 +77,7 @@ def test_few_modes_are_stiffer_and_a_step_changes_no_state(workshop, cases, exac
     assert 0.0 < work[0] < work[1]
 
 
-def test_time_does_not_go_back(workshop, cases, in_its_own_modes):
-    for method in (Full(workshop), in_its_own_modes):
+def test_time_does_not_go_back(problem, cases, in_its_own_modes):
+    for method in (Full(problem), in_its_own_modes):
         with pytest.raises(ValueError, match="dt"):
             method.step(method.at_rest(), cases[0], -0.1)

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from palpate.offline.fem.norms import relative
+from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.methods.lattice import scaled
 from palpate.offline.methods.mass_spring import POISSON, MassSpring, identify, spring_forces
 from palpate.offline.methods.method import Case
 from palpate.offline.methods.relaxation import TOLERANCE
 from palpate.offline.methods.tensor_mass import TensorMass
 from palpate.offline.methods.tetrahedra import Tetrahedra, edges_of, stiffness
-from palpate.offline.run.workshop import Load, Workshop
 from palpate.offline.scenes import find_scene
-from palpate.offline.validate.norms import relative
 
 YOUNG = 15.0
 POINT = np.array([4.0, 6.0, 8.0])
@@ -20,13 +20,13 @@ DOWN = np.array([0.0, 0.0, -1.0])
 
 
 @pytest.fixture(scope="module")
-def workshop():
-    return Workshop(find_scene("quick"))
+def problem():
+    return FullProblem(find_scene("quick"))
 
 
 @pytest.fixture(scope="module")
-def springs(workshop):
-    return MassSpring(workshop, (4, 3, 3))
+def springs(problem):
+    return MassSpring(problem, (4, 3, 3))
 
 
 def force_of(body, displacement):
@@ -96,9 +96,9 @@ def test_springs_of_a_regular_tetrahedron_are_lloyds():
     np.testing.assert_allclose(identify(points, elements, ends, YOUNG), expected, rtol=1e-3)
 
 
-def test_identified_springs_are_the_nearest(workshop, rng):
+def test_identified_springs_are_the_nearest(problem, rng):
     """No other nonnegative stiffnesses come nearer to the matrix of the tetrahedra."""
-    mesh = Tetrahedra.of(workshop, (4, 3, 3))
+    mesh = Tetrahedra.of(problem, (4, 3, 3))
     ends = edges_of(mesh.both_cuts)
     found = identify(mesh.nodes, mesh.both_cuts, ends, YOUNG)
     wanted = 0.5 * stiffness(mesh.nodes, mesh.both_cuts, YOUNG, POISSON).toarray()
@@ -123,12 +123,12 @@ def test_identified_springs_are_the_nearest(workshop, rng):
         assert distance(np.maximum(found + change, 0.0)) > best
 
 
-def small_errors(workshop, method):
+def small_errors(problem, method):
     """Errors under a small load, of both models' linear answers in effect: fitted, and not."""
-    case = Case.of(workshop, Load(POINT, DOWN, 1e-3))
-    load, free = case.load(len(workshop.mesh.nodes)), workshop.model.free
+    case = Case.of(problem, Load(POINT, DOWN, 1e-3))
+    load, free = case.load(len(problem.mesh.nodes)), problem.model.free
     expected = np.zeros(load.size)
-    expected[free] = workshop.model.solve_linear(load.ravel()[free])
+    expected[free] = problem.model.solve_linear(load.ravel()[free])
     found = method.displacement(method.solve(case).state)
     return [relative(u, expected.reshape(-1, 3)) for u in (found, method.factor * found)]
 
@@ -138,17 +138,17 @@ def test_tissue_of_a_networks_own_ratio_is_met_better_and_fitting_helps():
     scene, error = find_scene("quick"), {}
     for poisson in (POISSON, 0.45):
         tissue = scene.tissue.model_copy(update={"poisson": poisson})
-        workshop = Workshop(scene.model_copy(update={"tissue": tissue}))
-        error[poisson] = small_errors(workshop, MassSpring(workshop, scaled(scene, 2)))[0]
+        problem = FullProblem(scene.model_copy(update={"tissue": tissue}))
+        error[poisson] = small_errors(problem, MassSpring(problem, scaled(scene, 2)))[0]
     assert error[POISSON] < 0.2
     assert error[0.45] > 1.5 * error[POISSON]
-    fitted, plain = small_errors(workshop, MassSpring(workshop, scaled(scene, 1)))
+    fitted, plain = small_errors(problem, MassSpring(problem, scaled(scene, 1)))
     assert fitted < 0.8 * plain
 
 
-def test_the_answer_is_at_rest(workshop):
-    method = MassSpring(workshop, scaled(workshop.scene, 2))
-    case = Case.of(workshop, Load(POINT, DOWN, 3.0))
+def test_the_answer_is_at_rest(problem):
+    method = MassSpring(problem, scaled(problem.scene, 2))
+    case = Case.of(problem, Load(POINT, DOWN, 3.0))
     answer = method.solve(case)
     assert answer.converged
     load = np.empty((3, len(method.mesh.nodes)))
@@ -159,20 +159,20 @@ def test_the_answer_is_at_rest(workshop):
     assert not answer.state[:, method.mesh.free :].any()
     moved = method.displacement(answer.state)
     assert moved[:, 2].min() < -0.3
-    assert not moved[workshop.mesh.clamped].any()
+    assert not moved[problem.mesh.clamped].any()
 
 
 @pytest.mark.parametrize(("kind", "apart"), [(MassSpring, 0.2), (TensorMass, 0.03)])
-def test_two_contacts_and_huge_loads(workshop, kind, apart):
-    method = kind(workshop, (4, 4, 3))
+def test_two_contacts_and_huge_loads(problem, kind, apart):
+    method = kind(problem, (4, 4, 3))
     loads = Load(np.array([3.0, 3.0, 8.0]), DOWN, 0.5), Load(np.array([7.0, 7.0, 8.0]), DOWN, 1.0)
     both, *each = (
-        method.displacement(method.solve(Case.of(workshop, *contacts)).state)
+        method.displacement(method.solve(Case.of(problem, *contacts)).state)
         for contacts in (loads, loads[:1], loads[1:])
     )
     assert relative(sum(each), both) < apart
     assert relative(each[1], both) > 0.2
     for pressure in (1e3, 1e30, 1e300):
-        answer = method.solve(Case.of(workshop, Load(POINT, DOWN, pressure)))
-        assert method.displacement(answer.state).shape == workshop.mesh.nodes.shape
+        answer = method.solve(Case.of(problem, Load(POINT, DOWN, pressure)))
+        assert method.displacement(answer.state).shape == problem.mesh.nodes.shape
         assert not answer.converged or np.isfinite(answer.state).all()

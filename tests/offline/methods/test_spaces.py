@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh
 
+from palpate.offline.fem.problem import Load
 from palpate.offline.methods.catalogue import loads_about
 from palpate.offline.methods.method import Case
 from palpate.offline.methods.spaces import krylov, mass, modal, pod, static_derivatives
-from palpate.offline.run.workshop import Load
 
 SIZE = 12
 
 
 @pytest.fixture(scope="module")
-def model(workshop):
-    return workshop.model
+def model(problem):
+    return problem.model
 
 
 @pytest.fixture(scope="module")
@@ -69,12 +69,12 @@ def test_a_larger_basis_holds_the_smaller(spaces, model, name):
     assert missed(model, spaces[name](SIZE), spaces[name](SIZE // 2)).max() <= 1e-6
 
 
-def test_the_mass_of_a_linear_field_is_its_integral(workshop, M):
+def test_the_mass_of_a_linear_field_is_its_integral(problem, M):
     # z^2 over the block; z is nought on the clamped bottom
-    x, y, z = workshop.scene.geometry.size
-    field = np.zeros_like(workshop.mesh.nodes)
-    field[:, 1] = workshop.mesh.nodes[:, 2]
-    u = field.ravel()[workshop.model.free]
+    x, y, z = problem.scene.geometry.size
+    field = np.zeros_like(problem.mesh.nodes)
+    field[:, 1] = problem.mesh.nodes[:, 2]
+    u = field.ravel()[problem.model.free]
     assert u @ M @ u == pytest.approx(x * y * z**3 / 3)
 
 
@@ -108,26 +108,26 @@ def test_a_load_given_twice_adds_nothing(model, M, loads):
     assert missed(model, once, twice).max() <= 1e-6
 
 
-def test_static_derivatives_are_of_third_order_in_the_load(workshop, queries):
+def test_static_derivatives_are_of_third_order_in_the_load(problem, queries):
     contact = queries[0][0]
-    free, errors = workshop.model.free, []
+    free, errors = problem.model.free, []
     basis = static_derivatives(
-        workshop.model, loads_about(workshop, Case.of(workshop, contact))[free], 19
+        problem.model, loads_about(problem, Case.of(problem, contact))[free], 19
     )
     for fraction in (1.0, 0.5, 0.25):
         load = Load(contact.position, contact.direction, fraction * contact.pressure)
-        exact = workshop.solve(load).displacement.ravel()[free]
-        errors.append(missed(workshop.model, basis, exact[:, None]).item())
+        exact = problem.solve(load).displacement.ravel()[free]
+        errors.append(missed(problem.model, basis, exact[:, None]).item())
     # the first term left out is of fourth order, relative to the answer of third
     assert errors[0] < 0.01
     assert errors[0] / errors[1] == pytest.approx(8, rel=0.3)
     assert errors[1] / errors[2] == pytest.approx(8, rel=0.3)
 
 
-def test_they_hold_the_linear_answer_of_several_contacts(workshop, queries):
-    case = Case.of(workshop, *(load for load, _ in queries[:2]))
-    loads = loads_about(workshop, case)
-    total = np.zeros_like(workshop.mesh.nodes)
+def test_they_hold_the_linear_answer_of_several_contacts(problem, queries):
+    case = Case.of(problem, *(load for load, _ in queries[:2]))
+    loads = loads_about(problem, case)
+    total = np.zeros_like(problem.mesh.nodes)
     total[case.nodes] = case.forces
     np.testing.assert_allclose(loads[:, 0], total.ravel(), atol=1e-12 * np.abs(total).max())
 

@@ -5,14 +5,14 @@ import pytest
 from scipy.sparse import lil_matrix
 from scipy.sparse.linalg import cg, spsolve
 
+from palpate.offline.fem.norms import relative
+from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.methods.lattice import scaled
 from palpate.offline.methods.method import Case
 from palpate.offline.methods.relaxation import TOLERANCE
 from palpate.offline.methods.tensor_mass import POISSON, TensorMass
 from palpate.offline.methods.tetrahedra import Tetrahedra, gradients, stiffness
-from palpate.offline.run.workshop import Load, Workshop
 from palpate.offline.scenes import find_scene
-from palpate.offline.validate.norms import relative
 from palpate.shared.mechanics.tissue import lame
 
 POINT = np.array([4.0, 6.0, 8.0])
@@ -20,13 +20,13 @@ DOWN = np.array([0.0, 0.0, -1.0])
 
 
 @pytest.fixture(scope="module")
-def workshop():
-    return Workshop(find_scene("quick"))
+def problem():
+    return FullProblem(find_scene("quick"))
 
 
 @pytest.fixture(scope="module")
-def method(workshop):
-    return TensorMass(workshop, (4, 4, 3))
+def method(problem):
+    return TensorMass(problem, (4, 4, 3))
 
 
 def voigt_stiffness(mesh, young, poisson):
@@ -49,9 +49,9 @@ def voigt_stiffness(mesh, young, poisson):
     return matrix.tocsr()
 
 
-def test_the_answer_is_a_direct_solver_s(workshop, method):
-    mesh, young = method.mesh, workshop.scene.tissue.young
-    case = Case.of(workshop, Load(POINT, np.array([0.0, 0.6, -0.8]), 2.0))
+def test_the_answer_is_a_direct_solver_s(problem, method):
+    mesh, young = method.mesh, problem.scene.tissue.young
+    case = Case.of(problem, Load(POINT, np.array([0.0, 0.6, -0.8]), 2.0))
     answer = method.solve(case)
     assert answer.converged
     load, free = np.empty((3, len(mesh.nodes))), 3 * mesh.free
@@ -65,9 +65,9 @@ def test_the_answer_is_a_direct_solver_s(workshop, method):
     assert relative(1.03 * found, expected) > 2 * TOLERANCE
 
 
-def test_patch_of_uniform_strain(workshop, method, rng):
+def test_patch_of_uniform_strain(problem, method, rng):
     """Forces of a uniform gradient: none inside, and those of the law's uniform stress outside."""
-    mesh, young = method.mesh, workshop.scene.tissue.young
+    mesh, young = method.mesh, problem.scene.tissue.young
     H = 1e-4 * rng.standard_normal((3, 3))
     K = stiffness(mesh.nodes, mesh.elements, young, 0.3)
     force = (K @ (mesh.nodes @ H.T).ravel()).reshape(-1, 3)
@@ -77,20 +77,20 @@ def test_patch_of_uniform_strain(workshop, method, rng):
     expected = np.zeros_like(force)
     for a in range(4):
         np.add.at(expected, mesh.elements[:, a], volume[:, None] * (g[:, a] @ stress.T))
-    size = np.array(workshop.scene.geometry.size)
+    size = np.array(problem.scene.geometry.size)
     inside = np.all((mesh.nodes > 1e-9) & (mesh.nodes < size - 1e-9), axis=1)
     assert inside.any()
     np.testing.assert_allclose(expected[inside], 0.0, atol=1e-9 * abs(expected).max())
     np.testing.assert_allclose(force, expected, atol=1e-9 * abs(expected).max())
 
 
-def test_the_full_model_is_approached(workshop):
+def test_the_full_model_is_approached(problem):
     """With the tissue's own constants the error shrinks as the mesh is refined."""
     load = Load(POINT, DOWN, 0.02)
-    case, expected = Case.of(workshop, load), workshop.solve(load).displacement
-    tissue, error = workshop.scene.tissue, []
+    case, expected = Case.of(problem, load), problem.solve(load).displacement
+    tissue, error = problem.scene.tissue, []
     for factor in (1, 2, 4):
-        mesh = Tetrahedra.of(workshop, scaled(workshop.scene, factor))
+        mesh = Tetrahedra.of(problem, scaled(problem.scene, factor))
         force, free = np.empty((3, len(mesh.nodes))), 3 * mesh.free
         mesh.load(case, force)
         K = stiffness(mesh.nodes, mesh.elements, tissue.young, tissue.poisson)[:free, :free]
@@ -103,10 +103,10 @@ def test_the_full_model_is_approached(workshop):
 
 
 def test_fitting_makes_up_for_stiff_tetrahedra():
-    workshop = Workshop(find_scene("turbinate"))
-    point = workshop.surface.vertices[len(workshop.surface.vertices) // 2]
-    load = Load(point, -workshop.unit_load(point)[1], 0.05)
-    expected = workshop.solve(load).displacement
-    method = TensorMass(workshop, scaled(workshop.scene, 1))
-    fitted = method.displacement(method.solve(Case.of(workshop, load)).state)
+    problem = FullProblem(find_scene("turbinate"))
+    point = problem.surface.vertices[len(problem.surface.vertices) // 2]
+    load = Load(point, -problem.unit_load(point)[1], 0.05)
+    expected = problem.solve(load).displacement
+    method = TensorMass(problem, scaled(problem.scene, 1))
+    fitted = method.displacement(method.solve(Case.of(problem, load)).state)
     assert relative(fitted, expected) < 0.5 * relative(method.factor * fitted, expected)

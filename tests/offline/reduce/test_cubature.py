@@ -14,6 +14,7 @@ from palpate.offline.reduce.cubature import (
     point_forces,
 )
 from palpate.offline.scenes import find_scene
+from palpate.shared.mechanics.neo_hookean import NeoHookean
 from palpate.shared.reduced.points import LANES
 
 POINTS, EQUATIONS = 300, 20
@@ -85,7 +86,8 @@ def test_forces_of_all_points_are_the_sum_of_each_ones(rng):
     gradients = rng.standard_normal((count, 9, modes)).astype(np.float32)
     tiles = gradients.reshape(2, LANES, 9, modes)
     rows = np.ascontiguousarray(tiles.transpose(3, 0, 2, 1)).reshape(modes, -1)
-    law = rng.uniform(1.0, 2.0, (3, count))
+    weights, mu, lam = rng.uniform(1.0, 2.0, (3, count))
+    law = weights, NeoHookean(mu, lam)
     states = 0.02 * rng.standard_normal((STATES + 3, modes))
     states[1] *= 100.0  # turns points inside out
     together = nonlinear_forces(rows, *law, states)

@@ -1,15 +1,15 @@
 import numpy as np
 import pytest
 
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.transfer import neighbours, overlaps
-from palpate.offline.run.workshop import Workshop
 from palpate.shared.artifact import read_artifact
 from palpate.shared.model import ReducedModel
 
 
 @pytest.fixture(scope="module")
 def trained(artifact):
-    return ReducedModel.load(artifact), Workshop.of_artifact(read_artifact(artifact)).model
+    return ReducedModel.load(artifact), FullProblem.of_artifact(read_artifact(artifact)).model
 
 
 def test_neighbours_are_all_pairs_within_reach(trained):

@@ -16,7 +16,7 @@ def sources():
     folder = Path(palpate.offline.__file__).parent
     paths = [
         folder / "train.py",
-        *(p for name in ("fem", "reduce", "run") for p in folder.glob(f"{name}/*.py")),
+        *(p for name in ("fem", "reduce", "run", "validate") for p in folder.glob(f"{name}/*.py")),
     ]
     return {path.name: path.read_text() for path in paths}
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from palpate.offline.run.workshop import Load, Workshop
+from palpate.offline.fem.problem import FullProblem, Load, TipPosition
 from palpate.shared.artifact import read_artifact
 from palpate.shared.errors import QueryError
 from palpate.shared.mechanics import newton
@@ -35,8 +35,8 @@ def atlas(visco_artifact):
 
 
 @pytest.fixture(scope="module")
-def workshop(visco_artifact):
-    return Workshop.of_artifact(read_artifact(visco_artifact))
+def problem(visco_artifact):
+    return FullProblem.of_artifact(read_artifact(visco_artifact))
 
 
 def off(a, b):
@@ -62,10 +62,10 @@ class Pressing:
         """What the answer says of the contact."""
         return answer.contact_displacement
 
-    def full(self, workshop, answers, times):
+    def full(self, problem, answers, times):
         """Displacements and stresses of the full model under the same loads."""
-        loads = [Load(a.contact_point, DOWN, a.pressure) for a in answers]
-        return workshop.follow(loads, times)
+        steps = zip(answers, times, strict=True)
+        return problem.reference([Load(a.contact_point, DOWN, a.pressure, dt) for a, dt in steps])
 
 
 class Touching:
@@ -89,8 +89,9 @@ class Touching:
     def response(self, answer):
         return answer.force
 
-    def full(self, workshop, answers, times):
-        return workshop.follow_tip(np.array([a.position for a in answers]), times)
+    def full(self, problem, answers, times):
+        steps = zip(answers, times, strict=True)
+        return problem.reference([TipPosition(a.position, dt) for a, dt in steps])
 
 
 @pytest.fixture(scope="module", params=[Pressing, Touching], ids=["load", "tip"])
@@ -116,17 +117,17 @@ def follow(tool, course, past=REST):
 # --- beside the full model -----------------------------------------------------------------------
 
 
-def errors(tool, workshop, course):
+def errors(tool, problem, course):
     """Of displacement, stress and the tip's force in each moment, over the largest so far."""
     atlas, answers = tool.atlas, follow(tool, course)
-    full = tool.full(workshop, answers, [dt for *_, dt in course])
-    kept = workshop.beyond_clamped_layer
+    full = tool.full(problem, answers, [dt for *_, dt in course])
+    kept = problem.beyond_clamped_layer
     found = (
         [atlas.displacement(a) for a in answers],
         [atlas.von_mises(a)[kept] for a in answers],
         [a.force for a in answers],
     )
-    exact = (full[0], full[1][:, kept], *full[2:])
+    exact = full.u, full.s[:, kept], *([full.f] if tool.limit_name == "depth" else [])
     columns = []
     for a, b in zip(found, exact, strict=False):
         largest = np.maximum.accumulate([np.linalg.norm(x) for x in b])
@@ -134,27 +135,27 @@ def errors(tool, workshop, course):
     return answers, full, np.array(columns).T
 
 
-def test_what_is_held_relaxes_or_creeps_as_the_full_model_does(tool, workshop):
-    answers, _, found = errors(tool, workshop, HOLD)
+def test_what_is_held_relaxes_or_creeps_as_the_full_model_does(tool, problem):
+    answers, _, found = errors(tool, problem, HOLD)
     first, *_, last = (np.linalg.norm(tool.response(answer)) for answer in answers)
     assert last < 0.75 * first if tool.limit_name == "depth" else last > 1.2 * first
     assert np.all(found <= ([0.03, 0.04, 0.02] if tool.limit_name == "depth" else [0.03, 0.05]))
 
 
-def test_a_dent_stays_behind_the_tool_and_recovers(atlas, workshop):
+def test_a_dent_stays_behind_the_tool_and_recovers(atlas, problem):
     """A tool that presses, hops to the other side and is lifted."""
     course = [(0.7, -2.5, 0.05), (0.7, -2.5, 1.0), (0.7, 2.5, 0.05), (0.7, 2.5, 0.2)]
     course += [(LIFTED, 2.5, 0.01), (LIFTED, 2.5, 0.3)]
-    _, full, found = errors(Pressing(atlas), workshop, course)
+    _, full, found = errors(Pressing(atlas), problem, course)
     assert np.all(found <= [0.03, 0.05])
-    sizes = np.linalg.norm(full[0], axis=(1, 2))
+    sizes = np.linalg.norm(full.u, axis=(1, 2))
     assert sizes[-1] > 0.1 * sizes.max()
 
 
-def test_sliding_from_model_to_model_does_not_lose_the_past(tool, workshop):
+def test_sliding_from_model_to_model_does_not_lose_the_past(tool, problem):
     course = [(0.6, -2.0, 0.5), *((0.6, aside, 0.05) for aside in np.linspace(-2, 2, 13))]
     course += [(LIFTED, 2.0, 0.02), (LIFTED, 2.0, 0.3), (0.4, 0.5, 0.02)]
-    answers, _, found = errors(tool, workshop, course)
+    answers, _, found = errors(tool, problem, course)
     assert len({answer.past.main for answer in answers}) > 1
     assert np.all(found <= [0.03, 0.05, 0.03][: found.shape[1]])
 
@@ -388,12 +389,12 @@ class Alone:
 
 
 @pytest.fixture
-def alone(atlas, workshop):
+def alone(atlas, problem):
     """Return the model nearest to the middle, with all points or its own."""
     models, middle = atlas.models, atlas.nodes.max(axis=0) * [0.5, 0.5, 1.0]
     k = int(np.argmin(np.linalg.norm(models.centres - middle, axis=1)))
     own = slice(models.point_from[k], models.point_from[k + 1])
-    every = workshop.model.weights.ravel()
+    every = problem.model.weights.ravel()
     names = ("centres", "frames", "pressures", "whole", "mix", "defect", "guess", "directions")
     single = {name: getattr(models, name)[[k]] for name in (*names, "change", "residuals")}
 
@@ -471,9 +472,9 @@ def test_deviatoric_stiffness_is_between_none_and_all(atlas):
             assert values[-1] < 1.001
 
 
-def test_overlap_of_neighbours_is_the_product_of_their_modes(atlas, workshop):
+def test_overlap_of_neighbours_is_the_product_of_their_modes(atlas, problem):
     models, viscous = atlas.models, atlas.models.viscous
-    stiff, free = workshop.model.rest_stiffness, workshop.model.free
+    stiff, free = problem.model.rest_stiffness, problem.model.free
 
     def modes(k):
         region = models.region[k]

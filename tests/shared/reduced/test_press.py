@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numba import njit
 
+from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.reduce.footprint_models import LocalTrainer
-from palpate.offline.run.workshop import Load, Workshop
 from palpate.shared.artifact import read_artifact
 from palpate.shared.mechanics import newton
 from palpate.shared.model import ReducedModel
@@ -33,15 +33,15 @@ def atlas(artifact):
 
 
 @pytest.fixture(scope="module")
-def workshop(artifact):
-    return Workshop.of_artifact(read_artifact(artifact))
+def problem(artifact):
+    return FullProblem.of_artifact(read_artifact(artifact))
 
 
 @pytest.fixture(scope="module")
-def galerkin(atlas, workshop):
+def galerkin(atlas, problem):
     """Return the first local model with every quadrature point and its own weight."""
     models, region = atlas.models, atlas.models.region[0]
-    weights = workshop.model.weights.ravel()
+    weights = problem.model.weights.ravel()
     return replace(
         models,
         basis=models.basis[[region]],
@@ -142,10 +142,10 @@ def state(modes, rng):
 # --- one physics, two sizes ----------------------------------------------------------------------
 
 
-def test_with_every_point_it_is_the_full_model_in_its_modes(unloaded, modes, workshop, state):
+def test_with_every_point_it_is_the_full_model_in_its_modes(unloaded, modes, problem, state):
     residual, force = np.empty(len(state)), np.empty(len(modes))
     energy, smallest = potential(unloaded, state, residual)
-    expected_energy, expected_smallest = workshop.model.internal(modes @ state, force)
+    expected_energy, expected_smallest = problem.model.internal(modes @ state, force)
     expected = modes.T @ force
     # modes are stored in half precision, their gradients in 16 bits
     assert energy == pytest.approx(expected_energy, rel=1e-3)
@@ -153,9 +153,9 @@ def test_with_every_point_it_is_the_full_model_in_its_modes(unloaded, modes, wor
     assert np.linalg.norm(residual - expected) <= 1e-3 * np.linalg.norm(expected)
 
 
-def test_its_modes_are_orthonormal_in_the_energy_at_rest(modes, workshop):
-    free = modes[workshop.model.free]
-    gram = free.T @ (workshop.model.rest_stiffness @ free)
+def test_its_modes_are_orthonormal_in_the_energy_at_rest(modes, problem):
+    free = modes[problem.model.free]
+    gram = free.T @ (problem.model.rest_stiffness @ free)
     # modes are stored in half precision
     np.testing.assert_allclose(gram, np.eye(len(gram)), atol=2e-3)
 
@@ -177,8 +177,8 @@ def test_residual_is_the_derivative_of_the_potential(unloaded, state):
     assert np.abs(slopes - expected).max() <= 1e-4 * np.abs(expected).max()
 
 
-def test_tangent_is_the_derivative_of_the_residual(unloaded, galerkin, atlas, state):
-    trainer = LocalTrainer(atlas.scene, atlas.body, atlas.surface, galerkin)
+def test_tangent_is_the_derivative_of_the_residual(unloaded, galerkin, problem, state):
+    trainer = LocalTrainer(problem, galerkin)
     K = np.eye(len(state)) + trainer.tangent_changes(state[None])[0]
     found = derivative(lambda q: residual_of(unloaded, q), state, np.eye(len(state)))
     assert np.abs(found - K).max() <= 1e-4 * np.abs(K).max()
@@ -202,12 +202,9 @@ def test_a_secant_is_what_the_inverse_tangent_answers_from_then_on(atlas, single
 # --- answers -------------------------------------------------------------------------------------
 
 
-def test_points_and_defect_together_answer_as_all_points(atlas, galerkin, single):
+def test_points_and_defect_together_answer_as_all_points(atlas, problem, galerkin, single):
     few = replace(single, defect=galerkin.defect)
-    trainers = [
-        LocalTrainer(atlas.scene, atlas.body, atlas.surface, local)
-        for local in (galerkin, few, single)
-    ]
+    trainers = [LocalTrainer(problem, local) for local in (galerkin, few, single)]
     centre, inward = single.centres[0], -single.frames[0, 0]
     limit = atlas.press(centre, 1.0).pressure_limit
     errors = []
@@ -308,27 +305,27 @@ def test_a_warm_answer_is_the_equilibrium_of_its_patch(atlas, border):
     assert followed > 3
 
 
-def test_a_warm_answer_is_as_good_as_the_cold_one(atlas, workshop, border):
+def test_a_warm_answer_is_as_good_as_the_cold_one(atlas, problem, border):
     first, second, pressure = border
     memory = atlas.new_warm()
     for share in np.linspace(0.2, 0.8, 7):
         x, force = first + share * (second - first), (0.5 + share / 2) * pressure
         warm, cold = atlas.press(x, force, warm=memory), atlas.press(x, force)
-        u = workshop.solve(Load(x, warm.direction, force)).displacement
+        u = problem.solve(Load(x, warm.direction, force)).displacement
         errors = [norm(atlas.displacement(answer) - u) / norm(u) for answer in (warm, cold)]
         assert errors[0] <= errors[1] + TOLERANCE
 
 
 @pytest.fixture(scope="module")
-def path(workshop, border):
+def path(problem, border):
     """Return contact points 0.05 mm apart across a border and the full model's answers there."""
     first, second, pressure = border
     along = (second - first) / np.linalg.norm(second - first)
     points = (first + second) / 2 + 0.05 * np.arange(-8, 9)[:, None] * along
     answers, u = [], None
     for x in points:
-        nodal, normal = workshop.unit_load(x)
-        u = workshop.solve(Load(x, -normal, pressure), u).displacement
+        nodal, normal = problem.unit_load(x)
+        u = problem.solve(Load(x, -normal, pressure), start=u).displacement
         answers.append(np.vstack([u, nodal @ u / nodal.sum()]))
     return points, answers
 

@@ -1,13 +1,15 @@
 """A local model with every quadrature point is the Galerkin model; with all modes, the full one."""
 
-from contextlib import contextmanager, nullcontext
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from numba import njit
 
 from palpate.offline.fem.mesh import build_mesh
-from palpate.offline.fem.model import FullModel, TipContact
+from palpate.offline.fem.model import FullModel
+from palpate.offline.fem.potential import Potential
+from palpate.offline.fem.terms import DeadLoad, PastStress, TipContact, advanced
 from palpate.offline.reduce.viscous import deviatoric_stiffness
 from palpate.offline.scenes import find_scene
 from palpate.shared.compiled import bind, bind_compiled
@@ -114,13 +116,14 @@ class Twins:
         assert status == newton.CONVERGED
         return problem
 
-    @contextmanager
     def full(self, share, dt):
-        """Return the full model under the same load, after a past of the same displacements."""
-        self.apply_to_full(share)
-        with self.model._remembering(self.history, dt) if self.in_time else nullcontext():
-            yield self.model
-        self.model._contact = None
+        """Potential of the full model under the same load, after the same displacements."""
+        past = [PastStress(self.model, self.history, step_weights(PRONY, dt))]
+        return Potential(self.model, [self.full_load(share), *(past if self.in_time else [])])
+
+    def full_answer(self, share, dt):
+        """Equilibrium of the full model under it."""
+        return self.model.solve(self.full_load(share), self.history if self.in_time else None, dt)
 
     @property
     def displacement(self):
@@ -132,7 +135,7 @@ class Twins:
         if self.in_time:
             end(self._past, self.points, self.work, self.q)
             weights = step_weights(PRONY, dt)
-            self.history = self.model.advanced(self.history, self.displacement, weights)
+            self.history = advanced(self.model, self.history, self.displacement, weights)
 
 
 class Pressed(Twins):
@@ -156,13 +159,8 @@ class Pressed(Twins):
         self.external[:] = self.f + (self.past.exerted if self.in_time else 0.0)
         forget_secants(self.inverse, self.origin)
 
-    def apply_to_full(self, share):
-        self.model._load[:] = (share * self.whole).ravel()[self.model.free]
-
-    def full_answer(self, share, dt):
-        if self.in_time:
-            return self.model.step(self.history, share * self.whole, dt)[0]
-        return self.model.solve(share * self.whole)
+    def full_load(self, share):
+        return DeadLoad(share * self.whole.ravel())
 
 
 class Touched(Twins):
@@ -218,15 +216,8 @@ class Touched(Twins):
         self.x[:] = self.place(share)
         self.latest[:] = np.inf
 
-    def apply_to_full(self, share):
-        self.model._contact = self.contact
-        self.contact.position[:] = self.place(share)
-
-    def full_answer(self, share, dt):
-        tip = self.contact, self.place(share), np.array([0.0, 0.0, -share * DEPTH])
-        if self.in_time:
-            return self.model.touch_step(self.history, *tip, dt)[0]
-        return self.model.touch(*tip)
+    def full_load(self, share):
+        return self.contact.at(self.place(share), np.array([0.0, 0.0, -share * DEPTH]))
 
     def reaction(self, problem):
         """Force on the tool (3,) mN and its derivative (3, 3) mN/mm."""
@@ -236,14 +227,15 @@ class Touched(Twins):
         reaction(self.load, self.factor, coupling, step, force, tangent)
         return force, tangent
 
-    def galerkin_reaction(self, model):
+    def galerkin_reaction(self, full, share):
         """The same by the full model's tangent in the modes."""
-        u = self.displacement.ravel().astype(float)
-        K = model.stiffness(u)
-        self.contact.stiffen(u, K.data, False)
-        force, own, coupling = self.contact.reaction(u)
-        C = self.B.T @ coupling[model.free]
-        return force, C.T @ np.linalg.solve(self.B.T @ (K @ self.B), C) - own
+        K = self.B.T @ (full.stiffness(self.B @ self.q) @ self.B)
+        in_modes = SimpleNamespace(
+            free=full.free,
+            factorise=lambda u, shift: None,
+            solve=lambda loads: self.B @ np.linalg.solve(K, self.B.T @ loads),
+        )
+        return self.full_load(share).reaction(in_modes, self.displacement.ravel().astype(float))
 
 
 def assert_close(found, expected, tolerance=ACCURATE):
@@ -271,16 +263,16 @@ def compare(twins, rng):
         away = q + 0.05 * np.linalg.norm(q) * rng.standard_normal(modes) / np.sqrt(modes)
         energy = -potential(problem, q, residual)[0]
         energy += potential(problem, away, residual)[0]
-        with twins.full(share, dt) as model:
-            expected = -model.potential(B @ q, force)[0]
-            assert np.linalg.norm(B.T @ force) <= 2 * TARGET
-            expected += model.potential(B @ away, force)[0]
-            assert_close(residual, B.T @ force)
-            assert energy == pytest.approx(expected, rel=2e-4)
-            if isinstance(twins, Touched):
-                found = twins.reaction(problem)
-                for one, other in zip(found, twins.galerkin_reaction(model), strict=True):
-                    assert_close(one, other)
+        full = twins.full(share, dt)
+        expected = -full.potential(B @ q, force)[0]
+        assert np.linalg.norm(B.T @ force) <= 2 * TARGET
+        expected += full.potential(B @ away, force)[0]
+        assert_close(residual, B.T @ force)
+        assert energy == pytest.approx(expected, rel=2e-4)
+        if isinstance(twins, Touched):
+            found = twins.reaction(problem)
+            for one, other in zip(found, twins.galerkin_reaction(full, share), strict=False):
+                assert_close(one, other)
         if modes == len(B):
             answer = twins.full_answer(share, dt)
             assert_close(twins.displacement, answer.displacement)

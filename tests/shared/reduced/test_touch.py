@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from palpate.offline.run.workshop import Workshop
+from palpate.offline.fem.problem import FullProblem, TipPosition
 from palpate.shared.artifact import read_artifact
 from palpate.shared.errors import QueryError
 from palpate.shared.mechanics import newton
@@ -104,7 +104,7 @@ def jumps(answers):
 
 def test_the_force_has_no_jumps_on_a_path(atlas, artifact):
     """In steps of 0.05 mm across all local models, in and out of contact."""
-    workshop = Workshop.of_artifact(read_artifact(artifact))
+    problem = FullProblem.of_artifact(read_artifact(artifact))
     width = atlas.nodes[:, 0].max()
     count = int(0.6 * width / 0.05)
     across = np.linspace(0.2, 0.8, count)
@@ -114,7 +114,9 @@ def test_the_force_has_no_jumps_on_a_path(atlas, artifact):
     assert len({k for a in glide for k, _, _ in a.parts}) >= 3
     assert jumps(glide).max() <= 0.01 * largest
     steepest = int(np.argmax(np.linalg.norm(np.diff(force, axis=0), axis=1)))
-    here, there = (workshop.touch(a.position).force for a in glide[steepest : steepest + 2])
+    here, there = (
+        problem.solve(TipPosition(a.position)).force for a in glide[steepest : steepest + 2]
+    )
     change = force[steepest + 1] - force[steepest]
     assert np.linalg.norm(change - (there - here)) <= 0.01 * largest
     warm = atlas.new_warm()

@@ -9,13 +9,14 @@ from scipy.optimize import root
 
 from palpate.offline.fem.mesh import build_mesh
 from palpate.offline.fem.model import FullModel
-from palpate.offline.run.workshop import Load, Workshop
+from palpate.offline.fem.problem import FullProblem, Load
+from palpate.offline.reduce.load_range import load_range
 from palpate.offline.scenes import find_scene
 from palpate.shared.mechanics.neo_hookean import NeoHookeanTissue
 from palpate.shared.mechanics.tissue import lame
 from palpate.shared.mechanics.viscosity import step_weights
 
-from ..shared.energies import advance, past_energy_and_power
+from ...shared.energies import advance, past_energy_and_power
 
 YOUNG, POISSON = 15.0, 0.45
 PRONY = ((0.3, 0.1), (0.2, 1.0))
@@ -44,8 +45,8 @@ def top_load(model, force):
 
 
 @pytest.fixture(scope="module")
-def workshop():
-    return Workshop(find_scene("quick-visco"))
+def problem():
+    return FullProblem(find_scene("quick-visco"))
 
 
 @pytest.fixture(params=ELEMENTS)
@@ -68,10 +69,10 @@ def test_tangent_of_relaxed_tissue_is_the_derivative_of_its_force(element, rng):
 def test_sudden_and_infinitely_slow_loads_meet_elastic_tissue(element):
     model = body(element)
     load = top_load(model, [3.0, 0.0, -10.0])
-    sudden, _ = model.step(model.at_rest, load, 0.0)
+    sudden = model.solve(load, model.at_rest, 0.0)
     instant = model.solve(load)
     np.testing.assert_array_equal(sudden.displacement, instant.displacement)
-    slow, _ = model.step(model.at_rest, load, np.inf)
+    slow = model.solve(load, dt=np.inf)
     relaxed = model.relaxed.solve(load)
     np.testing.assert_allclose(slow.displacement, relaxed.displacement, atol=1e-8)
     assert np.abs(slow.displacement).max() > 1.3 * np.abs(instant.displacement).max()
@@ -79,11 +80,12 @@ def test_sudden_and_infinitely_slow_loads_meet_elastic_tissue(element):
 
 def test_without_terms_time_changes_nothing(element):
     model = body(element, prony=())
-    history = model.at_rest
+    past = model.at_rest
     for force, dt in (([0.0, 0.0, -9.0], 0.1), ([4.0, 0.0, -3.0], 0.0), ([1.0, 0.0, 2.0], 5.0)):
         load = top_load(model, force)
-        expected = model.solve(load, history.displacement)
-        found, history = model.step(history, load, dt)
+        expected = model.solve(load, start=past.displacement)
+        found = model.solve(load, past, dt)
+        past = found.past
         np.testing.assert_array_equal(found.displacement, expected.displacement)
 
 
@@ -145,10 +147,10 @@ def test_creep_of_one_element_against_independent_integration():
     load = top_load(model, [6.0, -3.0, -12.0])
     times = np.linspace(0, 1.0, 5)
     expected = creep_of_one_element(model.mesh.nodes, load, times)
-    found, history = model.step(model.at_rest, load, 0.0)
+    found = model.solve(load, model.at_rest)
     shown, steps = [found.displacement], 100
     for step in range(1, steps + 1):
-        found, history = model.step(history, load, times[-1] / steps)
+        found = model.solve(load, found.past, times[-1] / steps)
         if step % (steps // 4) == 0:
             shown.append(found.displacement)
     top = model.mesh.nodes[:, 2] > 0
@@ -161,10 +163,10 @@ def test_convergence_in_the_step_is_of_second_order():
     load = top_load(model, [3.0, 0.0, -10.0])
 
     def after(steps):
-        history = model.at_rest
+        past = model.at_rest
         for share in np.linspace(0, 1, steps + 1)[1:]:
-            _, history = model.step(history, np.sin(4 * share) * load, 0.3 / steps)
-        return history.displacement
+            past = model.solve(np.sin(4 * share) * load, past, 0.3 / steps).past
+        return past.displacement
 
     exact = after(128)
     errors = [np.linalg.norm(after(steps) - exact) for steps in (4, 8, 16)]
@@ -177,33 +179,33 @@ def test_stored_energy_returns_to_zero_and_dissipation_is_never_negative():
     model, rng = body("hex8", divisions=(3, 3, 3)), np.random.default_rng(4)
     mu, scale, force = model.law.mu[0], 0.0, np.zeros(model.mesh.nodes.size)
 
-    def step(history, means, load, dt):
-        """Go on; return the history, the stored energy and the dissipated power."""
-        _, history = model.step(history, load, dt)
-        moved = history.displacement[model.connectivity]
+    def step(past, means, load, dt):
+        """Go on; return the past, the stored energy and the dissipated power."""
+        past = model.solve(load, past, dt).past
+        moved = past.displacement[model.connectivity]
         F = np.eye(3) + np.einsum("eai,eqaj->eqij", moved, model.gradients)
         advance(F, step_weights(PRONY, dt), means)
-        past, power = past_energy_and_power(F, means, PRONY, mu)
-        elastic, _ = model.internal(history.displacement.reshape(-1), force)
-        return history, elastic + np.sum(model.weights * past), np.sum(model.weights * power)
+        extra, power = past_energy_and_power(F, means, PRONY, mu)
+        elastic, _ = model.internal(past.displacement.reshape(-1), force)
+        return past, elastic + np.sum(model.weights * extra), np.sum(model.weights * power)
 
     for _ in range(50):
-        history, means = model.at_rest, np.zeros((3, *model.weights.shape, 7))
+        past, means = model.at_rest, np.zeros((3, *model.weights.shape, 7))
         for _ in range(4):
             load = top_load(model, rng.uniform([-4, -4, -12], [4, 4, 6]))
-            history, stored, power = step(history, means, load, 10 ** rng.uniform(-2, 0.5))
+            past, stored, power = step(past, means, load, 10 ** rng.uniform(-2, 0.5))
             scale = max(scale, power)
             assert power >= -1e-12 * scale
         for dt in (0.0, 0.01, 1.0, *[5.0] * 10):
-            history, left, power = step(history, means, np.zeros_like(load), dt)
+            past, left, power = step(past, means, np.zeros_like(load), dt)
             assert power >= -1e-12 * scale
         assert abs(left) <= 1e-8 * stored
     assert scale > 1.0
 
 
-def test_limits_are_those_of_a_load_that_stays(workshop):
-    fields = workshop.load_range(TOP)
-    model = workshop.model
-    load = workshop.load_vector(Load(TOP, np.array([0.0, 0.0, -1.0]), fields[0]))
+def test_limits_are_those_of_a_load_that_stays(problem):
+    fields = load_range(problem, TOP)
+    model = problem.model
+    load = problem.load_vector(Load(TOP, np.array([0.0, 0.0, -1.0]), fields[0]))
     moved = np.linalg.norm(model.relaxed.solve(load).displacement, axis=1).max()
     assert moved == pytest.approx(0.15 * 8.0, rel=0.03)

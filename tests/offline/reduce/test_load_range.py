@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from palpate.offline.fem.model import NoEquilibrium
-from palpate.offline.reduce.load_path import LoadPath, pressure_that_moves
-from palpate.offline.run.workshop import Workshop
+from palpate.offline.fem.problem import FullProblem
+from palpate.offline.reduce.load_range import LoadPath, load_range, pressure_that_moves
 from palpate.offline.scenes import find_scene
 
 
 @pytest.fixture(scope="module")
-def workshop():
-    return Workshop(find_scene("quick"))
+def problem():
+    return FullProblem(find_scene("quick"))
 
 
 def spring(law, limit=np.inf):
@@ -55,22 +55,22 @@ def test_without_any_equilibrium_it_says_so():
     assert len(asked) < 15
 
 
-def test_the_path_is_near_the_full_model(workshop):
-    x = workshop.surface.vertices[len(workshop.surface.vertices) // 2]
-    nodal, normal = workshop.unit_load(x)
+def test_the_path_is_near_the_full_model(problem):
+    x = problem.surface.vertices[len(problem.surface.vertices) // 2]
+    nodal, normal = problem.unit_load(x)
     force = -nodal[:, None] * normal
-    path = LoadPath(workshop.model, force.reshape(-1)[workshop.model.free])
-    limit = workshop.load_range(x)[0]
+    path = LoadPath(problem.model, force.reshape(-1)[problem.model.free])
+    limit = load_range(problem, x)[0]
     for share, allowed in ((0.1, 1e-3), (0.5, 0.02), (1.0, 0.1)):
-        exact = workshop.model.solve(share * limit * force).displacement
+        exact = problem.model.solve(share * limit * force).displacement
         error = np.linalg.norm(path.solve(share * limit, None) - exact)
         assert error <= allowed * np.linalg.norm(exact)
 
 
-def test_the_limit_moves_the_tissue_by_the_indentation(workshop):
-    x = workshop.surface.vertices[len(workshop.surface.vertices) // 2]
-    nodal, normal = workshop.unit_load(x)
-    limit = workshop.load_range(x)[0]
-    u = workshop.model.solve(-limit * nodal[:, None] * normal).displacement
-    wanted = workshop.scene.load.max_indentation * workshop.scene.geometry.size[2]
+def test_the_limit_moves_the_tissue_by_the_indentation(problem):
+    x = problem.surface.vertices[len(problem.surface.vertices) // 2]
+    nodal, normal = problem.unit_load(x)
+    limit = load_range(problem, x)[0]
+    u = problem.model.solve(-limit * nodal[:, None] * normal).displacement
+    wanted = problem.scene.load.max_indentation * problem.scene.geometry.size[2]
     assert np.linalg.norm(u, axis=1).max() == pytest.approx(wanted, rel=0.01)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from palpate.offline.fem.mesh import build_mesh
-from palpate.offline.fem.model import FullModel, TipContact
+from palpate.offline.fem.model import FullModel
+from palpate.offline.fem.terms import TipContact
 from palpate.offline.scenes import find_scene
 from palpate.shared.mechanics.neo_hookean import NeoHookeanTissue
 from palpate.shared.mechanics.sphere import tip_of, tip_surface
@@ -32,7 +33,8 @@ def block():
 def touch(block, depth, aside=(0.0, 0.0), start=None):
     model, contact, top = block
     position = np.add(top, [*aside, contact.tip.radius - depth])
-    return model.touch(contact, position, np.array([0.0, 0.0, -max(depth, 0.0)]), start)
+    approach = np.array([0.0, 0.0, -max(depth, 0.0)])
+    return model.solve(contact.at(position, approach), start=start)
 
 
 def test_a_tip_off_the_block_moves_nothing(block):
@@ -90,9 +92,7 @@ def test_a_ball_on_a_layer_is_that_of_hertz():
     """Hertz's force with the correction for a bonded layer (Dimitriadis et al. 2002, eq. 12)."""
     radius, depth, height = 10.0, 0.4, 10.0
     model, contact, top = pressed_block(radius, (20.0, 20.0, height), (10, 10, 4))
-    found = model.touch(
-        contact, np.add(top, [0.0, 0.0, radius - depth]), np.array([0.0, 0.0, -depth])
-    )
+    found = touch((model, contact, top), depth)
     a = -(1.2876 - 1.4678 * POISSON + 1.3442 * POISSON**2) / (1 - POISSON)
     b = (0.6387 - 1.0277 * POISSON + 1.5164 * POISSON**2) / (1 - POISSON)
     chi, pi = np.sqrt(radius * depth) / height, np.pi

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from palpate.offline.fem.mesh import build_mesh
-from palpate.offline.fem.model import FullModel, TipContact
+from palpate.offline.fem.model import FullModel
+from palpate.offline.fem.terms import TipContact
 from palpate.offline.scenes import find_scene
 from palpate.shared.mechanics.neo_hookean import NeoHookeanTissue
 from palpate.shared.mechanics.sphere import tip_of, tip_surface
@@ -31,20 +32,20 @@ def place(depth, aside=0.0):
     return TOP + np.array([aside, 0.0, RADIUS - depth]), np.array([0.0, 0.0, -max(depth, 0.0)])
 
 
-def follow(block, course, history=None):
+def follow(block, course, past=None):
     """Answers along a course of depths (mm), places aside (mm) and time steps (s)."""
     model, contact = block
-    history, answers = history or model.at_rest, []
+    answers = []
     for depth, aside, dt in course:
-        found, history = model.touch_step(history, contact, *place(depth, aside), dt)
-        answers.append(found)
-    return answers, history
+        answers.append(model.solve(contact.at(*place(depth, aside)), past, dt))
+        past = answers[-1].past
+    return answers
 
 
 def test_at_once_tissue_answers_as_without_time(block):
     model, contact = block
-    (sudden,), _ = follow(block, [(0.5, 0.2, 0.0)])
-    elastic = model.touch(contact, *place(0.5, 0.2))
+    sudden = model.solve(contact.at(*place(0.5, 0.2)), model.at_rest)
+    elastic = model.solve(contact.at(*place(0.5, 0.2)))
     np.testing.assert_allclose(sudden.displacement, elastic.displacement, atol=1e-9)
     np.testing.assert_allclose(sudden.force, elastic.force, rtol=1e-9)
     np.testing.assert_allclose(sudden.tangent, elastic.tangent, rtol=1e-6, atol=1e-6)
@@ -52,8 +53,8 @@ def test_at_once_tissue_answers_as_without_time(block):
 
 def test_after_long_the_force_is_that_of_relaxed_tissue(block):
     model, contact = block
-    answers, _ = follow(block, [(0.5, 0.2, 0.0), *[(0.5, 0.2, 5.0)] * 4])
-    relaxed = model.relaxed.touch(contact, *place(0.5, 0.2))
+    answers = follow(block, [(0.5, 0.2, 0.0), *[(0.5, 0.2, 5.0)] * 4])
+    relaxed = model.relaxed.solve(contact.at(*place(0.5, 0.2)))
     forces = [np.linalg.norm(answer.force) for answer in answers]
     assert np.all(np.diff(forces) < 1e-9)
     np.testing.assert_allclose(answers[-1].force, relaxed.force, rtol=1e-4, atol=1e-4)
@@ -63,7 +64,7 @@ def test_after_long_the_force_is_that_of_relaxed_tissue(block):
 def test_a_held_tip_relaxes_as_the_law_says(block):
     """For a small dent: what relaxes is ``sum g (1 - exp(-t / tau))`` of the isochoric part."""
     held = [(0.02, 0.0, 0.0), *[(0.02, 0.0, 0.05)] * 20, (0.02, 0.0, 1e9)]
-    forces = np.array([answer.force[2] for answer in follow(block, held)[0]])
+    forces = np.array([answer.force[2] for answer in follow(block, held)])
     times = np.array([0.0, *(0.05 * np.arange(1, 21))])
     lost = sum(g * (1 - np.exp(-times / tau)) for g, tau in PRONY) / sum(g for g, _ in PRONY)
     shown = (forces[0] - forces[:-1]) / (forces[0] - forces[-1])
@@ -81,7 +82,7 @@ def test_a_closed_path_dissipates(block, rng):
             [np.interp(ticks, np.arange(5), depths), np.interp(ticks, np.arange(5), asides)]
         )
         dt = 10 ** rng.uniform(-2.5, 0.0)
-        answers, _ = follow(block, [(*row, dt) for row in course])
+        answers = follow(block, [(*row, dt) for row in course])
         force = np.array([answer.force for answer in answers])
         moves = np.diff(course, axis=0) @ [[0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]
         work = -np.sum((force[1:] + force[:-1]) / 2 * moves, axis=1)
@@ -91,23 +92,22 @@ def test_a_closed_path_dissipates(block, rng):
 
 def test_the_tangent_is_the_derivative_of_the_force_of_a_step(block):
     model, contact = block
-    _, history = follow(block, [(0.5, 0.0, 0.05), (0.5, 0.3, 0.1), (0.3, 0.3, 0.02)])
+    past = follow(block, [(0.5, 0.0, 0.05), (0.5, 0.3, 0.1), (0.3, 0.3, 0.02)])[-1].past
     dt, h = 0.02, 1e-4
     position, approach = place(0.4, 0.3)
-    found, _ = model.touch_step(history, contact, position, approach, dt)
+    found = model.solve(contact.at(position, approach), past, dt)
     for axis, step in enumerate(h * np.eye(3)):
         ahead, behind = (
-            model.touch_step(history, contact, position + s * step, approach, dt)[0].force
-            for s in (1, -1)
+            model.solve(contact.at(position + s * step, approach), past, dt).force for s in (1, -1)
         )
         error = np.abs(found.tangent[:, axis] - (ahead - behind) / (2 * h)).max()
         assert error <= 1e-3 * np.abs(found.tangent).max()
 
 
 def test_a_lifted_tip_leaves_a_dent_that_recovers(block):
-    answers, history = follow(block, [(0.6, 0.0, 0.0), (0.6, 0.0, 2.0), (-0.1, 0.0, 0.0)])
-    assert not answers[-1].force.any()
-    dent = np.abs(history.displacement).max()
+    lifted = follow(block, [(0.6, 0.0, 0.0), (0.6, 0.0, 2.0), (-0.1, 0.0, 0.0)])[-1]
+    assert not lifted.force.any()
+    dent = np.abs(lifted.displacement).max()
     assert 0.01 < dent < 0.6
-    _, history = follow(block, [(-0.1, 0.0, 4.0)] * 6, history)
-    assert np.abs(history.displacement).max() < 0.01 * dent
+    later = follow(block, [(-0.1, 0.0, 4.0)] * 6, lifted.past)[-1]
+    assert np.abs(later.displacement).max() < 0.01 * dent

@@ -1,4 +1,4 @@
-"""How far a growing load moves the tissue, and the load at which it moves as far as wanted.
+"""The range of loads: the pressure at which the tissue moves as far as the scene allows.
 
 The equilibrium path under ``p f`` starts along ``u_1 = K_0^-1 f`` and bends along its second and
 third derivative at rest.  Galerkin's solution in these three vectors is within some percent of the
@@ -13,7 +13,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.offline.fem.mesh import local_thickness
 from palpate.offline.fem.model import FullModel, NoEquilibrium
+from palpate.offline.fem.potential import Projected
+from palpate.offline.fem.problem import FullProblem
+from palpate.offline.fem.terms import DeadLoad
 from palpate.offline.reduce.ritz import energy_pod, path_vectors
 from palpate.shared.mechanics import newton
 
@@ -26,6 +30,12 @@ LEAST = 1e-3
 
 TOLERANCE = 1e-3
 MAX_ITERATIONS = 20
+
+DEEPEST = 0.8
+"""Largest depth of the tip, in radii: its centre must stay outside the undeformed body."""
+
+SHALLOWEST = 0.02
+"""Millimetres that the range of depths has at least."""
 
 
 class LoadPath:
@@ -40,12 +50,9 @@ class LoadPath:
 
     def __init__(self, model: FullModel, load: Array) -> None:
         self._model = model
-        self._modes, _ = energy_pod(model, path_vectors(model, load), 3)
-        self._unit = self._modes.T @ load
-        self._load = np.zeros_like(self._unit)
-        self._work = np.empty((4, len(self._unit)))
-        self._tangent = np.eye(len(self._unit))
-        self._q = np.zeros_like(self._unit)
+        self._load = model.filled(load)
+        self._basis, _ = energy_pod(model, path_vectors(model, load), 3)
+        self._q = np.zeros(self._basis.shape[1])
 
     def solve(self, pressure: float, start: Array | None) -> Array:
         """Displacement (n, 3) mm at a pressure, from the last found unless ``start`` is None.
@@ -54,38 +61,17 @@ class LoadPath:
         ------
         NoEquilibrium
         """
-        self._load[:] = pressure * self._unit
+        load = pressure * self._load
+        path = Projected(self._model, [DeadLoad(load)], self._basis)
         q = np.zeros_like(self._q) if start is None else self._q.copy()
-        target = TOLERANCE * float(np.linalg.norm(self._load))
-        status, *_ = newton.newton(self, q, self._work, target, 0.0, MAX_ITERATIONS, False)
+        target = TOLERANCE * float(np.linalg.norm(self._basis.T @ load[self._model.free]))
+        status, *_ = newton.newton(
+            path, q, np.empty((4, len(q))), target, 0.0, MAX_ITERATIONS, False
+        )
         if status != newton.CONVERGED:
             raise NoEquilibrium("load: no equilibrium found along its path")
         self._q = q
-        return self._full(q).reshape(-1, 3)
-
-    def _full(self, q: Array) -> Array:
-        displacement = np.zeros(3 * len(self._model.mesh.nodes))
-        displacement[self._model.free] = self._modes @ q
-        return displacement
-
-    # what mechanics.newton asks for ------------------------------------------------------------
-
-    def potential(self, q: Array, residual: Array) -> tuple[float, float]:
-        """Total potential energy (mN mm), its gradient and the smallest det F."""
-        force = np.empty(3 * len(self._model.mesh.nodes))
-        energy, smallest = self._model.internal(self._full(q), force)
-        residual[:] = self._modes.T @ force[self._model.free] - self._load
-        return energy - float(self._load @ q), smallest
-
-    def factorise(self, q: Array, shift: float) -> bool:
-        """Tangent plus ``shift`` times the rest stiffness, if that is definite."""
-        K = self._model.stiffness(self._full(q))
-        self._tangent = self._modes.T @ (K @ self._modes) + shift * np.eye(len(q))
-        return bool(np.linalg.eigvalsh(self._tangent)[0] > 0.0)
-
-    def correct(self, residual: Array, step: Array) -> None:
-        """Newton's step for a residual."""
-        step[:] = np.linalg.solve(self._tangent, -residual)
+        return self._model.filled(self._basis @ q).reshape(-1, 3)
 
 
 def pressure_that_moves(
@@ -150,3 +136,31 @@ def pressure_that_moves(
             pressure = (low + high) / 2
         start = (pressure / last[0]) ** power * state
     return low, 1.0, below
+
+
+def load_range(problem: FullProblem, position: Array) -> Array:
+    """Load range at a surface point: fields (8,) of ``mechanics.footprint.pressure_limit``.
+
+    The limit along the normal is where the tissue moves by the scene's indentation, or beyond
+    which it has no equilibrium; the depth of the tip is how far the footprint has sunk then.
+    """
+    model = problem.model.relaxed  # for as long as it takes
+    nodal, normal = problem.unit_load(position)
+    unit = np.einsum("n,ij->nij", nodal, np.eye(3)).reshape(-1, 3)[model.free]
+    linear = model.solve_linear(unit)
+    C = unit.T @ linear / nodal.sum()
+    thickness = local_thickness(problem.mesh, position[None], normal[None])[0]
+    wanted = problem.scene.load.max_indentation * thickness
+    pressure = wanted / np.linalg.norm((linear @ normal).reshape(-1, 3), axis=1).max()
+    path = LoadPath(model, -unit @ normal)
+    # no load steps in the full model: where a jump fails, the pressure between is asked for
+    near = pressure_that_moves(path.solve, wanted, pressure)
+
+    def full(pressure: float, start: Array | None) -> Array:
+        force = -pressure * nodal[:, None] * normal
+        return model.solve(force, start=start, smallest_step=1.0).displacement
+
+    limit, _, moved = pressure_that_moves(full, wanted, *near)
+    depth = 0.0 if moved is None else -float(nodal @ moved @ normal) / nodal.sum()
+    depth = min(max(depth, SHALLOWEST), DEEPEST * problem.scene.endoscope.radius)
+    return np.array([limit, *np.diag(C), C[0, 1], C[0, 2], C[1, 2], depth])

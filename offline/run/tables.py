@@ -1,4 +1,4 @@
-"""Tables of the studies on disk."""
+"""Tables on disk."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows of equal keys, numbers with five digits and vectors as words in one field."""
+    """Write rows of equal keys, numbers with six digits and vectors as words in one field."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]) if rows else ["method"], lineterminator="\n")
@@ -21,4 +21,4 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 def _text(value: Any) -> str:
     if isinstance(value, list):
         return " ".join(map(_text, value))
-    return f"{value:.5g}" if isinstance(value, float) else str(value)
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,120 @@
+"""The total potential energy of a body under loads, as ``mechanics.newton`` minimises it.
+
+The unknowns are the displacements of the free degrees of freedom, or their coordinates in a basis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.sparse import csr_matrix
+
+from palpate.offline.fem.linear_solver import NotPositiveDefinite
+from palpate.offline.fem.terms import Term
+
+if TYPE_CHECKING:
+    from palpate.offline.fem.model import FullModel
+
+Array = NDArray[np.float64]
+
+
+class Potential:
+    """Elastic tissue and further terms.
+
+    Only one potential of a full model can be minimised at a time: they share its linear solver.
+
+    Parameters
+    ----------
+    model : FullModel
+    terms : sequence of Term
+    """
+
+    def __init__(self, model: FullModel, terms: Sequence[Term]) -> None:
+        self.free = model.free
+        self.terms = terms
+        self._model = model
+        self._displacement = np.zeros(3 * len(model.mesh.nodes))
+        self._force = np.zeros_like(self._displacement)
+        self._data = np.empty(model.pattern.nnz)
+
+    def stiffness(self, u: Array, convex: bool = False) -> csr_matrix:
+        """Tangent (mN/mm) at ``u`` (free dofs,) mm, which the next call overwrites.
+
+        For ``convex`` see ``Term.add_stiffness``.
+        """
+        self._displacement[self.free] = u
+        self._data[:] = 0.0
+        self._model.add_stiffness(self._displacement, self._data)
+        for term in self.terms:
+            term.add_stiffness(self._displacement, self._data, convex)
+        return self._model.matrix(self._data)
+
+    def solve(self, loads: Array) -> Array:
+        """Linear responses (free dofs, k) mm to loads (free dofs, k) mN, by the factorisation."""
+        return self._model.solver.solve(loads)
+
+    def potential(self, u: Array, residual: Array) -> tuple[float, float]:
+        """Energy (mN mm), its gradient (mN) and the smallest det F."""
+        self._displacement[self.free] = u
+        energy, smallest = self._model.internal(self._displacement, self._force)
+        if smallest > 0.0:
+            for term in self.terms:
+                energy += term.add_force(self._displacement, self._force)
+        np.take(self._force, self.free, out=residual)
+        return energy, smallest
+
+    def factorise(self, u: Array, shift: float) -> bool:
+        """Factorise the tangent plus ``shift`` times the rest stiffness, if that is definite."""
+        matrix = self.stiffness(u, convex=shift > 0)
+        if shift:
+            matrix.data += shift * self._model.rest_stiffness.data
+        try:
+            self._model.solver.factorise(matrix.data)
+        except NotPositiveDefinite:
+            return False
+        return True
+
+    def correct(self, residual: Array, step: Array) -> None:
+        """Newton's step for a residual, by the last factorisation."""
+        np.negative(self.solve(residual), out=step)
+
+
+class Projected(Potential):
+    """The same in the span of a basis.
+
+    Parameters
+    ----------
+    model, terms
+        See ``Potential``.
+    basis : ndarray, shape (free dofs, m), mm
+        Orthonormal in the energy at rest.
+    """
+
+    def __init__(self, model: FullModel, terms: Sequence[Term], basis: Array) -> None:
+        super().__init__(model, terms)
+        self._basis = basis
+        self._residual = np.empty(len(basis))
+
+    def potential(self, q: Array, residual: Array) -> tuple[float, float]:
+        """Energy (mN mm), its gradient in the coordinates ``q`` (m,) and the smallest det F."""
+        energy, smallest = super().potential(self._basis @ q, self._residual)
+        np.matmul(self._basis.T, self._residual, out=residual)
+        return energy, smallest
+
+    def factorise(self, q: Array, shift: float) -> bool:
+        """See ``Potential``."""
+        K = self.stiffness(self._basis @ q, convex=shift > 0)
+        tangent = self._basis.T @ (K @ self._basis) + shift * np.eye(len(q))
+        try:
+            self._factor = cho_factor(tangent)
+        except LinAlgError:
+            return False
+        return True
+
+    def solve(self, loads: Array) -> Array:
+        """Coordinates (m, k) of responses to loads (m, k), by the factorisation."""
+        return np.asarray(cho_solve(self._factor, loads))

@@ -1,0 +1,199 @@
+"""A scene in full order: its full model, its surface, and the loads of its endoscope."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.offline.fem.mesh import Mesh, build_mesh
+from palpate.offline.fem.model import Equilibrium, FullModel, NoEquilibrium
+from palpate.offline.fem.norms import relative
+from palpate.offline.fem.refine import refined, twin
+from palpate.offline.fem.surface import accessible_surface
+from palpate.offline.fem.terms import DeadLoad, Past, TipContact, TipLoad
+from palpate.shared.artifact import Artifact
+from palpate.shared.geometry.quadrature import stress_recovery
+from palpate.shared.geometry.surface import Surface
+from palpate.shared.local_models import Body
+from palpate.shared.mechanics.footprint import footprint
+from palpate.shared.mechanics.sphere import tip_of, tip_surface
+from palpate.shared.mechanics.stress import StressRecovery, nodal_von_mises, nodal_von_mises_after
+from palpate.shared.scene import Scene, parse_scene
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Load:
+    """A pressed footprint at the end of a time step."""
+
+    position: Array  # (3,) mm, contact point
+    direction: Array  # (3,), unit vector
+    pressure: float  # kPa
+    dt: float = 0.0  # s
+
+
+@dataclass(frozen=True)
+class TipPosition:
+    """A rigid tip at the end of a time step."""
+
+    position: Array  # (3,) mm, centre
+    dt: float = 0.0  # s
+
+
+Step = Load | TipPosition
+"""What the endoscope does in one time step; without time, its length is zero."""
+
+
+class Reference(NamedTuple):
+    """Full solutions at the ends of time steps."""
+
+    u: NDArray[np.float32]  # (t, n, 3) mm
+    s: NDArray[np.float32]  # (t, n) kPa, von Mises stress
+    f: Array  # (t, 3) mN, on the tool
+    tangent: Array  # (t, 3, 3) mN/mm, derivative of the force in the tool's position
+
+
+class FullProblem:
+    """The full model of a scene and what it needs to be pressed.
+
+    Parameters
+    ----------
+    scene : Scene
+    mesh : Mesh, optional
+        Built from the scene if absent.
+    """
+
+    def __init__(self, scene: Scene, mesh: Mesh | None = None) -> None:
+        self.scene = scene
+        self.mesh = build_mesh(scene) if mesh is None else mesh
+        self.model = FullModel.of(scene, self.mesh)
+        self.surface: Surface = accessible_surface(self.mesh)
+        self._nodal = np.zeros(len(self.mesh.nodes))
+
+    @classmethod
+    def of_artifact(cls, artifact: Artifact) -> FullProblem:
+        """Full model on the very mesh that an artifact was trained on."""
+        return cls(
+            parse_scene(artifact.scene),
+            Mesh(**{part.name: artifact.arrays[part.name] for part in fields(Mesh)}),
+        )
+
+    @cached_property
+    def body(self) -> Body:
+        """Mesh and tissue as the reduced model sees them."""
+        parts = {part.name: getattr(self.mesh, part.name) for part in fields(Mesh)}
+        tip = tip_of(self.scene.endoscope.radius, self.scene.tissue.young)
+        return Body(**parts, law=self.model.law, tip=tip)
+
+    @cached_property
+    def beyond_clamped_layer(self) -> NDArray[np.bool_]:
+        """Nodes of no element that touches the support, (n,)."""
+        layer = self.mesh.elements[self.mesh.clamped[self.mesh.elements].any(axis=1)]
+        outside = np.ones(len(self.mesh.nodes), dtype=bool)
+        outside[layer] = False
+        return outside
+
+    @cached_property
+    def remeshed(self) -> tuple[FullProblem, FullProblem]:
+        """The scene on a mesh of the other element that does not lock, and on a finer one."""
+        return FullProblem(twin(self.scene)), FullProblem(refined(self.scene))
+
+    # --- loads ---------------------------------------------------------------------------------
+
+    def unit_load(self, position: Array) -> tuple[Array, Array]:
+        """Nodal weights (n,) mm^2 of a unit pressure at a surface point, and the normal there."""
+        x, normal, _ = self.surface.project(position)
+        return self.unit_load_at(x, normal), normal
+
+    def unit_load_at(self, x: Array, normal: Array) -> Array:
+        """The same at a contact point of another mesh, whose accessible surface ends elsewhere."""
+        footprint(self.body.boundary, x, normal, self.scene.endoscope.radius, self._nodal)
+        return self._nodal.copy()
+
+    def load_vector(self, load: Load) -> Array:
+        """Nodal forces (n, 3) mN."""
+        nodal, _ = self.unit_load(load.position)
+        return load.pressure * nodal[:, None] * load.direction
+
+    @cached_property
+    def contact(self) -> TipContact:
+        """The rigid tip against the full model."""
+        mesh, tip = self.mesh, self.body.tip
+        surface = tip_surface(mesh.nodes, mesh.faces, mesh.accessible, tip.radius)
+        return TipContact(self.model, surface, tip)
+
+    def tip_load(self, position: Array) -> TipLoad:
+        """The tip at a place (3,) mm, on the shortest way from where it does not touch."""
+        foot, normal, _ = self.surface.project(position)
+        out = position - foot
+        depth = self.body.tip.radius - float(np.copysign(np.linalg.norm(out), out @ normal))
+        return TipLoad(self.contact, position, -max(depth, 0.0) * normal)
+
+    # --- answers -------------------------------------------------------------------------------
+
+    def solve(
+        self, step: Step, past: Past | None = None, start: Array | None = None
+    ) -> Equilibrium:
+        """Full solution at the end of a time step; see ``FullModel.solve``."""
+        load: DeadLoad | TipLoad = (
+            DeadLoad(self.load_vector(step).reshape(-1))
+            if isinstance(step, Load)
+            else self.tip_load(step.position)
+        )
+        return self.model.solve(load, past, step.dt, start)
+
+    def follow(self, steps: Sequence[Step], start: Array | None = None) -> Iterator[Equilibrium]:
+        """Full solutions of one step after the other, the first from a guess ``start`` (n, 3)."""
+        past = None
+        for step in steps:
+            found = self.solve(step, past, start)
+            yield found
+            past, start = found.past, None
+
+    def reference(self, steps: Sequence[Step], start: Array | None = None) -> Reference | None:
+        """What a reduced model is compared with, None where there is no equilibrium."""
+        try:
+            rows = [
+                (
+                    found.displacement.astype(np.float32),
+                    self.von_mises(found.displacement, found.past).astype(np.float32),
+                    found.force,
+                    found.tangent,
+                )
+                for found in self.follow(steps, start)
+            ]
+        except NoEquilibrium:
+            return None
+        return Reference(*(np.array(part) for part in zip(*rows, strict=True)))
+
+    @cached_property
+    def _recovery(self) -> StressRecovery:
+        return stress_recovery(self.mesh.nodes, self.mesh.elements, self.model.law)
+
+    def von_mises(self, displacement: Array, past: Past | None = None) -> Array:
+        """Nodal von Mises stress (n,) kPa at a displacement (n, 3) mm, with which a past ends."""
+        out, u = np.zeros(len(self.mesh.nodes)), np.ascontiguousarray(displacement, dtype=float)
+        if past is None or not self.model.prony:
+            nodal_von_mises(self._recovery, u, out)
+            return out
+        shares = np.array([share for share, _ in self.model.prony])
+        lost = np.einsum("a,aeqi->eiq", shares, past.points[:-1])
+        nodal_von_mises_after(self._recovery, u, np.ascontiguousarray(lost), out)
+        return out
+
+    def errors(self, displacement: Array, reference: Array) -> tuple[float, float]:
+        """Relative errors of displacement and of von Mises stress beyond the clamped layer."""
+        kept = self.beyond_clamped_layer
+        stresses = [self.von_mises(u)[kept] for u in (displacement, reference)]
+        return relative(displacement, reference), relative(*stresses)
+
+    def under(self, position: Array, displacement: Array) -> Array:
+        """Mean displacement (3,) under a footprint, weighted with its pressure."""
+        nodal, _ = self.unit_load(position)
+        return np.asarray(nodal @ displacement / nodal.sum())

@@ -1,0 +1,220 @@
+"""Answers of the reduced model beside full solutions, query by query.
+
+A query is a list of time steps; without time its length is one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.offline.fem.norms import relative, statistics
+from palpate.offline.fem.problem import FullProblem, Load, Reference, Step
+from palpate.offline.validate.calibrate import KnownAnswer, coverage
+from palpate.offline.validate.kinds import LOADS, Kind
+from palpate.shared.answer import Answer
+from palpate.shared.model import ReducedModel
+from palpate.shared.reduced.transfer import REST
+
+Array = NDArray[np.float64]
+
+OTHER_EQUILIBRIUM = 0.1
+"""Displacement error beyond which the models rest in different equilibria: a free edge can slip off
+the tip or not, and where it just does not in one model, it does in the other."""
+
+
+def play(model: ReducedModel, query: Sequence[Step]) -> list[Answer]:
+    """Answers of the reduced model at the ends of time steps; a single one may take no time."""
+    in_time = len(query) > 1 or query[0].dt > 0.0
+    past, warm = (REST, model.new_warm()) if in_time else (None, None)
+    answers: list[Answer] = []
+    for step in query:
+        answer = (
+            model.press(
+                step.position, step.pressure, step.direction, past=past, dt=step.dt, warm=warm
+            )
+            if isinstance(step, Load)
+            else model.touch(step.position, past=past, dt=step.dt, warm=warm)
+        )
+        answers.append(answer)
+        past = answer.past
+    return answers
+
+
+class Compared(NamedTuple):
+    """A quantity at the ends of time steps, by both models, each (t, ...)."""
+
+    reduced: Array
+    full: Array
+
+    @property
+    def error(self) -> float:
+        """Relative L2 norm over everything."""
+        return relative(self.reduced, self.full)
+
+    @property
+    def away(self) -> Array:
+        """Size of the error (t,) at each moment."""
+        return _sizes(self.reduced - self.full)
+
+    @property
+    def largest(self) -> Array:
+        """Largest norm (t,) until each moment."""
+        return np.asarray(np.maximum.accumulate(_sizes(self.full)))
+
+    @property
+    def so_far(self) -> Array:
+        """Largest error (t,) until each moment over the largest norm until then.
+
+        It does not vanish where the error changes its sign.
+        """
+        floor = 1e-9 * max(float(self.largest[-1]), 1e-300)
+        return np.asarray(np.maximum.accumulate(self.away) / np.maximum(self.largest, floor))
+
+
+def _sizes(values: Array) -> Array:
+    return np.asarray(np.linalg.norm(values.reshape(len(values), -1), axis=1))
+
+
+class Row(NamedTuple):
+    """One query answered by both models.
+
+    Attributes
+    ----------
+    table : dict
+        What there is to tell of it; errors are relative L2 norms over all nodes (of stress outside
+        the clamped layer) and all moments.
+    known : list of KnownAnswer
+        The answers at the ends of its time steps.
+    """
+
+    table: dict[str, float]
+    known: list[KnownAnswer]
+
+
+def compare(
+    kind: Kind, problem: FullProblem, model: ReducedModel, query: Sequence[Step], full: Reference
+) -> Row:
+    """Answer a query with the reduced model and compare with full solutions."""
+    answers, kept = play(model, query), problem.beyond_clamped_layer
+    fields = {
+        "displacement": ([model.displacement(answer) for answer in answers], full.u),
+        "von_mises": ([model.von_mises(answer)[kept] for answer in answers], full.s[:, kept]),
+        "force": ([answer.force for answer in answers], full.f),
+    }
+    compared = {
+        name: Compared(*(np.array(values, float) for values in fields[name]))
+        for name in kind.quantities
+    }
+    errors = np.transpose([quantity.so_far for quantity in compared.values()])
+    known = [
+        KnownAnswer(
+            errors=own,
+            features=answer.features,
+            converged=answer.converged,
+            # a pressed footprint has one equilibrium within the range of loads
+            comparable=answer.converged and (kind is LOADS or own[0] <= OTHER_EQUILIBRIUM),
+            estimated=np.array([getattr(answer, f"error_{name}") for name in kind.quantities]),
+        )
+        for own, answer in zip(errors, answers, strict=True)
+    ]
+    table = (
+        _history(kind, problem, query, answers, compared)
+        if kind.in_time
+        else _single(model, answers[0], compared, full)
+    )
+    return Row(table, known)
+
+
+def _single(
+    model: ReducedModel, answer: Answer, compared: Mapping[str, Compared], full: Reference
+) -> dict[str, float]:
+    """What there is to tell of a load or a position; ``load`` and ``tilt`` are shares of limits."""
+    errors = {name: quantity.error for name, quantity in compared.items()}
+    if answer.tip:
+        at, names = answer.position, ("depth", "depth_limit", "penetration")
+        errors["tangent"] = relative(answer.tangent, full.tangent[0])
+        errors["penetration_over_depth"] = answer.penetration / answer.depth
+        shares = {}
+    else:
+        at, names = answer.contact_point, ("pressure", "departure", "residual")
+        found, exact = (np.percentile(stress[0], 99) for stress in compared["von_mises"])
+        errors["von_mises_p99"] = float(abs(found - exact) / exact)
+        errors["peak_displacement"] = float(np.linalg.norm(full.u[0], axis=1).max())
+        shares = {
+            "limit": answer.pressure_limit,
+            "load": answer.pressure / answer.pressure_limit,
+            "tilt": answer.tilt / model.scene.endoscope.max_tilt,
+        }
+    said = {name: getattr(answer, name) for name in (*names, "converged", "in_range", "iterations")}
+    return dict(zip("xyz", at.tolist(), strict=True)) | shares | said | errors
+
+
+def _history(
+    kind: Kind,
+    problem: FullProblem,
+    query: Sequence[Step],
+    answers: Sequence[Answer],
+    compared: Mapping[str, Compared],
+) -> dict[str, float]:
+    """What there is to tell of a history.
+
+    ``apart`` are moments at which the models rest in different equilibria, as where tissue has
+    slipped off the tip in one and is about to in the other; ``together_`` are errors over others.
+    ``depth`` is the error of how far a footprint has moved.
+    """
+    positions = np.array([step.position for step in query])
+    table = {
+        "steps": len(query),
+        "seconds": float(sum(step.dt for step in query)),
+        "travel": float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()),
+        "unconverged": sum(not answer.converged for answer in answers),
+    }
+    for name, quantity in compared.items():
+        table[name] = quantity.error
+        table[f"worst_{name}"] = float(quantity.so_far.max() if kind.tip else quantity.so_far[-1])
+    moved = compared["displacement"]
+    if kind.tip:
+        apart = moved.away > OTHER_EQUILIBRIUM * moved.largest
+        table["apart"] = int(apart.sum())
+        for name, (reduced, full) in compared.items():
+            table[f"together_{name}"] = relative(reduced[~apart], full[~apart])
+        return table
+    under = [problem.under(*pair) for pair in zip(positions, moved.full, strict=True)]
+    contact = np.array([answer.contact_displacement for answer in answers])
+    table["depth"] = relative(contact, np.array(under))
+    table["last_displacement"] = float(moved.away[-1] / moved.largest[-1])
+    return table
+
+
+def summarise(kind: Kind, rows: Sequence[Row]) -> dict[str, Any]:
+    """Statistics over queries of one kind.
+
+    ``unconverged`` counts answers, and ``covered`` is the share of all others that are within their
+    estimates.  Single answers that did not converge count in nothing else.  Under the tip queries
+    that the models spend in different equilibria, ``other_equilibrium``, are left out of all
+    errors but ``together_...``, which are those of moments at which they do not.
+    """
+    known = [answer for row in rows for answer in row.known]
+    converged = [answer for answer in known if answer.converged]
+    covered, ratios = coverage(converged)
+    answered = [row.table for row in rows if any(answer.converged for answer in row.known)]
+    alike = [row for row in answered if not kind.tip or row["displacement"] <= OTHER_EQUILIBRIUM]
+    summary: dict[str, Any] = {"histories" if kind.in_time else "queries": len(rows)}
+    if kind.in_time:
+        summary["steps"] = len(known)
+    summary["unconverged"] = len(known) - len(converged)
+    if kind.tip:
+        summary["other_equilibrium"] = len(answered) - len(alike)
+    summary["covered"] = covered
+    if kind.tip and kind.in_time:
+        moments = [row["apart"] for row in answered]
+        summary["apart"] = {"histories": int(np.count_nonzero(moments)), "moments": sum(moments)}
+    for name in kind.columns:
+        counted = answered if name.startswith("together") else alike
+        summary[name] = statistics([row[name] for row in counted])
+    medians = dict(zip(kind.quantities, ratios.tolist(), strict=True))
+    return summary | {"estimate_over_error_median": medians}

@@ -1,0 +1,46 @@
+"""Errors of answers, and what is said of many."""
+
+import numpy as np
+import pytest
+
+from palpate.offline.fem.norms import relative
+from palpate.offline.fem.problem import FullProblem, Reference
+from palpate.offline.reduce.queries import random_histories
+from palpate.offline.validate.compare import Compared, compare, play, summarise
+from palpate.offline.validate.kinds import TIP_HISTORIES
+from palpate.shared.artifact import read_artifact
+from palpate.shared.model import ReducedModel
+
+
+def test_relative_error():
+    assert relative(np.array([3.0, 1.0]), np.array([3.0, 0.0])) == pytest.approx(1 / 3)
+    assert relative(np.ones(3), np.zeros(3)) == 0.0
+
+
+def test_moments_are_relative_to_the_largest_so_far():
+    exact = np.array([[1.0, 0.0], [4.0, 0.0], [0.0, 0.0]])
+    found = exact + np.array([[0.1, 0.0], [0.0, 0.2], [0.4, 0.0]])
+    np.testing.assert_allclose(Compared(found, exact).so_far, [0.1, 0.05, 0.1])
+
+
+def test_moments_in_different_equilibria_are_told_apart(visco_artifact, rng):
+    atlas = ReducedModel.load(visco_artifact)
+    (history,) = random_histories(atlas, 1, rng, tip=True)
+    answers = play(atlas, history)
+    u = np.array([atlas.displacement(answer) for answer in answers])
+    at = np.argmax(np.linalg.norm(u.reshape(len(u), -1), axis=1))
+    u[at] *= 1.2  # as if it had gone further there
+    full = Reference(
+        u,
+        np.array([atlas.von_mises(answer) for answer in answers]),
+        np.array([answer.force for answer in answers]),
+        np.array([answer.tangent for answer in answers]),
+    )
+    problem = FullProblem.of_artifact(read_artifact(visco_artifact))
+    row = compare(TIP_HISTORIES, problem, atlas, history, full)
+    assert row.table["apart"] == 1
+    assert row.table["displacement"] > 0.01
+    assert row.table["together_displacement"] <= 1e-6
+    found = summarise(TIP_HISTORIES, [row])
+    assert found["apart"] == {"histories": 1, "moments": 1}
+    assert found["together_displacement"]["max"] <= 1e-6 < found["displacement"]["max"]
