@@ -4,10 +4,9 @@ import csv
 
 import pytest
 
-from palpate.offline.studies import mesh_error, relaxation
+from palpate.offline.studies import mesh_error
 from palpate.offline.studies.continuity import continuity
 from palpate.offline.studies.mesh_error import Discretisation
-from palpate.shared.errors import QueryError
 
 
 def test_the_force_on_a_gliding_tip_jumps_no_more_than_the_full_models(artifact):
@@ -47,18 +46,3 @@ def test_mesh_error_is_tabled_and_drawn(tmp_path, monkeypatch):
     with (tmp_path / "report" / "mesh_error.csv").open() as file:
         assert [row["values"] for row in csv.DictReader(file)] == ["9", "9", "9"]
     assert (tmp_path / "report" / "mesh_error.png").stat().st_size > 5000
-
-
-def test_pressed_tissue_gives_way_and_comes_back(artifact, visco_artifact, monkeypatch):
-    phases = (0.2, 3, 1.0), (4.0, 5, 1.0), (0.1, 2, 0.0), (4.0, 5, 0.0)
-    monkeypatch.setattr(relaxation, "PHASES", phases)
-    found = relaxation.relaxation(visco_artifact)
-    assert found["depth_held_mm"] > 1.2 * found["depth_pressed_mm"]
-    assert 0 <= found["dent_left_mm"] < 0.2 * found["depth_held_mm"]
-    assert found["largest_difference_mm"] < 0.05 * found["depth_held_mm"]
-    report = visco_artifact.parent / visco_artifact.stem / "report"
-    with (report / "relaxation.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == 15
-    assert (report / "relaxation.png").stat().st_size > 5000
-    with pytest.raises(QueryError, match="elastic"):
-        relaxation.relaxation(artifact)
