@@ -6,10 +6,11 @@ import sys
 import pytest
 
 SCRIPT = """
-from palpate import Client, ReducedModel, Session
+from palpate import REST, Client, ReducedModel, Session
 from palpate.offline.train import train
 from palpate.shared.errors import PalpateError
-print(Client.__module__, ReducedModel.__module__, Session.__module__, PalpateError.__module__)
+for name in (REST, Client, ReducedModel, Session, PalpateError):
+    print(name.__module__)
 """
 
 
@@ -22,6 +23,7 @@ def test_a_script_beside_a_folder_named_like_a_part_of_palpate_runs(folder, tmp_
         [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=True
     )
     assert run.stdout.split() == [
+        "palpate.shared.reduced.transfer",
         "palpate.online.client.http",
         "palpate.shared.model",
         "palpate.online.client.session",

@@ -10,10 +10,12 @@ if TYPE_CHECKING:
     from palpate.online.client.http import Client
     from palpate.online.client.session import Session
     from palpate.shared.model import ReducedModel
+    from palpate.shared.reduced.transfer import REST
 
-__all__ = ["Client", "ReducedModel", "Session"]
+__all__ = ["REST", "Client", "ReducedModel", "Session"]
 
 _WHERE = {
+    "REST": "palpate.shared.reduced.transfer",
     "Client": "palpate.online.client.http",
     "ReducedModel": "palpate.shared.model",
     "Session": "palpate.online.client.session",
