@@ -86,7 +86,7 @@ def test_the_readme_is_read_in_five_minutes():
 
 def test_its_python_runs(visco_artifact, capsys):
     example = re.search(
-        r"```python\n(from palpate import ReducedModel.*?)```", TEXTS[DOCUMENTS[0]], re.S
+        r"```python\n(from palpate import REST, ReducedModel.*?)```", TEXTS[DOCUMENTS[0]], re.S
     )
     own = (("artifacts/turbinate-visco.h5", str(visco_artifact)), ("(10, 20, 11)", "(5, 5, 8)"),
            ("(11.9, 20, 11)", "(5, 5, 9.8)"))  # fmt: skip
