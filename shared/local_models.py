@@ -153,13 +153,6 @@ class LocalTips:
         ),
     ] = None
 
-    @property
-    def viscous(self) -> ViscousModels | None:
-        """What steps in time need, of tissue that remembers."""
-        if self.deviatoric is None:
-            return None
-        return ViscousModels(self.deviatoric, self.pairs, self.overlaps)
-
 
 @dataclass(frozen=True)
 class LocalModels:
@@ -259,7 +252,10 @@ class LocalModels:
     @property
     def viscous_tips(self) -> ViscousModels | None:
         """What steps in time need under the tip."""
-        return None if self.tips is None else self.tips.viscous
+        tips = self.tips
+        if tips is None or tips.deviatoric is None:
+            return None
+        return ViscousModels(tips.deviatoric, tips.pairs, tips.overlaps)
 
     @cached_property
     def modes(self) -> Field:

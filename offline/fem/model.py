@@ -142,11 +142,16 @@ class FullModel:
         mean = np.einsum("eq,eqai->eai", weights, self.gradients)
         return np.ascontiguousarray(mean[:, None]), np.ones((len(mean), 1))
 
-    def _sparsity(self) -> tuple[NDArray[np.int32], csr_matrix]:
-        """CSR pattern of the free dofs and the slot in it of every element matrix entry."""
+    @cached_property
+    def _number(self) -> NDArray[np.int64]:
+        """Place of every dof (3 nodes,) among the free ones; -1 is clamped."""
         number = np.full(3 * len(self.mesh.nodes), -1, dtype=np.int64)
         number[self.free] = np.arange(len(self.free))
-        dofs = number[
+        return number
+
+    def _sparsity(self) -> tuple[NDArray[np.int32], csr_matrix]:
+        """CSR pattern of the free dofs and the slot in it of every element matrix entry."""
+        dofs = self._number[
             (3 * self.mesh.elements[:, :, None] + np.arange(3)).reshape(len(self.mesh.elements), -1)
         ]
         rows = np.repeat(dofs, dofs.shape[1], axis=1).ravel()
@@ -162,9 +167,7 @@ class FullModel:
 
     def face_slots(self, faces: NDArray[np.int32]) -> NDArray[np.int32]:
         """Slots (f, 3 k, 3 k) in the pattern of the dofs of faces (f, k); -1 is clamped."""
-        number = np.full(3 * len(self.mesh.nodes), -1, dtype=np.int64)
-        number[self.free] = np.arange(len(self.free))
-        dofs = number[(3 * faces[:, :, None] + np.arange(3)).reshape(len(faces), -1)]
+        dofs = self._number[(3 * faces[:, :, None] + np.arange(3)).reshape(len(faces), -1)]
         rows = np.broadcast_to(dofs[:, :, None], (*dofs.shape, dofs.shape[1]))
         cols = np.swapaxes(rows, 1, 2)
         n = len(self.free)

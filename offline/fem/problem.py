@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from palpate.offline.fem.mesh import Mesh, build_mesh
 from palpate.offline.fem.model import Equilibrium, FullModel, NoEquilibrium
-from palpate.offline.fem.norms import relative
 from palpate.offline.fem.refine import refined, twin
 from palpate.offline.fem.surface import accessible_surface
 from palpate.offline.fem.terms import DeadLoad, Past, TipContact, TipLoad
@@ -148,6 +147,24 @@ class FullProblem:
         )
         return self.model.solve(load, past, step.dt, start)
 
+    def press_at(
+        self, x: Array, normal: Array, traction: Array, start: Array | None = None
+    ) -> tuple[Array, Array]:
+        """Displacement (n, 3) mm, and its mean (3,) under the footprint, at a given contact point.
+
+        The point may be one of another mesh, whose accessible surface ends elsewhere.
+
+        Parameters
+        ----------
+        x, normal : ndarray, shape (3,)
+        traction : ndarray, shape (3,), kPa
+            Direction times pressure at the footprint's centre.
+        start : ndarray, shape (n, 3), optional
+        """
+        nodal = self.unit_load_at(x, normal)
+        displacement = self.model.solve(np.outer(nodal, traction), start=start).displacement
+        return displacement, nodal @ displacement / nodal.sum()
+
     def follow(self, steps: Sequence[Step], start: Array | None = None) -> Iterator[Equilibrium]:
         """Full solutions of one step after the other, the first from a guess ``start`` (n, 3)."""
         past = None
@@ -186,12 +203,6 @@ class FullProblem:
         lost = np.einsum("a,aeqi->eiq", shares, past.points[:-1])
         nodal_von_mises_after(self._recovery, u, np.ascontiguousarray(lost), out)
         return out
-
-    def errors(self, displacement: Array, reference: Array) -> tuple[float, float]:
-        """Relative errors of displacement and of von Mises stress beyond the clamped layer."""
-        kept = self.beyond_clamped_layer
-        stresses = [self.von_mises(u)[kept] for u in (displacement, reference)]
-        return relative(displacement, reference), relative(*stresses)
 
     def under(self, position: Array, displacement: Array) -> Array:
         """Mean displacement (3,) under a footprint, weighted with its pressure."""

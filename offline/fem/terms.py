@@ -126,12 +126,7 @@ class TipContact:
         """The force is not known beforehand; this one dents the tissue by about the radius."""
         self._all = np.arange(len(surface.faces), dtype=np.int32)
         self._slots = model.face_slots(surface.faces)
-
         self.touching: Touching = room_for(surface, len(surface.faces))
-
-    def at(self, position: Array, approach: Array) -> TipLoad:
-        """The tip at a place; see ``TipLoad``."""
-        return TipLoad(self, position, approach)
 
     def touch(
         self, position: Array, displacement: Array, wanted: float

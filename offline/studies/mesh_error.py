@@ -89,9 +89,8 @@ def press(
     body: FullProblem, position: Array, normal: Array, pressure: float, start: Array | None = None
 ) -> tuple[float, float, Array]:
     """Press straight in: largest displacement, mean under the footprint (mm), and all (n, 3)."""
-    nodal = body.unit_load_at(position, normal)
-    u = body.model.solve(-pressure * np.outer(nodal, normal), start=start).displacement
-    return np.linalg.norm(u, axis=1).max(), np.linalg.norm(nodal @ u) / nodal.sum(), u
+    u, under = body.press_at(position, normal, -pressure * normal, start)
+    return float(np.linalg.norm(u, axis=1).max()), float(np.linalg.norm(under)), u
 
 
 def contacts(reference: FullProblem, probe: FullProblem) -> list[Contact]:

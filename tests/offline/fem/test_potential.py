@@ -6,7 +6,7 @@ import pytest
 from palpate.offline.fem.mesh import build_mesh
 from palpate.offline.fem.model import FullModel
 from palpate.offline.fem.potential import Projected
-from palpate.offline.fem.terms import DeadLoad, PastStress, TipContact
+from palpate.offline.fem.terms import DeadLoad, PastStress, TipContact, TipLoad
 from palpate.offline.scenes import find_scene
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.neo_hookean import NeoHookeanTissue
@@ -39,7 +39,7 @@ def tip_load(model):
     mesh = model.mesh
     surface = tip_surface(mesh.nodes, mesh.faces, mesh.accessible, RADIUS)
     contact = TipContact(model, surface, tip_of(RADIUS, YOUNG))
-    return contact.at(np.add(TOP, [0.1, 0.0, RADIUS - 0.3]), np.array([0.0, 0.0, -0.3]))
+    return TipLoad(contact, np.add(TOP, [0.1, 0.0, RADIUS - 0.3]), np.array([0.0, 0.0, -0.3]))
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import pytest
 
 from palpate.offline.fem.mesh import build_mesh
 from palpate.offline.fem.model import FullModel
-from palpate.offline.fem.terms import TipContact
+from palpate.offline.fem.terms import TipContact, TipLoad
 from palpate.offline.scenes import find_scene
 from palpate.shared.mechanics.neo_hookean import NeoHookeanTissue
 from palpate.shared.mechanics.sphere import tip_of, tip_surface
@@ -34,7 +34,7 @@ def touch(block, depth, aside=(0.0, 0.0), start=None):
     model, contact, top = block
     position = np.add(top, [*aside, contact.tip.radius - depth])
     approach = np.array([0.0, 0.0, -max(depth, 0.0)])
-    return model.solve(contact.at(position, approach), start=start)
+    return model.solve(TipLoad(contact, position, approach), start=start)
 
 
 def test_a_tip_off_the_block_moves_nothing(block):

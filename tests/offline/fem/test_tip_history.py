@@ -5,7 +5,7 @@ import pytest
 
 from palpate.offline.fem.mesh import build_mesh
 from palpate.offline.fem.model import FullModel
-from palpate.offline.fem.terms import TipContact
+from palpate.offline.fem.terms import TipContact, TipLoad
 from palpate.offline.scenes import find_scene
 from palpate.shared.mechanics.neo_hookean import NeoHookeanTissue
 from palpate.shared.mechanics.sphere import tip_of, tip_surface
@@ -37,15 +37,15 @@ def follow(block, course, past=None):
     model, contact = block
     answers = []
     for depth, aside, dt in course:
-        answers.append(model.solve(contact.at(*place(depth, aside)), past, dt))
+        answers.append(model.solve(TipLoad(contact, *place(depth, aside)), past, dt))
         past = answers[-1].past
     return answers
 
 
 def test_at_once_tissue_answers_as_without_time(block):
     model, contact = block
-    sudden = model.solve(contact.at(*place(0.5, 0.2)), model.at_rest)
-    elastic = model.solve(contact.at(*place(0.5, 0.2)))
+    sudden = model.solve(TipLoad(contact, *place(0.5, 0.2)), model.at_rest)
+    elastic = model.solve(TipLoad(contact, *place(0.5, 0.2)))
     np.testing.assert_allclose(sudden.displacement, elastic.displacement, atol=1e-9)
     np.testing.assert_allclose(sudden.force, elastic.force, rtol=1e-9)
     np.testing.assert_allclose(sudden.tangent, elastic.tangent, rtol=1e-6, atol=1e-6)
@@ -54,7 +54,7 @@ def test_at_once_tissue_answers_as_without_time(block):
 def test_after_long_the_force_is_that_of_relaxed_tissue(block):
     model, contact = block
     answers = follow(block, [(0.5, 0.2, 0.0), *[(0.5, 0.2, 5.0)] * 4])
-    relaxed = model.relaxed.solve(contact.at(*place(0.5, 0.2)))
+    relaxed = model.relaxed.solve(TipLoad(contact, *place(0.5, 0.2)))
     forces = [np.linalg.norm(answer.force) for answer in answers]
     assert np.all(np.diff(forces) < 1e-9)
     np.testing.assert_allclose(answers[-1].force, relaxed.force, rtol=1e-4, atol=1e-4)
@@ -95,10 +95,11 @@ def test_the_tangent_is_the_derivative_of_the_force_of_a_step(block):
     past = follow(block, [(0.5, 0.0, 0.05), (0.5, 0.3, 0.1), (0.3, 0.3, 0.02)])[-1].past
     dt, h = 0.02, 1e-4
     position, approach = place(0.4, 0.3)
-    found = model.solve(contact.at(position, approach), past, dt)
+    found = model.solve(TipLoad(contact, position, approach), past, dt)
     for axis, step in enumerate(h * np.eye(3)):
         ahead, behind = (
-            model.solve(contact.at(position + s * step, approach), past, dt).force for s in (1, -1)
+            model.solve(TipLoad(contact, position + s * step, approach), past, dt).force
+            for s in (1, -1)
         )
         error = np.abs(found.tangent[:, axis] - (ahead - behind) / (2 * h)).max()
         assert error <= 1e-3 * np.abs(found.tangent).max()

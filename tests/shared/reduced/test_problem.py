@@ -9,7 +9,7 @@ from numba import njit
 from palpate.offline.fem.mesh import build_mesh
 from palpate.offline.fem.model import FullModel
 from palpate.offline.fem.potential import Potential
-from palpate.offline.fem.terms import DeadLoad, PastStress, TipContact, advanced
+from palpate.offline.fem.terms import DeadLoad, PastStress, TipContact, TipLoad, advanced
 from palpate.offline.reduce.viscous import deviatoric_stiffness
 from palpate.offline.scenes import find_scene
 from palpate.shared.compiled import bind, bind_compiled
@@ -217,7 +217,7 @@ class Touched(Twins):
         self.latest[:] = np.inf
 
     def full_load(self, share):
-        return self.contact.at(self.place(share), np.array([0.0, 0.0, -share * DEPTH]))
+        return TipLoad(self.contact, self.place(share), np.array([0.0, 0.0, -share * DEPTH]))
 
     def reaction(self, problem):
         """Force on the tool (3,) mN and its derivative (3, 3) mN/mm."""
