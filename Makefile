@@ -28,8 +28,9 @@ serve: .venv/run | $(artifact)
 	@$(bin)/palpate info $(artifact) > /dev/null || $(bin)/palpate train turbinate --out $(artifact)
 	$(bin)/palpate serve --artifacts artifacts --host $(HOST) --port $(PORT)
 
+# A file of tests stays in one process, which has its set-ups.
 test: lint
-	$(bin)/pytest -q
+	$(bin)/pytest -q -n auto --dist loadfile
 
 lint: .venv/dev
 	$(bin)/ruff check

@@ -1,3 +1,4 @@
+import fcntl
 import os
 import subprocess
 import sys
@@ -16,21 +17,29 @@ def rng():
     return np.random.default_rng(20260101)
 
 
-def trained(scene, folder):
-    """Train a scene in a process of its own."""
-    path = folder / f"{scene}.h5"
-    train = "from palpate.shared.cli import main; main()", "train", scene, "--out", str(path)
-    subprocess.run([sys.executable, "-c", *train], check=True, capture_output=True)
+def trained(scene, tmp_path_factory):
+    """Train a scene in a process of its own, once for all processes that run tests."""
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    path = folder / scene / f"{scene}.h5"
+    with open(folder / f"{scene}.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not path.exists():
+            path.parent.mkdir(exist_ok=True)
+            train = "from palpate.shared.cli import main; main()", "train", scene
+            run = [sys.executable, "-c", *train, "--out", str(path)]
+            subprocess.run(run, check=True, capture_output=True)
     return path
 
 
 @pytest.fixture(scope="session")
 def artifact(tmp_path_factory):
     """Return the artifact of the quick scene, trained here and now."""
-    return trained("quick", tmp_path_factory.mktemp("trained"))
+    return trained("quick", tmp_path_factory)
 
 
 @pytest.fixture(scope="session")
 def visco_artifact(tmp_path_factory):
     """Return the artifact of the quick scene of visco-elastic tissue."""
-    return trained("quick-visco", tmp_path_factory.mktemp("visco"))
+    return trained("quick-visco", tmp_path_factory)
