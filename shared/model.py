@@ -36,6 +36,7 @@ Field = NDArray[np.float32]
 Region = Literal["surface", "all"]
 
 Active = tuple[tuple[int, float, Local], ...]
+Answering = list[tuple[int, int, float]]
 Moves = dict[int, tuple[Mapping[int, LeftBehind], ...]]
 
 _NONE, _UNKNOWN = np.zeros(3), np.full(3, np.inf)
@@ -247,12 +248,15 @@ class ReducedModel:
         own = self._warm(warm, past, dt).press(in_time=past is not None)
         press.place(own.solver, at, towards)
         check_place(self.scene.endoscope, own.outcome.distance.item(), own.outcome.tilt.item())
-        moves = self._begin(own, self.press_transfer, past, dt) if past is not None else {}
+        answering = own.answering()
+        moves: Moves = {}
+        if past is not None:
+            moves = self._begin(own, answering, self.press_transfer, past, dt)
         press.press(own.solver, pressure, radius)
         if past is None:
             press.estimate(own.solver, pressure)
         found = own.result()
-        parts = tuple([(k, w, own.warm.q[slot].copy()) for slot, k, w in own.answering()])
+        parts = tuple([(k, w, own.warm.q[slot].copy()) for slot, k, w in answering])
         converged = found.status == newton.CONVERGED
         outside = out_of_range(self.scene.endoscope, at, found, pressure, radius)
         active: Active = ()
@@ -260,7 +264,7 @@ class ReducedModel:
         if past is not None:
             response = math.hypot(*found.displacement.tolist())
             features, errors, after, active = self._in_time(
-                own, past, dt, moves, self.estimators.histories, found, found.foot,
+                own, answering, past, dt, moves, self.estimators.histories, found, found.foot,
                 pressure / found.limit, response,
             )  # fmt: skip
         if outside or not converged:
@@ -338,13 +342,16 @@ class ReducedModel:
         if off and (past is None or past.main < 0):
             own.active.number[:] = -1
             own.active.weight[:] = 0.0
-        moves = self._begin(own, self.touch_transfer, past, dt) if past is not None else {}
+        answering = own.answering()
+        moves: Moves = {}
+        if past is not None:
+            moves = self._begin(own, answering, self.touch_transfer, past, dt)
         touch.touch(own.solver, at, most)
         touched = own.outcome.touched.item() > 0
         if past is None and touched:
             touch.estimate(own.solver, at)
         found = own.result()
-        parts = tuple([(k, w, own.scratch.q[slot].copy()) for slot, k, w in own.answering()])
+        parts = tuple([(k, w, own.scratch.q[slot].copy()) for slot, k, w in answering])
         converged = found.status == newton.CONVERGED
         outside: tuple[str, ...] = ()
         active: Active = ()
@@ -356,7 +363,7 @@ class ReducedModel:
         if past is not None:
             response = math.hypot(*found.force.tolist())
             features, errors, after, active = self._in_time(
-                own, past, dt, moves, self.estimators.courses, found,
+                own, answering, past, dt, moves, self.estimators.courses, found,
                 past.position if off else at, depth / found.limit, response,
             )  # fmt: skip
         if outside or not converged:
@@ -405,18 +412,21 @@ class ReducedModel:
             warm.forget()
         return warm
 
-    def _begin(self, own: Workspace, transfer: Transfer, past: Past, dt: float) -> Moves:
+    def _begin(
+        self, own: Workspace, answering: Answering, transfer: Transfer, past: Past, dt: float
+    ) -> Moves:
         """Write past and time step into a workspace; return what earlier moves left behind."""
         assert isinstance(own.past, Remembering)
         if self._last_step is None or self._last_step[0] != dt:
             self._last_step = dt, step_weights(self.scene.tissue.prony, dt)
         for own_weights, weights in zip(own.past.time, self._last_step[1], strict=True):
             own_weights[:] = weights
-        return transfer.begin(own, past)
+        return transfer.begin(own, answering, past)
 
     def _in_time(
         self,
         own: Workspace,
+        answering: Answering,
         past: Past,
         dt: float,
         moves: Moves,
@@ -429,9 +439,7 @@ class ReducedModel:
         """Return features and errors of a history, the past to go on from, and active models."""
         assert isinstance(own.past, Remembering)
         records = own.past.records
-        active = tuple(
-            [(k, w, Local(records[slot].copy(), moves[k])) for slot, k, w in own.answering()]
-        )
+        active = tuple([(k, w, Local(records[slot].copy(), moves[k])) for slot, k, w in answering])
         travel = 0.0
         if position is not None and past.position is not None:
             travel = math.dist(position.tolist(), past.position.tolist())

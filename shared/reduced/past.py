@@ -25,6 +25,7 @@ from palpate.shared.mechanics import viscosity
 from palpate.shared.mechanics.viscosity import Weights
 from palpate.shared.reduced.blend import MAX_ACTIVE
 from palpate.shared.reduced.points import (
+    FAST,
     LANES,
     PAST_STATE,
     SYMMETRIC,
@@ -33,7 +34,7 @@ from palpate.shared.reduced.points import (
     predict_points,
     superpose,
 )
-from palpate.shared.reduced.terms import Elastic, Viscous
+from palpate.shared.reduced.terms import Elastic, Viscous, distance
 
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
@@ -149,9 +150,10 @@ def _end_elastic(past, points, work, slot, q):
 
 def _end_step(past, points, work, slot, q):
     memory, time = _memory(past, slot), past.time
-    for i in range(len(q)):
-        work.stepped[i] = q[i] * points.steps[i]
-    superpose(points.gradients, work.stepped, work.H)
+    if distance(q, work.latest) > 0.0:  # the last evaluation was of another state
+        for i in range(len(q)):
+            work.stepped[i] = q[i] * points.steps[i]
+        superpose(points.gradients, work.stepped, work.H)
     drive_points(work.H, past.B, past.S)
     viscosity.advance(past.B, time, memory.points)
     viscosity.advance(past.S, time, memory.linear)
@@ -183,7 +185,7 @@ by_type(last_answer, {Elastic: _no_last_answer, Remembering: _last_answer})
 # --- the path of answers -------------------------------------------------------------------------
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
 def _add_knot(memory, time):
     """Append the last answer to the knots; two of the others become one."""
     knots, share = memory.knots, memory.share
@@ -198,10 +200,10 @@ def _add_knot(memory, time):
         for a in range(share.shape[1]):
             x += time.share[a] * share[j, a]
             y += time.share[a] * share[j + 1, a]
-        distance = 0.0
+        apart = 0.0
         for i in range(knots.shape[1]):
-            distance += (knots[j, i] - knots[j + 1, i]) ** 2
-        cost = x * y / (x + y) * distance if x * y > 0.0 else 0.0
+            apart += (knots[j, i] - knots[j + 1, i]) ** 2
+        cost = x * y / (x + y) * apart if x * y > 0.0 else 0.0
         if cost < least:
             best, least, ratio = j, cost, (y / (x + y) if x + y > 0.0 else 1.0)
     for i in range(knots.shape[1]):

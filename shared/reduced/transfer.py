@@ -165,16 +165,16 @@ class Transfer:
         return memory
 
     def begin(
-        self, workspace: Workspace, past: Past
+        self, workspace: Workspace, answering: list[tuple[int, int, float]], past: Past
     ) -> dict[int, tuple[Mapping[int, LeftBehind], ...]]:
-        """Write what the active local models remember into a workspace.
+        """Write what the local models that answer remember into a workspace.
 
         Returns what each move left behind, by the number of the active model.
         """
         moves = {}
         assert isinstance(workspace.past, Remembering)
         records = workspace.past.records
-        for slot, k, _ in workspace.answering():
+        for slot, k, _ in answering:
             known = past.locals.get(k)
             if known is not None:
                 records[slot], moves[k] = known
