@@ -25,30 +25,24 @@ from palpate.shared.answer import Answer
 from palpate.shared.artifact import read_artifact
 from palpate.shared.mechanics.footprint import TIP_DEPTH, pressure_limit
 from palpate.shared.model import ReducedModel, Region
+from palpate.shared.reduced.workspace import Warm
 
 Array = NDArray[np.float64]
 
 ROUNDS = 20
-QUERIES = 100
-"""Of each kind in a round, beside one full solution."""
-
+QUERIES = 100  # of each kind in a round, beside one full solution
 STEP = 0.05  # mm
 
-TURNS = 20
-"""Headings tried where the surface ends; if none leads on, the last is taken."""
+TURNS = 20  # headings tried where the surface ends; if none leads on, the last is taken
 
 
 def bench(artifact: Path) -> dict[str, Any]:
-    """Time queries of every kind on random loads over the whole range.
+    """Time queries of every kind on random loads over the whole range: medians in µs.
 
-    Returns
-    -------
-    dict
-        Medians in µs: ``cold_us``, each query independent of the last; ``warm_us``, along paths of
-        0.05 mm steps over the surface; ``tip_us``, of the rigid tip along those; ``surface_us`` and
-        ``fields_us``, a cold query with displacement and von Mises stress at the surface's or all
-        nodes; ``full_us``, the full model in a single jump from rest. ``p95``: their 95th
-        percentiles. ``ratio``: full over cold.
+    ``cold_us``, each query independent of the last; ``warm_us``, along paths of 0.05 mm steps over
+    the surface; ``tip_us``, of the rigid tip along those; ``surface_us`` and ``fields_us``, a cold
+    query with displacement and von Mises stress at the surface's or all nodes; ``full_us``, the
+    full model in a single jump from rest.  ``p95``: 95th percentiles.  ``ratio``: full over cold.
     """
     atlas = ReducedModel.load(artifact)
     problem = FullProblem.of_artifact(read_artifact(artifact))
@@ -56,15 +50,12 @@ def bench(artifact: Path) -> dict[str, Any]:
     rng = np.random.default_rng(atlas.scene.seed)
     times: dict[str, list[float]] = {}
 
+    def press(warm: Warm, load: Load) -> Answer:
+        return atlas.press(load.position, load.pressure, load.direction, warm=warm)
+
     def cold(load: Load) -> Answer:
         state.forget()
-        return atlas.press(load.position, load.pressure, load.direction, warm=state)
-
-    def warm(load: Load) -> Answer:
-        return atlas.press(load.position, load.pressure, load.direction, warm=walker)
-
-    def touch(position: Array) -> Answer:
-        return atlas.touch(position, warm=walker)
+        return press(state, load)
 
     def with_fields(region: Region, load: Load) -> None:
         answer = cold(load)
@@ -84,6 +75,7 @@ def bench(artifact: Path) -> dict[str, Any]:
             taken = time.perf_counter() - started
             times.setdefault(kind, []).append(1e6 * taken)
 
+    warm, touch = partial(press, walker), partial(atlas.touch, warm=walker)
     for round_ in range(ROUNDS + 1):
         loads = held_out_loads(atlas, QUERIES, round_)
         path = walk(atlas, loads[0], QUERIES + 1, rng)

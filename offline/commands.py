@@ -3,14 +3,13 @@
 Each imports what it runs when it runs, so that ``--help`` is instant.
 """
 
-import json
-import math
 from collections.abc import Callable, Iterator, Mapping
 from functools import wraps
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import click
+import orjson
 
 
 class _Artifact(click.Path):
@@ -30,7 +29,7 @@ OUTPUT = click.Path(dir_okay=False, writable=True, path_type=Path)
 VECTOR = (float, float, float)
 
 Report = Mapping[str, object]
-T = TypeVar("T")
+Option = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 artifact_argument = click.argument("artifact", type=ARTIFACT)
 artifact_option = click.option(
@@ -46,7 +45,7 @@ def reporting(command: Callable[..., Report]) -> Callable[..., None]:
     def show(as_json: bool, **parameters: Any) -> None:
         report = command(**parameters)
         if as_json:
-            click.echo(json.dumps(_finite(report)))
+            click.echo(_json(report))
             return
         leaves = list(_leaves(report, ""))
         width = max(len(name) for name, _ in leaves)
@@ -57,13 +56,9 @@ def reporting(command: Callable[..., Report]) -> Callable[..., None]:
     return show
 
 
-def _finite(value: Any) -> Any:
-    """The same, JSON-able, with null for numbers that are not finite."""
-    if isinstance(value, Mapping):
-        return {name: _finite(item) for name, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _json(report: Report) -> str:
+    """JSON with null for numbers that are not finite."""
+    return orjson.dumps(report, option=orjson.OPT_SERIALIZE_NUMPY).decode()
 
 
 def _leaves(report: Report, prefix: str) -> Iterator[tuple[str, object]]:
@@ -74,41 +69,31 @@ def _leaves(report: Report, prefix: str) -> Iterator[tuple[str, object]]:
             yield prefix + name, value
 
 
-def count_option(
-    name: str, default: int | None, help: str, least: int = 1
-) -> Callable[[Callable[..., T]], Callable[..., T]]:
+def count_option(name: str, default: int | None, help: str, least: int = 1) -> Option:
     """Option of a whole number."""
     kind = click.IntRange(min=least)
-    shown = default is not None
-    return click.option(name, type=kind, default=default, show_default=shown, help=help)
+    return click.option(name, type=kind, default=default, show_default=bool(default), help=help)
 
 
-seed_option = count_option("--seed", 0, "Number that the random loads follow from.", least=0)
+seed_option = click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True,
+    help="Number that the random loads follow from.",
+)  # fmt: skip
 
 
-def place_option(required: bool, help: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
-    """Option of the point that is pressed."""
-    return click.option(
-        "--at", "position", type=VECTOR, required=required, metavar="X Y Z", help=help
-    )
+def vector_option(*names: str, help: str, required: bool = False) -> Option:
+    """Option of a point or a direction."""
+    return click.option(*names, type=VECTOR, required=required, metavar="X Y Z", help=help)
 
 
-def load_options(command: Callable[..., T]) -> Callable[..., T]:
+def load_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Options of a command that presses the tissue once."""
-    at = place_option(True, "Where to press, mm; moved to the nearest point that can be touched.")
-    pressure = click.option(
-        "--pressure",
-        type=float,
-        required=True,
-        help="Pressure at the centre of the footprint, kPa.",
-    )
-    direction = click.option(
-        "--direction",
-        type=VECTOR,
-        metavar="X Y Z",
-        help="Direction of the load, of any length.  [default: the inward normal]",
-    )
-    return at(pressure(direction(command)))
+    at = "Where to press, mm; moved to the nearest point that can be touched."
+    pressure = "Pressure at the centre of the footprint, kPa."
+    direction = "Direction of the load, of any length.  [default: the inward normal]"
+    command = vector_option("--direction", help=direction)(command)
+    command = click.option("--pressure", type=float, required=True, help=pressure)(command)
+    return vector_option("--at", "position", help=at, required=True)(command)
 
 
 @click.command()
@@ -117,18 +102,17 @@ def load_options(command: Callable[..., T]) -> Callable[..., T]:
 def scene(name: str | None, keys: bool) -> None:
     """Print a scene with every default filled in.
 
-    SCENE is the name of one that comes along, such as quick or turbinate, or a TOML file. Each key
-    stands with its unit and what it means. What is printed is a scene file itself: write your own
-    from it, or start from an empty file, for which this command says what is missing.
+    SCENE is the name of one that comes along, such as quick or turbinate, or a TOML file. What is
+    printed, with unit and meaning of each key, is a scene file itself: write your own from it, or
+    start from an empty file, for which this command says what is missing.
     """
     from palpate.offline.scenes import filled, find_scene, reference, shipped_scenes
 
     if keys:
         click.echo(reference(), nl=False)
     elif name is None:
-        raise click.UsageError(
-            f"Name a scene: a .toml file or one of {', '.join(shipped_scenes())}"
-        )
+        known = ", ".join(shipped_scenes())
+        raise click.UsageError(f"Name a scene: a .toml file or one of {known}")
     else:
         click.echo(filled(find_scene(name)), nl=False)
 
@@ -162,7 +146,7 @@ def info(artifact: Path, as_json: bool) -> None:
     from palpate.offline.info import info, lines
 
     report = info(artifact)
-    click.echo(json.dumps(_finite(report)) if as_json else "\n".join(lines(report)))
+    click.echo(_json(report) if as_json else "\n".join(lines(report)))
 
 
 @click.command()
@@ -175,9 +159,8 @@ def solve(**request: Any) -> Report:
     """Press the tissue of an artifact once.
 
     The file OUT.vtu holds the mesh at rest with the point data displacement (mm), von_mises (kPa),
-    load (mN) and clamped (0 or 1). With --full-model these are the fields of the full model;
-    displacement_error and von_mises_error are the deviations of the reduced model from them, and
-    its relative errors are printed.
+    load (mN) and clamped (0 or 1): with --full-model of the full model, and with the deviations
+    displacement_error and von_mises_error of the reduced model from it.
     """
     from palpate.offline.solve import solve
 
@@ -246,9 +229,7 @@ def study() -> None:
 
 
 @study.command()
-@click.option(
-    "--measure", metavar="PATTERN", help="Run the commands that match, such as 'bench *'."
-)
+@click.option("--measure", metavar="PATTERN", help="Run those that match, such as 'bench *'.")
 def figures(measure: str | None) -> None:
     """Write artifacts/FIGURES.md and README's figures.
 
@@ -260,26 +241,23 @@ def figures(measure: str | None) -> None:
     figures(Path("artifacts"), measure)
 
 
-def report_option(default: Path | None) -> Callable[[Callable[..., T]], Callable[..., T]]:
-    """Option of the folder that tables and pictures go to."""
-    kind, shown = click.Path(file_okay=False, path_type=Path), default is not None
-    text = "Folder for tables and pictures."
-    text += "" if shown else "  [default: artifacts/SCENE/report]"
-    return click.option("--report", type=kind, default=default, show_default=shown, help=text)
+report_option = click.option(
+    "--report", type=click.Path(file_okay=False, path_type=Path),
+    help="Folder for tables and pictures.  [default: artifacts/SCENE/report]",
+)  # fmt: skip
 
 
 @study.command("mesh-error")
-@report_option(Path("artifacts/turbinate/report"))
+@report_option
 @reporting
-def mesh_error(report: Path) -> Report:
-    """Compare elements of about 6048 DOFs with a fine mesh.
+def mesh_error(report: Path | None) -> Report:
+    """Compare elements of about 6048 DOFs with a fine mesh of the turbinate.
 
-    Errors are fractions of the displacement that the turbinate shows in the reference mesh; takes
-    a few minutes.
+    Errors are fractions of its displacement; takes a few minutes.
     """
     from palpate.offline.studies.mesh_error import mesh_error
 
-    return mesh_error(report)
+    return mesh_error(report or Path("artifacts/turbinate/report"))
 
 
 @study.command()
@@ -292,10 +270,9 @@ def mesh_error(report: Path) -> Report:
 def chart(scene: str, artifact: Path | None, **settings: Any) -> Report:
     """Set speed and accuracy of many methods side by side.
 
-    Those that learn do so from full solutions of SNAPSHOTS random loads; all answer the QUERIES
-    that palpate validate asks with this seed. Times are of one core. Table, picture and page go to
-    NAME/report/chart.csv, .png and .html beside the artifact. Takes half an hour; a stopped run
-    continues where it was.
+    Some learn from full solutions of SNAPSHOTS random loads; all answer the QUERIES that palpate
+    validate asks with this seed, on one core. Table, picture and page go to NAME/report/chart.csv,
+    .png and .html beside the artifact. Takes half an hour; a stopped run continues where it was.
     """
     from palpate.offline.scenes import default_artifact, find_scene
     from palpate.offline.studies.chart import chart
@@ -313,10 +290,9 @@ def chart(scene: str, artifact: Path | None, **settings: Any) -> Report:
 def chart_in_time(artifact: Path, histories: int, snapshots: int, seed: int) -> Report:
     """Set speed and accuracy of methods over histories side by side.
 
-    The visco-elastic artifact, its twin without memory, the full model and Galerkin models with all
-    quadrature points in modal, Ritz and POD bases answer the HISTORIES that palpate validate asks
-    with this seed. Table, picture and page go to NAME/report/chart_in_time.csv, .png and .html
-    beside the artifact.
+    The visco-elastic artifact, its twin without memory, the full model and Galerkin models in
+    modal, Ritz and POD bases answer the HISTORIES that palpate validate asks with this seed. Table,
+    picture and page go to NAME/report/chart_in_time.csv, .png and .html beside the artifact.
     """
     from palpate.offline.studies.chart import chart
 
@@ -334,13 +310,13 @@ def stability(scene: str, artifact: Path | None, **settings: Any) -> Report:
 
     The artifact of SCENE and other methods answer CASES loads of every kind, in range and far
     beyond it, for which the full model's answer is known. The map goes to NAME/report/stability.csv
-    and .png beside the artifact, the artifact's silent errors to stability_silent.csv. A killed run
-    goes on where it stopped.
+    and .png beside the artifact. A killed run goes on where it stopped.
     """
     from palpate.offline.scenes import default_artifact, find_scene
     from palpate.offline.studies.stability import stability
 
-    return stability(artifact or default_artifact(find_scene(scene)), **settings)
+    found = find_scene(scene)
+    return stability(artifact or default_artifact(found), found, **settings)
 
 
 @study.command("stability-in-time")
@@ -349,17 +325,17 @@ def stability(scene: str, artifact: Path | None, **settings: Any) -> Report:
 @seed_option
 @count_option("--many", 100_000, "Steps of the longest history.", least=100)
 @reporting
-def stability_in_time(**settings: Any) -> Report:
+def stability_in_time(artifact: Path, **settings: Any) -> Report:
     """Map which methods fail under which histories, and whether they say so.
 
     The visco-elastic artifact, under footprints and its rigid tip, and other methods answer
-    histories in CASES places: very small and large steps, long holds, sudden reversals, contacts
-    that teleport and more. The map goes to NAME/report/stability_in_time.csv and .png beside the
-    artifact. A killed run goes on where it stopped.
+    histories in CASES places: tiny and huge steps, long holds, sudden reversals and more. The map
+    goes to NAME/report/stability_in_time.csv and .png beside the artifact. A killed run goes on
+    where it stopped.
     """
-    from palpate.offline.studies.stability import stability_in_time
+    from palpate.offline.studies.stability import stability
 
-    return stability_in_time(**settings)
+    return stability(artifact, None, **settings)
 
 
 @study.command()
@@ -372,8 +348,8 @@ def stability_in_time(**settings: Any) -> Report:
 def continuity(**settings: Any) -> Report:
     """Measure jumps in the answers of an artifact as the contact glides.
 
-    The change over steps of 0.05 mm that the full model does not show: of the displacement, largest
-    of all nodes, in mm; of the force on the tip, over its largest on the path.
+    The change over steps of 0.05 mm that the full model does not show: of displacement, largest of
+    all nodes, in mm; of the force on the tip, over its largest on the path.
     """
     from palpate.offline.studies.continuity import continuity
 
@@ -382,23 +358,23 @@ def continuity(**settings: Any) -> Report:
 
 @study.command()
 @click.argument("scene", type=click.Choice(["cube", "cube-visco"]), default="cube")
-@report_option(None)
+@report_option
 @reporting
 def cube(scene: str, report: Path | None) -> Report:
     """Redraw figure 1 of Radermacher & Reese.
 
-    A cube under compression in modal, Ritz and POD bases: relative error at a point and ratio of
-    CPU times against the number of bases, and which of the paper's claims hold. SCENE cube-visco is
-    of visco-elastic tissue: pressed, held and let go.
+    A cube under compression in modal, Ritz and POD bases: error at a point and ratio of CPU times
+    against the number of bases, and which of the paper's claims hold. SCENE cube-visco is of
+    visco-elastic tissue: pressed, held and let go.
     """
-    from palpate.offline.studies import paper
+    from palpate.offline.studies.paper import figures
 
-    return paper.cube(scene, report or Path("artifacts", scene, "report"))
+    return figures(scene, report or Path("artifacts", scene, "report"))
 
 
 @study.command()
 @click.argument("scene", type=click.Choice(["turbinate", "turbinate-visco"]), default="turbinate")
-@report_option(None)
+@report_option
 @reporting
 def turbinate(scene: str, report: Path | None) -> Report:
     """Redraw figures 1, 2c and 2d of Radermacher & Reese.
@@ -407,14 +383,14 @@ def turbinate(scene: str, report: Path | None) -> Report:
     errors in five POD bases, for which PyVista is needed: pip install -e '.[pictures]'. SCENE
     turbinate-visco is of visco-elastic tissue, pressed, held and let go; without contours.
     """
-    from palpate.offline.studies import paper
+    from palpate.offline.studies.paper import figures
 
-    return paper.turbinate(scene, report or Path("artifacts", scene, "report"))
+    return figures(scene, report or Path("artifacts", scene, "report"))
 
 
 @study.command()
 @artifact_argument
-@place_option(False, "Where to press, mm.  [default: the middle]")
+@vector_option("--at", "position", help="Where to press, mm.  [default: the middle]")
 @reporting
 def relaxation(artifact: Path, position: tuple[float, float, float] | None) -> Report:
     """Press the visco-elastic tissue of an artifact, hold, release and wait.

@@ -12,19 +12,14 @@ from palpate.shared.artifact import ArtifactError, read_artifact
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.scene import Patch, Scene, SceneError, parse_scene
 
-LABELS = 14
-"""Column at which the values of ``lines`` stand."""
+LABELS = 14  # column at which the values of ``lines`` stand
 
 
 def info(artifact: Path) -> dict[str, Any]:
     """Everything an artifact tells of itself, JSON-able.
 
-    Returns
-    -------
-    dict
-        ``scene`` (its name), ``description``, ``text`` (the scene's TOML), ``bytes``, ``body`` (box
-        in mm, sizes of the mesh), ``loads`` (limits in kPa, degrees and mm) and the documents of
-        training: ``provenance``, ``training``, ``validation`` and others.
+    Beside the documents of training (``provenance``, ``training``, ``validation`` and others) the
+    scene, its ``text`` in TOML, ``body`` (box in mm) and ``loads`` (limits in kPa, degrees, mm).
 
     Raises
     ------
@@ -37,6 +32,7 @@ def info(artifact: Path) -> dict[str, Any]:
     except SceneError as error:
         raise ArtifactError(f"{artifact}: incomplete or inconsistent: {error}") from error
     nodes, elements, limits, vertices = (found.arrays[name] for name in names)
+    depths = limits[:, TIP_DEPTH]
     middle = int(np.argmin(np.linalg.norm(vertices - vertices.mean(axis=0), axis=1)))
     return {
         "scene": scene.name,
@@ -53,7 +49,7 @@ def info(artifact: Path) -> dict[str, Any]:
             "smallest_pressure_limit": float(limits[:, 0].min()),
             "largest_tilt": scene.endoscope.max_tilt,
             "radius": scene.endoscope.radius,
-            "tip_depth_limits": [float(end(limits[:, TIP_DEPTH])) for end in (np.min, np.max)]
+            "tip_depth_limits": [float(depths.min()), float(depths.max())]
             if scene.endoscope.tip
             else None,
             "example": {"at": vertices[middle].tolist(), "pressure": float(limits[middle, 0]) / 2},
@@ -91,7 +87,7 @@ def lines(report: Mapping[str, Any]) -> list[str]:
 
 
 def accuracy(report: Mapping[str, Any]) -> dict[str, str]:
-    """Errors that training found against the full model, by what presses."""
+    """Errors that training found, by what presses."""
     kinds = {"errors": ("validation", "loads"), "tip's errors": ("validation_tip", "positions")}
     return {
         label: f"95 of 100 random {noun} at most {_percent(found['displacement']['p95'])} in "
@@ -141,6 +137,5 @@ def _tissue(scene: Scene) -> str:
 
 def _patch(patch: Patch) -> str:
     ranges = [(axis, getattr(patch, axis)) for axis in "xyz"]
-    return ", ".join(
-        [f"side {patch.side}", *(f"{axis} {r[0]:g} to {r[1]:g} mm" for axis, r in ranges if r)]
-    )
+    ends = [f"{axis} {r[0]:g} to {r[1]:g} mm" for axis, r in ranges if r]
+    return ", ".join([f"side {patch.side}", *ends])

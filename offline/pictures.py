@@ -24,28 +24,18 @@ Array = NDArray[np.float64]
 Fields = Mapping[str, NDArray[np.floating[Any]]]
 
 SIZE = (1500, 720)
-SUBDIVISIONS = 3
-"""Of a quadratic face, each halving the edges: curved faces then look curved."""
-
-SHARP = 35.0
-"""Angle between faces (degrees) that is drawn as an edge of the body at rest."""
-
-SHAFT = 4.0
-"""Length drawn of the endoscope, in radii."""
-
-TITLE = (0.04, 0.9)
-"""Where the words stand in a view, as fractions of its size."""
-
-ROOM = (0.95, 0.72)
-"""Shares of a view's width and height that the drawing may take."""
-
+SUBDIVISIONS = 3  # of a quadratic face, each halving the edges: curved faces then look curved
+SHARP = 35.0  # angle between faces (degrees) that is drawn as an edge of the body at rest
+SHAFT = 4.0  # length drawn of the endoscope, in radii
+TITLE = (0.04, 0.9)  # where the words stand in a view, as fractions of its size
+ROOM = (0.95, 0.72)  # shares of a view's width and height that the drawing may take
 COLOURS = "YlOrRd"
 INK, FAINT, STEEL = "#202428", "#8a949e", "#5b7c99"
 SHINE = {"smooth_shading": True, "ambient": 0.65, "diffuse": 0.45}
 
 
 def require_pyvista() -> Any:
-    """Return the module ``pyvista``, or say how to install it."""
+    """Return the module, or say how to install it."""
     try:
         import pyvista
     except ImportError as error:
@@ -94,16 +84,7 @@ def picture(
     direction: Sequence[float] | None,
     out: Path,
 ) -> None:
-    """Press the tissue of an artifact once and draw it.
-
-    Parameters
-    ----------
-    position : sequence of 3 floats, mm
-    pressure : float, kPa
-    direction : sequence of 3 floats, optional
-        The inward normal if absent.
-    out : Path
-        PNG.
+    """Press the tissue of an artifact once, at a position (mm) with a pressure (kPa), and draw it.
 
     Raises
     ------

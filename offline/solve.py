@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,6 @@ from palpate.shared.artifact import read_artifact
 from palpate.shared.model import ReducedModel
 
 Array = NDArray[np.float64]
-T = TypeVar("T")
 
 
 def solve(
@@ -30,7 +29,7 @@ def solve(
     full_model: bool = False,
     vtu: Path | None = None,
 ) -> dict[str, Any]:
-    """Answer one load, JSON-able.
+    """Answer one load as the service does, JSON-able, with ``peak`` values of the fields.
 
     Parameters
     ----------
@@ -46,12 +45,6 @@ def solve(
     vtu : Path, optional
         Where to write mesh and fields: those of the full model if it is solved, and then the
         reduced model's deviations from them too.
-
-    Returns
-    -------
-    dict
-        ``scene``, ``contact``, ``force``, ``contact_displacement`` and ``trust`` as the service
-        answers; ``peak`` values of the fields, ``timing`` and, if wanted, ``full_model``.
 
     Raises
     ------
@@ -102,7 +95,7 @@ def solve(
     return report
 
 
-def _timed(call: Callable[[], T]) -> tuple[T, float]:
+def _timed(call: Callable[[], Any]) -> tuple[Any, float]:
     """Result of a call and its time in µs, the second time round: the first loads compiled code."""
     call()
     started = time.perf_counter()

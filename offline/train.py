@@ -6,22 +6,18 @@
 4. The reduced model, pressed everywhere, lowers the range where the tissue gives way.
 5. Full solutions of random loads, which calibrate the error estimate, and others, which validate.
 
-Every finished task is on disk before it counts; see ``run.checkpoint``.
+Every finished task is on disk before it counts; see ``run.workers``.
 """
 
 from __future__ import annotations
 
 import os
-import platform
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
-from datetime import UTC, datetime
 from functools import partial
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -32,28 +28,41 @@ from scipy.spatial import cKDTree
 from scipy.special import betaincinv
 from tqdm import tqdm
 
-from palpate.offline.fem.choose_mesh import with_mesh
+from palpate.offline.fem.choose_mesh import (
+    MOST_DOFS_REFINED,
+    mesh_error,
+    mesh_error_document,
+    with_mesh,
+)
 from palpate.offline.fem.mesh import mesh_quality
 from palpate.offline.fem.model import POINTWISE
 from palpate.offline.fem.problem import FullProblem, Load
-from palpate.offline.fem.refine import MOST_DOFS, mesh_error_document
 from palpate.offline.reduce.footprint_models import compile_query, train_patch
+from palpate.offline.reduce.join import join
 from palpate.offline.reduce.layout import Layout
-from palpate.offline.reduce.limit_points import lowered_depths, lowered_limits
+from palpate.offline.reduce.limit_points import (
+    Rows,
+    ask,
+    lowered_depths,
+    lowered_limits,
+    untested,
+)
 from palpate.offline.reduce.load_range import load_range
-from palpate.offline.reduce.patches import PatchResult, PatchTask, RegionResult, local_models
-from palpate.offline.reduce.regions import region
-from palpate.offline.reduce.ritz import Footprint
-from palpate.offline.reduce.sampling import area, fewer, spacing_count, spread_points
-from palpate.offline.reduce.size import Trial, choose, ladder
-from palpate.offline.reduce.tip_models import local_tips
-from palpate.offline.reduce.viscous import with_time
-from palpate.offline.run import tasks as training
-from palpate.offline.run.checkpoint import Checkpoint, content_key
+from palpate.offline.reduce.ritz import region
+from palpate.offline.reduce.sampling import fewer, spacing_count, spread_points, triangle_areas
+from palpate.offline.reduce.size import Trial, choose, ladder, try_patch
 from palpate.offline.run.forecast import forecast
 from palpate.offline.run.streams import Stage, stream
-from palpate.offline.run.workers import Tasks, open_scene, resume, run, worker_pool
-from palpate.offline.run.writing import write_model
+from palpate.offline.run.workers import (
+    Checkpoint,
+    Tasks,
+    content_key,
+    open_scene,
+    resume,
+    run,
+    worker_pool,
+)
+from palpate.offline.run.writing import provenance, write_model
 from palpate.offline.scenes import default_artifact, find_scene
 from palpate.offline.validate.against_full import reference_task, write_rows
 from palpate.offline.validate.calibrate import calibrate, calibrate_by_halves
@@ -89,7 +98,7 @@ REFINED_LOADS = 4
 def train(
     scene: str | Path, out: Path | None = None, workers: int | None = None, force: bool = False
 ) -> Path:
-    """Train a scene and write its artifact, unless it is there already.
+    """Train a scene and write its artifact, unless it is there already; return where.
 
     Parameters
     ----------
@@ -101,10 +110,6 @@ def train(
         Processes; one per core if absent.
     force : bool
         Train although the artifact is of this very scene and of this code.
-
-    Returns
-    -------
-    path : Path
 
     Raises
     ------
@@ -143,33 +148,21 @@ def is_of(path: Path, key: str) -> bool:
 
 
 class Pipeline:
-    """One training run.
-
-    Parameters
-    ----------
-    scene : Scene
-    executor : Executor
-        Of workers initialized by ``open_scene``.
-    checkpoint : Checkpoint
-    started : float, optional
-        When the clock began to run, s; now if absent.
-    """
+    """One training run, since ``started`` (s), by workers initialized with ``open_scene``."""
 
     def __init__(
-        self,
-        scene: Scene,
-        executor: Executor,
-        checkpoint: Checkpoint,
-        started: float | None = None,
+        self, scene: Scene, executor: Executor, checkpoint: Checkpoint, started: float
     ) -> None:
-        self.started = time.perf_counter() if started is None else started
+        self.started = started
         self.scene = scene
         self.executor = executor
         self.checkpoint = checkpoint
         self.problem = FullProblem(scene)
         self.surface = self.problem.surface
         self.seconds: dict[str, float] = {}
-        self.provenance = self._provenance()  # now: sources may change while it runs
+        self.asked = 0
+        # now: sources may change while it runs
+        self.provenance = provenance(scene, checkpoint.key)
 
     def run(self, path: Path, mesh_choice: dict[str, Any] | None = None) -> None:
         """Train and write the artifact; it keeps how its mesh was chosen."""
@@ -177,45 +170,32 @@ class Pipeline:
         compiled = self.executor.submit(run, compile_query)
         limits = self._load_range()
         compiled.result()
-        choice = None
-        size = self.scene.training.size
+        size, training = self.scene.training.size, {"mesh": mesh_quality(self.problem.mesh)}
         if size is None:
-            scene = self.scene
-            sizes = ladder(scene.tissue)
-            choice = choose(
-                sizes, scene.tolerance, scene.budget, lambda size: self._trial(size, limits)
-            )
-            size = choice.size
+            scene, attempt = self.scene, partial(self._trial, limits)
+            choice = choose(ladder(scene.tissue), scene.tolerance, scene.budget, attempt)
+            size, training["choice"] = choice.size, choice.document
             tqdm.write(f"size: {size}\n{choice.why}", file=sys.stderr)
-        layout = Layout.of(self.scene, self.surface, size)
-        models = self.local_models(layout, limits)
+        if mesh_choice is not None:
+            training["mesh_choice"] = mesh_choice
+        layout = Layout.of(self.scene, self.surface, limits, size)
+        models = self._local_models(layout)
         limits = self._lowered(models, limits)
-        model = training.untested(self.problem, models, limits)
+        model = untested(self.problem, models, limits)
         tables: dict[Kind, list[Row]] = {}
         estimators: dict[str, Estimator] = {}
-        documents: dict[str, Any] = {"provenance": self.provenance}
+        documents: dict[str, Any] = {"provenance": self.provenance, "training": training}
         for kind in KINDS:
-            if kind.lacks(models):
-                continue
-            estimators[kind.name], tables[kind] = self._validate(kind, model)
-            documents[kind.document] = summarise(kind, tables[kind])
-        if 3 * len(self.problem.mesh.nodes) <= MOST_DOFS:
+            if not kind.lacks(models):
+                estimators[kind.name], tables[kind] = self._validate(kind, model)
+                documents[kind.document] = summarise(kind, tables[kind])
+        if self.problem.mesh.nodes.size <= MOST_DOFS_REFINED:
             documents["mesh_error"] = self._mesh_error(limits)
-        documents["training"] = {
-            "seconds": self.seconds,
-            "mesh": mesh_quality(self.problem.mesh),
-            "layout": self._describe(layout, models),
-        }
-        if choice is not None:
-            documents["training"]["choice"] = choice.document
-        if mesh_choice is not None:
-            documents["training"]["mesh_choice"] = mesh_choice
+        training |= {"seconds": self.seconds, "layout": self._describe(layout, models)}
         self.provenance["wall_seconds"] = round(time.perf_counter() - self.started, 1)
-        write_model(path, self.problem, models, limits, estimators, documents)
-        report = path.parent / path.stem / "report"
-        report.mkdir(parents=True, exist_ok=True)
+        write_model(path, model, estimators, documents)
         for kind, rows in tables.items():
-            write_rows(report / f"{kind.document}.csv", kind, rows)
+            write_rows(path.parent / path.stem / "report" / f"{kind.document}.csv", kind, rows)
 
     # --- stages --------------------------------------------------------------------------------
 
@@ -232,111 +212,63 @@ class Pipeline:
         at_vertices[:, [0, TIP_DEPTH]] = np.exp(at_vertices[:, [0, TIP_DEPTH]])
         return at_vertices
 
-    def _trial(self, size: Size, limits: Array) -> Trial:
+    def _trial(self, limits: Array, size: Size) -> Trial:
         """Try a size on patches spread over the surface."""
-        layout = Layout.of(self.scene, self.surface, size)
+        layout = Layout.of(self.scene, self.surface, limits, size)
         rng = stream(self.scene.seed, Stage.TRIAL_PATCHES)
         places = spread_points(self.surface, min(TRIAL_PATCHES, len(layout.centres)), rng)
         chosen = np.unique(cKDTree(layout.centres).query(places)[1])
-        footprints = self._footprints(layout, limits)
-        tasks = {
-            f"trial-{size.modes}-{k}": (
-                training.trial, self._patch_task(layout, footprints, limits, int(k)),
-            )
-            for k in chosen
-        }  # fmt: skip
-        title = f"trying {size.modes} modes"
-        return Trial.of(size, self._stage(title, tasks))
+        tasks = {f"trial-{size.modes}-{k}": (try_patch, layout.patch(k)) for k in chosen}
+        return Trial.of(size, self._stage(f"trying {size.modes} modes", tasks))
 
-    def _regions(
-        self, layout: Layout, footprints: Sequence[Footprint]
-    ) -> list[tuple[RegionResult, dict[int, int]]]:
-        """Basis and Ritz vectors of each region, with the place of each footprint among them."""
-        tasks, members = {}, []
-        for r in range(int(layout.region.max()) + 1):
-            patches = np.flatnonzero(layout.region == r)
-            used = np.unique(np.concatenate([layout.ritz_of_patch[k] for k in patches]))
-            tasks[f"region-{r}"] = (
-                region,
-                [footprints[i] for i in used],
-                layout.size.region_modes,
-            )
-            members.append({int(i): place for place, i in enumerate(used)})
-        results: list[RegionResult] = self._stage("Ritz vectors", tasks)
+    def _local_models(self, layout: Layout) -> LocalModels:
+        """Bases of the regions and local models."""
+        used = [layout.footprints_of(r) for r in range(layout.region.max() + 1)]
+        tasks: Tasks = {
+            f"region-{r}": (region, [layout.footprints[i] for i in own], layout.size.region_modes)
+            for r, own in enumerate(used)
+        }
+        regions = self._stage("Ritz vectors", tasks)
         # a small region may have fewer vectors to give than asked for
-        modes = min(len(result.steps) for result in results)
-        return list(zip([result.truncate(modes) for result in results], members, strict=True))
-
-    def _footprints(self, layout: Layout, limits: Array) -> list[Footprint]:
-        """Where Ritz vectors are taken, with the loads expected there."""
-        found = []
-        for point in layout.ritz:
-            x, normal, _, fields = self.surface.locate(point, limits)
-            found.append(Footprint(x, normal, float(fields[0])))
-        return found
-
-    def _patch_task(
-        self, layout: Layout, footprints: Sequence[Footprint], limits: Array, k: int
-    ) -> PatchTask:
-        """Where patch k is, and the loads it answers."""
-        contacts = layout.contacts[layout.contacts_of_patch[k]]
-        located = [self.surface.locate(x, limits) for x in contacts]
-        return PatchTask(
-            centre=layout.centres[k],
-            normal=layout.normals[k],
-            pressure=float(self._range_at(layout.centres[[k]], limits)[0, 0]),
-            footprints=[footprints[i] for i in layout.ritz_of_patch[k]],
-            contacts=contacts,
-            normals=np.array([normal for _, normal, _, _ in located]),
-            ranges=np.array([fields for _, _, _, fields in located]),
-            extent=layout.extent,
-            blend=self.scene.training.blend,
-            size=layout.size,
-            seed=self.scene.seed + k,
-        )
-
-    def local_models(self, layout: Layout, limits: Array) -> LocalModels:
-        """Stages 2 and 3."""
-        footprints = self._footprints(layout, limits)
-        regions = self._regions(layout, footprints)
+        regions = [own.truncate(min(len(other.steps) for other in regions)) for own in regions]
         tasks = {}
-        for k in range(len(layout.centres)):
-            result, places = regions[layout.region[k]]
-            chosen = [places[int(i)] for i in layout.ritz_of_patch[k]]
-            tasks[f"patch-{k}"] = (
-                train_patch,
-                replace(result, ritz=result.ritz[chosen]),
-                self._patch_task(layout, footprints, limits, k),
-            )
-        results: list[PatchResult] = self._stage("local models", tasks)
-        bases, model = [basis for basis, _ in regions], self.problem.model
-        own = layout.region, layout.centres, self._range_at(layout.centres, limits)[:, 0]
-        models = local_models(bases, *own, results, layout.extent, self.scene.training.blend)
-        trained = [result.tip for result in results if result.tip is not None]
-        if trained:
-            models = replace(models, tips=local_tips(model, models, trained))
-        return with_time(model, models)
+        for k, r in enumerate(layout.region):
+            learnt = np.searchsorted(used[r], layout.learns_from[k])
+            own = replace(regions[r], ritz=regions[r].ritz[learnt])
+            tasks[f"patch-{k}"] = train_patch, own, layout.patch(k)
+        parts = self._stage("local models", tasks)
+        return join(self.problem.model, regions, layout.region, parts)
 
     def _lowered(self, models: LocalModels, limits: Array) -> Array:
         """Load range that ends before the tissue gives way, or slips off the tip."""
-        ask = partial(self._ask, self.checkpoint.store("models", (models, limits)))
-        patches = len(models.centres)
-        rng = stream(self.scene.seed, Stage.GIVING_WAY)
-        lowered = lowered_limits(self.surface, limits, self.scene, patches, ask, rng)
+        asking = partial(self._ask, self.checkpoint.store("models", (models, limits)))
+        model = untested(self.problem, models, limits)
+        lowered = lowered_limits(model, asking, stream(self.scene.seed, Stage.GIVING_WAY))
         _tell("giving way", lowered[:, 0] / limits[:, 0])
         if models.tips is not None:
             rng = stream(self.scene.seed, Stage.SLIPPING_OFF)
-            lowered = lowered_depths(self.surface, lowered, patches, ask, rng)
+            lowered[:, TIP_DEPTH] = lowered_depths(model, asking, rng)[:, TIP_DEPTH]
             _tell("slipping off", lowered[:, TIP_DEPTH] / limits[:, TIP_DEPTH])
         return lowered
+
+    def _ask(self, path: Path, title: str, function: Callable[..., float], rows: Rows) -> Array:
+        """Values (k,) of a function of the reduced model; see ``limit_points.ask``."""
+        tasks = {
+            f"ask-{self.asked + i}": (ask, path, function, rows[i : i + PLACES])
+            for i in range(0, len(rows), PLACES)
+        }
+        self.asked += len(rows)
+        return np.concatenate(self._stage(title, tasks))
 
     def _validate(self, kind: Kind, model: ReducedModel) -> tuple[Estimator, list[Row]]:
         """Validate on random queries of a kind, and calibrate its error estimate with them.
 
         What validation says of the estimate is of one calibrated on the other half of the queries.
         """
-        rng = stream(self.scene.seed, kind.stage)
-        queries = kind.random(model, self._queries(kind), rng)
+        count = TIP_SAMPLES if kind.tip else self.scene.training.samples
+        if kind.in_time:
+            count = min(MOST_HISTORIES, self.scene.training.samples // 4)
+        queries = kind.random(model, count, stream(self.scene.seed, kind.stage))
         rows: list[Row] = []
         size = BATCH if kind is LOADS else len(queries)
         for start in range(0, len(queries), size):
@@ -354,12 +286,6 @@ class Pipeline:
                 break
         fit = partial(calibrate, share=kind.coverage, damping=kind.damping)
         return calibrate_by_halves([row.known for row in rows], fit), rows
-
-    def _queries(self, kind: Kind) -> int:
-        """How many full solutions, or histories of them, validate and calibrate at most."""
-        if kind.in_time:
-            return min(MOST_HISTORIES, self.scene.training.samples // 4)
-        return TIP_SAMPLES if kind.tip else self.scene.training.samples
 
     def _suffice(self, rows: Sequence[Row]) -> bool:
         """Whether 95 % of all loads are within tolerance, with as much confidence.
@@ -383,28 +309,10 @@ class Pipeline:
         count = fewer(REFINED_LOADS, self.scene.tolerance)
         for i, point in enumerate(spread_points(self.surface, count, rng)):
             x, normal, _, fields = self.surface.locate(point, limits)
-            tasks[f"mesh-{i}"] = training.mesh_error, Load(x, -normal, float(fields[0]) / 2)
-        dofs, moved = zip(*self._stage("mesh error", tasks), strict=True)
-        return mesh_error_document(self.scene, dofs[0], np.array(moved))
+            tasks[f"mesh-{i}"] = mesh_error, Load(x, -normal, float(fields[0]) / 2)
+        return mesh_error_document(self._stage("mesh error", tasks))
 
     # --- pieces --------------------------------------------------------------------------------
-
-    def _range_at(self, points: Array, limits: Array) -> Array:
-        return np.array([self.surface.locate(x, limits)[3] for x in points])
-
-    def _ask(
-        self,
-        path: Path,
-        title: str,
-        function: Callable[..., float],
-        rows: Sequence[tuple[Any, ...]],
-    ) -> Array:
-        """Values (k,) of a function of the reduced model; see ``run.tasks.ask``."""
-        tasks = {
-            f"{title}-{i}": (training.ask, path, function, rows[i : i + PLACES])
-            for i in range(0, len(rows), PLACES)
-        }
-        return np.concatenate(self._stage(title, tasks))
 
     def _stage(self, title: str, tasks: Tasks) -> list[Any]:
         """Run the tasks that are not in the checkpoint yet; return all results in their order."""
@@ -417,33 +325,15 @@ class Pipeline:
     def _describe(self, layout: Layout, models: LocalModels) -> dict[str, Any]:
         points = np.diff(models.point_from)
         return {
-            "area_mm2": round(area(self.surface), 1),
-            "dofs": 3 * len(self.problem.mesh.nodes),
+            "area_mm2": round(float(triangle_areas(self.surface).sum()), 1),
+            "dofs": self.problem.mesh.nodes.size,
             "patches": len(layout.centres),
-            "regions": int(layout.region.max()) + 1,
-            "ritz_footprints": len(layout.ritz),
+            "regions": len(models.basis),
+            "ritz_footprints": len(layout.footprints),
             "modes": models.modes.shape[2],
             "cubature_points_median": float(np.median(points)),
             "cubature_points_max": int(points.max()),
             "quadrature_points": self.problem.model.weights.size,
-        }
-
-    def _provenance(self) -> dict[str, Any]:
-        packages = ("numpy", "scipy", "numba", "h5py", "palpate")
-        try:
-            commit = subprocess.run(
-                ["git", "rev-parse", "HEAD"],
-                cwd=Path(__file__).parent, capture_output=True, text=True, check=True,
-            ).stdout.strip()  # fmt: skip
-        except (OSError, subprocess.CalledProcessError):
-            commit = "unknown"
-        return {
-            "started": datetime.now(UTC).isoformat(timespec="seconds"),
-            "packages": {name: metadata.version(name) for name in packages},
-            "python": platform.python_version(),
-            "git_commit": commit,
-            "seed": self.scene.seed,
-            "content_key": self.checkpoint.key,
         }
 
 

@@ -15,9 +15,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from numpy.typing import NDArray
 
-CELL_TYPES = {8: 12, 20: 25}
-"""VTK_HEXAHEDRON and VTK_QUADRATIC_HEXAHEDRON, by nodes per element."""
-
+CELL_TYPES = {8: 12, 20: 25}  # VTK_HEXAHEDRON and VTK_QUADRATIC_HEXAHEDRON, by nodes per element
 TYPE_NAMES = {"f": "Float64", "i": "Int64", "u": "UInt8"}
 
 
@@ -27,23 +25,14 @@ def write_vtu(
     elements: NDArray[np.integer[Any]],
     point_data: Mapping[str, NDArray[Any]],
 ) -> None:
-    """Write a mesh of hexahedra and fields on its nodes.
+    """Write a mesh of hexahedra (e, 8) or (e, 20) and fields (n,) or (n, k) on its nodes (n, 3).
 
-    Parameters
-    ----------
-    nodes : ndarray, shape (n, 3), mm
-    elements : ndarray, shape (e, 8) or (e, 20)
-        In VTK's order.
-    point_data : dict of ndarray, shape (n,) or (n, k)
-        Floats are written with 8 bytes, truth values as 0 and 1.
+    Floats are written with 8 bytes, truth values as 0 and 1.
     """
     count, size = elements.shape
+    order = "LittleEndian" if sys.byteorder == "little" else "BigEndian"
     root = ET.Element(
-        "VTKFile",
-        type="UnstructuredGrid",
-        version="1.0",
-        byte_order="LittleEndian" if sys.byteorder == "little" else "BigEndian",
-        header_type="UInt64",
+        "VTKFile", type="UnstructuredGrid", version="1.0", byte_order=order, header_type="UInt64"
     )
     grid = ET.SubElement(root, "UnstructuredGrid")
     piece = ET.SubElement(grid, "Piece", NumberOfPoints=str(len(nodes)), NumberOfCells=str(count))

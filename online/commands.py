@@ -1,7 +1,4 @@
-"""The online commands of ``palpate``.
-
-Each imports what it runs when it runs, so that ``--help`` is instant.
-"""
+"""The online commands; each imports what it runs when it runs, so that ``--help`` is instant."""
 
 import json
 from functools import partial

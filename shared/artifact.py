@@ -19,7 +19,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from io import BufferedRandom, BufferedReader
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, NamedTuple, get_type_hints
 
 import h5py
 import numpy as np
@@ -50,58 +50,39 @@ class Dataset:
 
 @dataclass(frozen=True)
 class Artifact:
-    """Contents of an artifact.
+    """Contents of an artifact."""
 
-    Attributes
-    ----------
-    scene : str
-        The scene's TOML text.
-    documents : dict
-        JSON-able: ``provenance``, ``training``, ``validation``.
-    arrays : dict of ndarray
-    """
-
-    scene: str
-    documents: dict[str, Any]
+    scene: str  # the TOML text
+    documents: dict[str, Any]  # JSON-able: ``provenance``, ``training``, ``validation``
     arrays: dict[str, NDArray[Any]]
 
 
-@dataclass(frozen=True)
-class Stored:
-    """Annotation of a dataclass's field that is a dataset of an artifact.
+class Stored(NamedTuple):
+    """How a dataclass's field is stored, which is what it is ``Annotated`` with."""
 
-    Attributes
-    ----------
-    name, units, description : str
-        Of the dataset; a field that may be None has one only if it is not.
-    compress : bool
-        Worth while for integers.
-    half : bool
-        Kept in half precision, used in single precision.
-    """
-
-    name: str
+    name: str  # of the dataset; a field that may be None has one only if it is not
     units: str
     description: str
-    compress: bool = False
-    half: bool = False
+    how: str = ""  # "compress", worth while for integers, or "half": in half precision
 
 
 def _stored_fields(kind: type) -> dict[str, Stored]:
     """Stored fields of a dataclass, by their names."""
     annotations = get_type_hints(kind, include_extras=True)
     notes = {name: getattr(hint, "__metadata__", ()) for name, hint in annotations.items()}
-    return {name: note[0] for name, note in notes.items() if note}
+    return {name: Stored(*note) for name, note in notes.items() if note}
 
 
 def datasets_of(record: Any) -> dict[str, Dataset]:
     """Datasets of the stored fields of a dataclass, and of those that are its fields, by name."""
     datasets: dict[str, Dataset] = {}
-    for name, how in _stored_fields(type(record)).items():
+    for name, stored in _stored_fields(type(record)).items():
         value = getattr(record, name)
         if value is not None:
-            values = np.asarray(value, np.float16 if how.half else None)
-            datasets[how.name] = Dataset(values, how.units, how.description, how.compress)
+            values = np.asarray(value, np.float16 if stored.how == "half" else None)
+            datasets[stored.name] = Dataset(
+                values, stored.units, stored.description, stored.how == "compress"
+            )
     for item in fields(record):
         value = getattr(record, item.name)
         if is_dataclass(value):
@@ -113,10 +94,10 @@ def values_of(kind: type, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     """Values of the stored fields of a dataclass, by the fields' names; numbers are floats."""
     defaults = {item.name: item.default for item in fields(kind)}
     values: dict[str, Any] = {}
-    for name, how in _stored_fields(kind).items():
-        if how.name in arrays or defaults[name] is not None:
-            array = arrays[how.name]
-            values[name] = array.astype(np.float32) if how.half else array
+    for name, stored in _stored_fields(kind).items():
+        if stored.name in arrays or defaults[name] is not None:
+            array = arrays[stored.name]
+            values[name] = array.astype(np.float32) if stored.how == "half" else array
             if not array.ndim:
                 values[name] = array.item()
     return values

@@ -6,21 +6,25 @@ function to the next, which takes longer to compile.  A ``Bound`` value is one p
 """
 
 import inspect
+import math
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar, get_args, get_type_hints
 
+import numpy as np
 from numba import njit, types
 from numba.core import imputils
 from numba.experimental import structref
-from numba.extending import intrinsic, overload
+from numba.extending import intrinsic, overload, overload_method
+
+T = TypeVar("T")
 
 
 @structref.register
 class _BoundType(types.StructRef):
-    """Type of a bound named tuple: its fields' types and the tuple's class, ``kind``."""
+    """Type of a bound named tuple: its fields' types and the tuple's class."""
 
     def __init__(self, fields, kind):
-        self.kind = kind
+        self.instance_class = kind
         super().__init__(fields)
         # tuples of two classes with the same fields are two types
         types.Type.__init__(self, f"Bound({kind.__module__}.{kind.__qualname__}){self._fields}")
@@ -82,33 +86,58 @@ def bind(content: NamedTuple) -> Any:
     )
 
 
-def kind_of(value: types.Type) -> type | None:
-    """Class of the named tuple, bound or not, that a value of this numba type is."""
-    if isinstance(value, types.NamedTuple | types.NamedUniTuple):
-        return value.instance_class
-    return value.kind if isinstance(value, _BoundType) else None
+_METHODS: dict[str, dict[type, Callable[..., Any]]] = {}
+"""Of the classes of named tuples that compiled code knows, by their names."""
 
 
-def by_type(
-    piece: Callable[..., Any], table: Mapping[type, Callable[..., Any]], **options: bool
-) -> None:
-    """Compile calls of ``piece`` as calls of the function for the type of their first argument.
+def methods(**options: bool) -> Callable[[type[T]], type[T]]:
+    """Let compiled code call the methods of a class of named tuples, bound or not.
+
+    Methods of one name have the same arguments in every class, and no field of a named tuple that
+    is not bound has such a name.  Which one runs is known when the caller is compiled, so a method
+    that does nothing costs nothing.
 
     Parameters
     ----------
-    piece : function
-        Names the arguments and says what is done; never run itself.
-    table : mapping of type to function
-        Of the classes of named tuples, bound or not; the functions have the arguments of ``piece``,
-        the first of any name.
     options : bool
         Of the compiler.
     """
 
-    def choose(*args: types.Type) -> Callable[..., Any] | None:
-        kind = kind_of(args[0])
-        return None if kind is None else table.get(kind)
+    def register(kind: type[T]) -> type[T]:
+        for name, method in list(vars(kind).items()):
+            if inspect.isfunction(method) and not name.startswith("_"):
+                if name not in _METHODS:
+                    _overload(name, method, options)
+                _METHODS.setdefault(name, {})[kind] = method
+        return kind
 
-    jit_options: Any = {"error_model": "numpy"} | options
-    choose.__signature__ = inspect.signature(next(iter(table.values())))  # type: ignore[attr-defined]
-    overload(piece, jit_options=jit_options)(choose)
+    return register
+
+
+def _overload(name: str, method: Callable[..., Any], options: Mapping[str, bool]) -> None:
+    def choose(self: Any, *args: types.Type) -> Callable[..., Any] | None:
+        return _METHODS[name].get(self.instance_class)
+
+    choose.__signature__ = inspect.signature(method)  # type: ignore[attr-defined]
+    how: Any = {"jit_options": {"error_model": "numpy", **options}}
+    for kind in (types.BaseNamedTuple, _BoundType):
+        overload_method(kind, name, **how)(choose)
+
+
+def room(kind: type[T], **sizes: int) -> T:
+    """Zeros for a named tuple of arrays, each annotated with its shape, and of such named tuples.
+
+    A shape is numbers and names of ``sizes``, or products of them: ``"slots, r, 9 c"``.
+    """
+    arrays = []
+    for hint in get_type_hints(kind, include_extras=True).values():
+        if hasattr(hint, "_fields"):
+            arrays.append(room(hint, **sizes))
+        else:
+            array, text = get_args(hint)
+            product = [
+                math.prod(int(f) if f.isdigit() else sizes[f] for f in axis.split())
+                for axis in text.split(",")
+            ]
+            arrays.append(np.zeros(product, get_args(get_args(array)[1])[0]))
+    return kind(*arrays)

@@ -10,12 +10,7 @@ from numpy.typing import NDArray
 from palpate.shared.answer import Answer
 from palpate.shared.geometry.quadrature import stress_recovery
 from palpate.shared.local_models import Body, LocalModels
-from palpate.shared.mechanics.stress import (
-    nodal_von_mises,
-    nodal_von_mises_after,
-    remember,
-    remember_linearly,
-)
+from palpate.shared.mechanics.stress import nodal_von_mises, remember
 from palpate.shared.reduced.points import expand
 from palpate.shared.reduced.transfer import Transfer
 
@@ -78,11 +73,8 @@ class FieldRecovery:
 
     def von_mises(self, answer: Answer, displacement: Field) -> Field:
         """Nodal von Mises stress (n,) kPa of an answer with this displacement of all nodes."""
-        if answer.past is None:
-            nodal_von_mises(self._recovery, displacement, self._stress)
-        else:
-            B = self._remembered(answer)
-            nodal_von_mises_after(self._recovery, displacement, B, self._stress)
+        B = None if answer.past is None else self._remembered(answer)
+        nodal_von_mises(self._recovery, displacement, B, self._stress)
         # an answer that did not converge may be beyond single precision
         with np.errstate(over="ignore"):
             return self._stress.astype(np.float32)
@@ -96,5 +88,5 @@ class FieldRecovery:
             remember(self._recovery, u, share, B)
         lasting = transfer.lasting(answer.time, answer.active)
         if lasting:
-            remember_linearly(self._recovery, self._field(self._by_region(answer, lasting)), B)
+            remember(self._recovery, self._field(self._by_region(answer, lasting)), None, B)
         return B

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.shared.artifact import Stored, values_of
+from palpate.shared.artifact import values_of
 from palpate.shared.geometry.quadrature import surface_quadrature, volume_quadrature
 from palpate.shared.mechanics.footprint import SurfaceQuadrature
 from palpate.shared.mechanics.laws import law_of
@@ -26,25 +26,18 @@ from palpate.shared.scene import Scene
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
 Ints = NDArray[np.int64]
+Numbers = NDArray[np.int32]
 
 
 @dataclass(frozen=True)
 class Body:
     """Mesh and tissue of a scene, as both sides see them."""
 
-    nodes: Annotated[Array, Stored("nodes", "mm", "nodes (n, 3), dof = 3 node + axis")]
-    elements: Annotated[
-        NDArray[np.int32],
-        Stored("elements", "1", "nodes of each hexahedron (e, 8 or 20), VTK order"),
-    ]
-    faces: Annotated[
-        NDArray[np.int32],
-        Stored("faces", "1", "nodes of each boundary face (f, 4 or 8), VTK order, outward"),
-    ]
-    clamped: Annotated[NDArray[np.bool_], Stored("clamped", "1", "nodes held fixed (n,)")]
-    accessible: Annotated[
-        NDArray[np.bool_], Stored("accessible", "1", "faces an endoscope can touch (f,)")
-    ]
+    nodes: Annotated[Array, "nodes", "mm", "nodes (n, 3), dof = 3 node + axis"]
+    elements: Annotated[Numbers, "elements", "1", "nodes of hexahedra (e, 8 or 20), VTK order"]
+    faces: Annotated[Numbers, "faces", "1", "nodes of boundary faces (f, 4 or 8), VTK"]
+    clamped: Annotated[NDArray[np.bool_], "clamped", "1", "nodes held fixed (n,)"]
+    accessible: Annotated[NDArray[np.bool_], "accessible", "1", "faces an endoscope can touch (f,)"]
     law: Law  # parameters of the elements (e,)
     tip: Tip
 
@@ -56,7 +49,7 @@ class Body:
         return cls(**values_of(cls, arrays), law=law, tip=tip)
 
     @cached_property
-    def touchable(self) -> tuple[TipSurface, NDArray[np.int32]]:
+    def touchable(self) -> tuple[TipSurface, Numbers]:
         """Faces that the tip can touch, their nodes counted anew, and these nodes (s,)."""
         surface = tip_surface(self.nodes, self.faces, self.accessible, self.tip.radius)
         nodes, faces = np.unique(surface.faces, return_inverse=True)
@@ -79,24 +72,13 @@ class ViscousModels:
     """What steps in time need beyond elastic local models; n pairs of neighbours."""
 
     deviatoric: Annotated[
-        Field,
-        Stored(
-            "viscous_deviatoric",
-            "1",
-            "deviatoric part of the rest stiffness in the modes (p, r, r)",
-        ),
+        Field, "viscous_deviatoric", "1", "deviatoric rest stiffness in the modes (p, r, r)"
     ]
     pairs: Annotated[
-        NDArray[np.int32],
-        Stored(
-            "viscous_pairs", "1", "local models whose spaces meet (n, 2), the lower number first"
-        ),
+        Numbers, "viscous_pairs", "1", "local models whose spaces meet (n, 2), ascending"
     ]
     overlap: Annotated[
-        Field,
-        Stored(
-            "viscous_overlap", "1", "products of their modes in energy at rest (n, r, r)", half=True
-        ),
+        Field, "viscous_overlap", "1", "their modes' products at rest (n, r, r)", "half"
     ]
 
 
@@ -105,52 +87,21 @@ class LocalTips:
     """The same local models under the rigid tip."""
 
     modes: Annotated[
-        Field,
-        Stored(
-            "tip_modes",
-            "1",
-            "modes under the tip, orthonormal, in the basis of the region (p, M, m)",
-        ),
+        Field, "tip_modes", "1", "orthonormal modes in the basis of the region (p, M, m)"
     ]
-    point_from: Annotated[Ints, Stored("tip_from", "1", "first cubature point of each (p + 1,)")]
-    points: Annotated[
-        NDArray[np.int32], Stored("tip_points", "1", "quadrature point, by element (c,)")
-    ]
-    weights: Annotated[Array, Stored("tip_weights", "mm^3", "weight of each point (c,)")]
-    guess: Annotated[
-        Field,
-        Stored(
-            "tip_guess",
-            "1",
-            "answer as polynomials of place and depth (p, TIP_FEATURES, m)",
-            half=True,
-        ),
-    ]
-    pairs: Annotated[
-        NDArray[np.int32],
-        Stored("tip_pairs", "1", "local models next to one another (n, 2), the lower number first"),
-    ]
+    point_from: Annotated[Ints, "tip_from", "1", "first cubature point of each (p + 1,)"]
+    points: Annotated[Numbers, "tip_points", "1", "quadrature point by element (c,)"]
+    weights: Annotated[Array, "tip_weights", "mm^3", "weight of each point (c,)"]
+    guess: Annotated[Field, "tip_guess", "1", "answer, polynomials (p, TIP_FEATURES, m)", "half"]
+    pairs: Annotated[Numbers, "tip_pairs", "1", "local models side by side (n, 2), ascending"]
     overlaps: Annotated[
-        Field,
-        Stored(
-            "tip_overlaps", "1", "products of their modes in energy at rest (n, m, m)", half=True
-        ),
+        Field, "tip_overlaps", "1", "their modes' products at rest (n, m, m)", "half"
     ]
     residuals: Annotated[
-        Array,
-        Stored(
-            "tip_residuals",
-            "1",
-            "log of the residual in the full model, polynomials of normal and depth (p, k)",
-        ),
+        Array, "tip_residuals", "1", "log of the residual in the full model (p, k)"
     ]
     deviatoric: Annotated[
-        Field | None,
-        Stored(
-            "tip_viscous_deviatoric",
-            "1",
-            "deviatoric part of the rest stiffness in the modes of the tip (p, m, m)",
-        ),
+        Field | None, "tip_viscous_deviatoric", "1", "deviatoric rest stiffness (p, m, m)"
     ] = None
 
 
@@ -159,82 +110,35 @@ class LocalModels:
     """Local models under footprints, and the modes of the regions that they are made of."""
 
     basis: Annotated[
-        NDArray[np.int16],
-        Stored(
-            "basis",
-            "basis_steps",
-            "modes of each region, orthonormal in energy at rest (regions, M, 3 n)",
-            compress=True,
-        ),
+        NDArray[np.int16], "basis", "basis_steps", "orthonormal modes (regions, M, 3 n)", "compress"
     ]
-    steps: Annotated[Field, Stored("basis_steps", "mm", "value of one step of a mode (regions, M)")]
-    region: Annotated[
-        NDArray[np.int32], Stored("patch_region", "1", "region of each local model (p,)")
-    ]
-    centres: Annotated[Array, Stored("patch_centres", "mm", "centres of local models (p, 3)")]
-    frames: Annotated[Array, Stored("patch_frames", "1", "rows: normal and two tangents (p, 3, 3)")]
-    pressures: Annotated[Array, Stored("patch_pressures", "kPa", "load scale of local models (p,)")]
-    whole: Annotated[
-        NDArray[np.int16],
-        Stored("patch_modes", "patch_mix", "modes in the basis of the region (p, M, r)"),
-    ]
-    mix: Annotated[
-        Field,
-        Stored(
-            "patch_mix", "1", "makes orthonormal modes of them, triangular (p, r, r)", compress=True
-        ),
-    ]
-    point_from: Annotated[
-        Ints, Stored("cubature_from", "1", "first point of each local model (p + 1,)")
-    ]
-    points: Annotated[
-        NDArray[np.int32], Stored("cubature_points", "1", "quadrature point, by element (c,)")
-    ]
-    weights: Annotated[Array, Stored("cubature_weights", "mm^3", "weight of each point (c,)")]
+    steps: Annotated[Field, "basis_steps", "mm", "value of one step of a mode (regions, M)"]
+    region: Annotated[Numbers, "patch_region", "1", "region of each local model (p,)"]
+    centres: Annotated[Array, "patch_centres", "mm", "centres of local models (p, 3)"]
+    frames: Annotated[Array, "patch_frames", "1", "rows: normal and two tangents (p, 3, 3)"]
+    pressures: Annotated[Array, "patch_pressures", "kPa", "load scale of local models (p,)"]
+    whole: Annotated[NDArray[np.int16], "patch_modes", "patch_mix", "modes in the basis (p, M, r)"]
+    mix: Annotated[Field, "patch_mix", "1", "makes them orthonormal (p, r, r)", "compress"]
+    point_from: Annotated[Ints, "cubature_from", "1", "first point of each local model (p + 1,)"]
+    points: Annotated[Numbers, "cubature_points", "1", "quadrature point by element (c,)"]
+    weights: Annotated[Array, "cubature_weights", "mm^3", "weight of each point (c,)"]
     defect: Annotated[
-        Field,
-        Stored(
-            "patch_defect",
-            "mN",
-            "force that cubature misses, polynomials of the load (p, LOAD_FEATURES, r)",
-            half=True,
-        ),
+        Field, "patch_defect", "mN", "force that cubature misses (p, LOAD_FEATURES, r)", "half"
     ]
     guess: Annotated[
-        Field,
-        Stored(
-            "patch_guess",
-            "1",
-            "answer beyond the linear one, polynomials of the load (p, LOAD_FEATURES, r)",
-            half=True,
-        ),
+        Field, "patch_guess", "1", "answer beyond the linear one (p, LOAD_FEATURES, r)", "half"
     ]
     directions: Annotated[
-        Field,
-        Stored(
-            "patch_directions",
-            "1",
-            "orthonormal, in which the tangent changes most (p, CHANGING, r)",
-            half=True,
-        ),
+        Field, "patch_directions", "1", "of most change of the tangent (p, CHANGING, r)", "half"
     ]
     change: Annotated[
-        Field,
-        Stored(
-            "patch_change",
-            "1",
-            "change of the tangent there, lower triangle (p, TANGENT_FEATURES, CHANGES)",
-            half=True,
-        ),
+        Field, "patch_change", "1", "that change there (p, TANGENT_FEATURES, CHANGES)", "half"
     ]
     residuals: Annotated[
-        Array,
-        Stored("patch_residuals", "1", "log of the residual in the full model, polynomials (p, k)"),
+        Array, "patch_residuals", "1", "log of the residual in the full model (p, k)"
     ]
-    extent: Annotated[
-        float, Stored("patch_extent", "mm", "largest distance of a contact that it answers")
-    ]
-    blend: Annotated[float, Stored("patch_blend", "mm", "width of blending")]
+    extent: Annotated[float, "patch_extent", "mm", "largest distance of a contact"]
+    blend: Annotated[float, "patch_blend", "mm", "width of blending"]
     tips: LocalTips | None = None
     viscous: ViscousModels | None = None
 

@@ -24,10 +24,9 @@ from palpate.shared.mechanics.viscosity import Weights, step_weights
 from palpate.shared.query import check_place, checked_load, out_of_range, vector
 from palpate.shared.reduced import press, touch
 from palpate.shared.reduced.outcome import TOUCH_FEATURES, Outcome
-from palpate.shared.reduced.past import Remembering, remembering
-from palpate.shared.reduced.terms import Elastic
+from palpate.shared.reduced.past import Elastic, Remembering, remembering
 from palpate.shared.reduced.transfer import LeftBehind, Local, Past, Transfer, estimate_history
-from palpate.shared.reduced.workspace import Warm, Workspace, press_workspace, touch_workspace
+from palpate.shared.reduced.workspace import Warm, Workspace
 from palpate.shared.scene import Scene, SceneError, parse_scene
 from palpate.shared.tables import press_models, touch_models
 
@@ -161,13 +160,8 @@ class ReducedModel:
             assert viscous is not None, "or the tissue would have no past"
             points = tables.points.weights.shape[1]
             past = remembering(viscous.deviatoric, len(self.scene.tissue.prony), points)
-        if tip:
-            coefficients = np.ascontiguousarray(self.estimators.touches.coefficients)
-            return touch_workspace(self.touch_models, self._index, coefficients, past)
-        return press_workspace(
-            self.press_models, self._index, self.scene.endoscope.max_tilt,
-            np.ascontiguousarray(self.estimators.loads.coefficients), past,
-        )  # fmt: skip
+        estimator = self.estimators.touches if tip else self.estimators.loads
+        return Workspace(tables, self._index, estimator.coefficients, past)
 
     @cached_property
     def press_models(self) -> press.PressModels:

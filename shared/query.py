@@ -78,7 +78,8 @@ def out_of_range(
 ) -> tuple[str, ...]:
     """Fields of a load that are not of the kind the model was trained for."""
     fields: tuple[str, ...] = ()
-    if found.distance > BESIDE and _beside(at, found):
+    beside = UPRIGHT * found.distance  # rather beyond the rim than above or below
+    if found.distance > BESIDE and abs(np.dot(at - found.foot, found.upward)) < beside:
         fields += ("position",)
     if pressure > found.limit * (1 + 1e-9):
         fields += ("pressure",)
@@ -87,11 +88,6 @@ def out_of_range(
     if radius != endoscope.radius:
         fields += ("radius",)
     return fields
-
-
-def _beside(position: Array, found: Outcome) -> bool:
-    """Whether a position lies rather beside the surface, beyond its rim, than above or below it."""
-    return bool(abs(np.dot(position - found.foot, found.upward)) < UPRIGHT * found.distance)
 
 
 def vector(field: str, value: ArrayLike) -> Array:

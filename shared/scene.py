@@ -11,11 +11,12 @@ The descriptions of the fields are the documentation of the keys: `palpate scene
 from __future__ import annotations
 
 import difflib
+import json
 import tomllib
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import (
     Field,
@@ -40,11 +41,8 @@ Element = Annotated[
     ),
 ]
 
-Divisions = tuple[
-    Annotated[int, Field(ge=1, le=500)],
-    Annotated[int, Field(ge=1, le=500)],
-    Annotated[int, Field(ge=1, le=500)],
-]
+Division = Annotated[int, Field(ge=1, le=500)]
+Divisions = tuple[Division, Division, Division]
 CHOSEN = "the coarsest mesh whose error is at most three times the tolerance"
 Point2 = tuple[float, float]
 Range = tuple[float, float]
@@ -73,6 +71,9 @@ class Extrusion(Part):
     `posterior` (y = 0) and `anterior` (y = length).
     """
 
+    sides: ClassVar = "lip", "tip", "posterior", "anterior", "inner", "outer"
+    """Low and high end of each axis of the mesh's lattice."""
+
     kind: Literal["extrusion"] = Field(
         description="section along y; sides: lip, outer, tip, inner, posterior, anterior"
     )
@@ -92,24 +93,17 @@ class Extrusion(Part):
         description="depth over thickness = (layer / layers)^grading: thin layers outside",
     )
 
-    @property
-    def sides(self) -> tuple[str, ...]:
-        """Names of the sides: low and high end of each axis of the mesh's lattice."""
-        return ("lip", "tip", "posterior", "anterior", "inner", "outer")
-
 
 class Block(Part):
     """A box with one corner at the origin; its sides are named as seen along +y."""
+
+    sides: ClassVar = "left", "right", "front", "back", "bottom", "top"
+    """Low and high end of each axis of the mesh's lattice."""
 
     kind: Literal["block"] = Field(description="box; sides: left, right, front, back, bottom, top")
     size: tuple[Positive, Positive, Positive] = Field(description="lengths along [x, y, z], mm")
     element: Element = "hex20"
     divisions: Divisions | None = _chosen(CHOSEN, "elements along [x, y, z]")
-
-    @property
-    def sides(self) -> tuple[str, ...]:
-        """Names of the sides: low and high end of each axis of the mesh's lattice."""
-        return ("left", "right", "front", "back", "bottom", "top")
 
 
 def divisions_of(geometry: Extrusion | Block) -> Divisions:
@@ -249,29 +243,6 @@ class Scene(Part):
         """Where the files named by the scene lie; None for a scene without files at hand."""
         return self._folder
 
-    @model_validator(mode="before")
-    @classmethod
-    def _derive(cls, data: dict[str, Any]) -> dict[str, Any]:
-        """Fill in what follows from the name and the radius; an absent table is an empty one."""
-        tables: dict[str, Any] = {
-            name: {} for name, field in cls.model_fields.items() if kinds_of(field)
-        }
-        data = {"description": str(data.get("name", ""))} | tables | data
-        given = data["endoscope"]
-        radius = given.get("radius") if isinstance(given, dict) else None
-        # a wrong radius is an error by itself, and no reason for errors of what follows from it
-        if not (isinstance(radius, int | float) and 0 < radius < 1e300):
-            radius = 1.0
-        for name, part in (("endoscope", Endoscope), ("training", Training)):
-            if isinstance(data[name], dict):
-                lengths = {
-                    key: float(f"{said['radii'] * radius:.6g}")
-                    for key, field in part.model_fields.items()
-                    if "radii" in (said := _said(field))
-                }
-                data[name] = lengths | data[name]
-        return data
-
     @field_validator("support", "surface")
     @classmethod
     def _side_exists(cls, patch: Patch, info: ValidationInfo) -> Patch:
@@ -283,6 +254,26 @@ class Scene(Part):
                 {"side": patch.side, "sides": ", ".join(geometry.sides)},
             )
         return patch
+
+
+def _derived(data: dict[str, Any]) -> dict[str, Any]:
+    """Fill in what follows from the name and the radius; an absent table is an empty one."""
+    tables = {key: dict[str, Any]() for key, at in Scene.model_fields.items() if kinds_of(at)}
+    data = {"description": str(data.get("name", ""))} | tables | data
+    given = data["endoscope"]
+    radius = given.get("radius") if isinstance(given, dict) else None
+    # a wrong radius is an error by itself, and no reason for errors of what follows from it
+    if not (isinstance(radius, int | float) and 0 < radius < 1e300):
+        radius = 1.0
+    for name, part in (("endoscope", Endoscope), ("training", Training)):
+        if isinstance(data[name], dict):
+            lengths = {
+                key: float(f"{said['radii'] * radius:.6g}")
+                for key, field in part.model_fields.items()
+                if "radii" in (said := _said(field))
+            }
+            data[name] = lengths | data[name]
+    return data
 
 
 def _said(field: FieldInfo) -> dict[str, Any]:
@@ -344,7 +335,7 @@ def parse_scene(text: str, folder: Path | None = None, source: str = "scene") ->
         With every field that is wrong, its value and what is allowed.
     """
     try:
-        scene = Scene.model_validate(_tuples(tomllib.loads(text)))
+        scene = Scene.model_validate_json(json.dumps(_derived(tomllib.loads(text)), default=str))
     except tomllib.TOMLDecodeError as error:
         raise SceneError(f"{source}: not TOML: {error}") from error
     except ValidationError as error:
@@ -354,15 +345,6 @@ def parse_scene(text: str, folder: Path | None = None, source: str = "scene") ->
     scene._text = text
     scene._folder = folder
     return scene
-
-
-def _tuples(value: Any) -> Any:
-    """TOML arrays as tuples, the immutable kind strict models ask for."""
-    if isinstance(value, dict):
-        return {key: _tuples(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return tuple(_tuples(item) for item in value)
-    return value
 
 
 def _explain(detail: dict[str, Any]) -> str:

@@ -10,11 +10,16 @@ for library in ("OPENBLAS", "MKL", "OMP"):
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
+from palpate.shared.model import ReducedModel  # noqa: E402
+
 
 @pytest.fixture
 def rng():
     """Return a random generator that every run seeds alike."""
     return np.random.default_rng(20260101)
+
+
+PALPATE = [sys.executable, "-c", "from palpate.shared.cli import main; main()"]
 
 
 def trained(scene, tmp_path_factory):
@@ -27,9 +32,8 @@ def trained(scene, tmp_path_factory):
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not path.exists():
             path.parent.mkdir(exist_ok=True)
-            train = "from palpate.shared.cli import main; main()", "train", scene
-            run = [sys.executable, "-c", *train, "--out", str(path)]
-            subprocess.run(run, check=True, capture_output=True)
+            command = [*PALPATE, "train", scene, "--out", str(path)]
+            subprocess.run(command, check=True, capture_output=True)
     return path
 
 
@@ -40,6 +44,18 @@ def artifact(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def atlas(artifact):
+    """Return the reduced model of the quick scene."""
+    return ReducedModel.load(artifact)
+
+
+@pytest.fixture(scope="session")
 def visco_artifact(tmp_path_factory):
     """Return the artifact of the quick scene of visco-elastic tissue."""
     return trained("quick-visco", tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def visco_atlas(visco_artifact):
+    """Return the reduced model of the quick scene of visco-elastic tissue."""
+    return ReducedModel.load(visco_artifact)

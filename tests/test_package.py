@@ -14,15 +14,19 @@ for name in (REST, Client, ReducedModel, Session, PalpateError):
 """
 
 
-@pytest.mark.parametrize("folder", ["shared", "offline", "online"])
-def test_a_script_beside_a_folder_named_like_a_part_of_palpate_runs(folder, tmp_path):
-    (tmp_path / folder).mkdir()
-    (tmp_path / folder / "__init__.py").write_text("raise ImportError('not Palpate')\n")
+PARTS = "shared", "offline", "online"
+
+
+def run(folder, *arguments):
+    return subprocess.run([sys.executable, *arguments], cwd=folder, capture_output=True, text=True)
+
+
+def test_a_script_beside_folders_named_like_parts_of_palpate_runs(tmp_path):
+    for part in PARTS:
+        (tmp_path / part).mkdir()
+        (tmp_path / part / "__init__.py").write_text("raise ImportError('not Palpate')\n")
     (tmp_path / "script.py").write_text(SCRIPT)
-    run = subprocess.run(
-        [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
-    assert run.stdout.split() == [
+    assert run(tmp_path, "script.py").stdout.split() == [
         "palpate.shared.reduced.transfer",
         "palpate.online.client.http",
         "palpate.shared.model",
@@ -31,12 +35,9 @@ def test_a_script_beside_a_folder_named_like_a_part_of_palpate_runs(folder, tmp_
     ]
 
 
-@pytest.mark.parametrize("name", ["shared", "offline", "online"])
-def test_the_parts_are_not_importable_without_the_name_of_the_package(name, tmp_path):
-    run = subprocess.run(
-        [sys.executable, "-c", f"import {name}"], cwd=tmp_path, capture_output=True, text=True
-    )
-    assert f"No module named '{name}'" in run.stderr
+@pytest.mark.parametrize("part", PARTS)
+def test_the_parts_are_not_importable_without_the_name_of_the_package(part, tmp_path):
+    assert f"No module named '{part}'" in run(tmp_path, "-c", f"import {part}").stderr
 
 
 def test_an_unknown_name_is_an_attribute_error():

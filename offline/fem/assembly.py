@@ -72,11 +72,11 @@ def standard_residual(conn, grad, weight, law, u, r):
     for e in range(len(conn)):
         for q in range(weight.shape[1]):
             F = _deformation_gradient(conn[e], grad[e, q], u)
-            J, part, P = laws.first_piola(laws.at(law, e), F)
+            J, part, P = law.at(e).first_piola(F)
             smallest = min(smallest, J)
             if not J > 0.0:
                 return tissue.INVERTED, smallest
-            energy += weight[e, q] * laws.energy(laws.at(law, e), J, part)
+            energy += weight[e, q] * law.at(e).energy(J, part)
             _add_point_force(conn[e], grad[e, q], weight[e, q], P, r)
     return energy, smallest
 
@@ -134,7 +134,7 @@ def standard_tangent(conn, grad, weight, law, u, slots, data):
         K[:] = 0.0
         for q in range(weight.shape[1]):
             F = _deformation_gradient(conn[e], grad[e, q], u)
-            laws.tangent(laws.at(law, e), F, A)
+            laws.tangent(law.at(e), F, A)
             _add_point_tangent(grad[e, q], A, weight[e, q], G, C, K)
         _scatter(K, slots[e], data)
 
@@ -174,8 +174,8 @@ def dilatation_residual(conn, grad, weight, theta_grad, theta_weight, law, u, r)
             if not J > 0.0:
                 return tissue.INVERTED, smallest
             alpha, w = (theta / J) ** (1.0 / 3.0), weight[e, q]
-            bar, part, P = laws.first_piola(laws.at(law, e), scale(alpha, F))
-            energy += w * laws.energy(laws.at(law, e), bar, part)
+            bar, part, P = law.at(e).first_piola(scale(alpha, F))
+            energy += w * law.at(e).energy(bar, part)
             p = ddot(P, F) / 3.0
             by_theta += w * alpha * p / theta
             _add_point_force(own, grad[e, q], w * alpha, combine(1.0, P, -p / J, C), f)
@@ -192,21 +192,21 @@ def _fixed_dilatation_tangent(law, F, alpha, A):
     Returns the stress ``P`` at ``alpha F``, its derivative along ``alpha F``, and ``F^-T``.
     """
     Fbar, cofactors = scale(alpha, F), cofactor(F)
-    _, _, P = laws.first_piola(law, Fbar)
-    state = laws.linearise(law, Fbar)
+    _, _, P = law.first_piola(Fbar)
+    state = law.linearise(Fbar)
     T, once = scale(1.0 / det(F, cofactors), cofactors), ddot(P, F)
     for k in range(9):
         H = unit(k)
         third = ddot(T, H) / 3.0
         # of alpha (P - P:F/3 T), with dalpha = -alpha third and dT = -T H^T T
-        dP = laws.increment(law, state, scale(alpha, combine(1.0, H, -third, F)))
+        dP = law.increment(state, scale(alpha, combine(1.0, H, -third, F)))
         along = third * once / 3.0 - (ddot(dP, F) + ddot(P, H)) / 3.0
         D = add(
             combine(1.0, dP, -third, P),
             combine(along, T, once / 3.0, dot(T, dot(transposed(H), T))),
         )
         store(scale(alpha, D), A[k], 0, 1)
-    return P, laws.increment(law, state, Fbar), T
+    return P, law.increment(state, Fbar), T
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -227,7 +227,7 @@ def dilatation_tangent(conn, grad, weight, theta_grad, theta_weight, law, u, slo
         for q in range(weight.shape[1]):
             F, w = _deformation_gradient(conn[e], grad[e, q], u), weight[e, q]
             alpha = (theta / det(F, cofactor(F))) ** (1.0 / 3.0)
-            P, by_scale, T = _fixed_dilatation_tangent(laws.at(law, e), F, alpha, A)
+            P, by_scale, T = _fixed_dilatation_tangent(law.at(e), F, alpha, A)
             _add_point_tangent(grad[e, q], A, w, G, C, K)
             once, twice = ddot(P, F), ddot(by_scale, F)
             by_theta += w * alpha * once / (3.0 * theta)

@@ -1,4 +1,4 @@
-"""How fine a mesh must be: the coarsest whose own error does not dwarf the scene's tolerance.
+"""What a mesh errs by, and how fine it must be so that this does not dwarf the tolerance.
 
 Meshes of ever smaller elements, about as long as wide, are pressed at the same places as meshes of
 twice their divisions.  In linear elasticity: that costs one factorisation each, and under the
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import sys
-from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -17,11 +17,18 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from palpate.offline.fem.mesh import build_mesh
-from palpate.offline.fem.problem import FullProblem
-from palpate.offline.fem.refine import refined
+from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.reduce.sampling import spread_points
 from palpate.offline.run.streams import Stage, stream
-from palpate.shared.scene import Block, Divisions, Scene, SceneError, divisions_of, parse_scene
+from palpate.shared.scene import (
+    Block,
+    Divisions,
+    ElementName,
+    Scene,
+    SceneError,
+    divisions_of,
+    parse_scene,
+)
 
 Array = NDArray[np.float64]
 
@@ -36,14 +43,11 @@ MOST_DOFS = 40_000
 
 PLACES = 12
 
+MOST_DOFS_REFINED = 15_000
+"""Of a scene whose refinement training can afford."""
 
-@dataclass(frozen=True)
-class MeshTrial:
-    """A mesh that was tried: ``error`` is the 95th percentile over all places."""
-
-    divisions: Divisions
-    dofs: int
-    error: float
+LINEAR_PER_QUADRATIC = 1.62
+"""Linear elements per quadratic one along each axis, for as many degrees of freedom."""
 
 
 def with_mesh(scene: Scene) -> tuple[Scene, dict[str, Any] | None]:
@@ -57,20 +61,19 @@ def with_mesh(scene: Scene) -> tuple[Scene, dict[str, Any] | None]:
     if scene.geometry.divisions is not None:
         return scene, None
     allowed = SHARE * scene.tolerance.displacement
-    tried: list[MeshTrial] = []
+    tried: list[dict[str, Any]] = []
     for divisions in tqdm(_candidates(scene), "choosing the mesh"):
-        tried.append(_try(_divided(scene, divisions)))
-        if tried[-1].error <= allowed or FINER**-3 * tried[-1].dofs > MOST_DOFS:
+        chosen = _divided(scene, divisions)
+        dofs, error = _try(chosen)
+        tried.append({"divisions": divisions, "dofs": dofs, "error": error})
+        if error <= allowed or FINER**-3 * dofs > MOST_DOFS:
             break
-    chosen = tried[-1]
-    if chosen.error <= allowed:
-        why = "the coarsest mesh tried with"
-    else:
-        why = f"no mesh tried, of up to {chosen.dofs} DOFs, has"
-    why += f" at most {allowed:.1%} error under the footprint: {chosen.error:.2%}"
-    tqdm.write(f"mesh: {chosen.divisions}, {chosen.dofs} DOFs; {why}", file=sys.stderr)
-    document = {"why": why, "tried": [vars(trial) for trial in tried]}
-    return _divided(scene, chosen.divisions), document
+    why = "the coarsest mesh tried with"
+    if error > allowed:
+        why = f"no mesh tried, of up to {dofs} DOFs, has"
+    why += f" at most {allowed:.1%} error under the footprint: {error:.2%}"
+    tqdm.write(f"mesh: {divisions}, {dofs} DOFs; {why}", file=sys.stderr)
+    return chosen, {"why": why, "tried": tried}
 
 
 def _divided(scene: Scene, divisions: Divisions) -> Scene:
@@ -104,18 +107,19 @@ def _candidates(scene: Scene) -> list[Divisions]:
     return found
 
 
-def _try(scene: Scene) -> MeshTrial:
-    """Press a mesh and one of more than six times its degrees of freedom at the same places."""
-    problem, reference = FullProblem(scene), FullProblem(refined(scene))
+def _try(scene: Scene) -> tuple[int, float]:
+    """Degrees of freedom of a mesh, and the 95th percentile of its errors over some places.
+
+    They are relative to a mesh of more than six times its degrees of freedom.
+    """
+    problem, reference = FullProblem(scene), _remeshed(scene, scene.geometry.element, 2.0)
     rng = stream(scene.seed, Stage.MESH_CHOICE)
     errors = []
     for point in spread_points(problem.surface, PLACES, rng):
         x, normal, _ = problem.surface.project(point)
         moved, exact = (_moved(body, x, normal) for body in (problem, reference))
         errors.append(abs(moved / exact - 1))
-    return MeshTrial(
-        divisions_of(scene.geometry), problem.mesh.nodes.size, float(np.percentile(errors, 95))
-    )
+    return problem.mesh.nodes.size, float(np.percentile(errors, 95))
 
 
 def _moved(problem: FullProblem, x: Array, normal: Array) -> float:
@@ -124,3 +128,55 @@ def _moved(problem: FullProblem, x: Array, normal: Array) -> float:
     load = (nodal[:, None] * normal).reshape(-1)[problem.model.free]
     u = problem.model.solve_linear(load[:, None])[:, 0]
     return float(load @ u) / float(nodal.sum())
+
+
+def _remeshed(scene: Scene, element: ElementName, factor: float) -> FullProblem:
+    """The scene in another element, with so many times as many of them along every axis."""
+    divisions = tuple(max(1, round(factor * n)) for n in divisions_of(scene.geometry))
+    geometry = scene.geometry.model_copy(update={"element": element, "divisions": divisions})
+    return FullProblem(scene.model_copy(update={"geometry": geometry}))
+
+
+@lru_cache(maxsize=1)
+def _others(problem: FullProblem) -> list[FullProblem]:
+    """The scene with as many degrees of freedom in the other element that does not lock; finer."""
+    scene, element = problem.scene, problem.scene.geometry.element
+    if element == "hex20":
+        other = _remeshed(scene, "hex8-mean-dilatation", LINEAR_PER_QUADRATIC)
+    else:
+        other = _remeshed(scene, "hex20", 1 / LINEAR_PER_QUADRATIC)
+    return [other, _remeshed(scene, element, 2.0)]
+
+
+def mesh_error(problem: FullProblem, load: Load) -> list[tuple[str, int, float]]:
+    """Element, degrees of freedom and mean displacement (mm) under a footprint on three meshes.
+
+    They are the scene's, one of another element, and a finer one.
+    """
+    x, normal, _ = problem.surface.project(load.position)
+    traction = load.pressure * load.direction
+    problems = [problem, *_others(problem)]
+    moved = [np.linalg.norm(own.press_at(x, normal, traction)[1]) for own in problems]
+    return [
+        (own.scene.geometry.element, own.mesh.nodes.size, float(u))
+        for own, u in zip(problems, moved, strict=True)
+    ]
+
+
+def mesh_error_document(found: list[list[tuple[str, int, float]]]) -> dict[str, Any]:
+    """What an artifact keeps of ``mesh_error`` for some loads, relative to the finer mesh."""
+    moved = np.array([[u for *_, u in meshes] for meshes in found])
+    errors, (*meshes, (_, reference_dofs, _)) = moved[:, :2] / moved[:, 2:] - 1, found[0]
+    return {
+        "loads": len(found),
+        "reference_dofs": reference_dofs,
+        "elements": {
+            element: {
+                "dofs": dofs,
+                "mean": float(own.mean()),
+                "least": float(own.min()),
+                "greatest": float(own.max()),
+            }
+            for (element, dofs, _), own in zip(meshes, errors.T, strict=True)
+        },
+    }

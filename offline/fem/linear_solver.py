@@ -4,20 +4,10 @@ A tangent keeps its sparsity through a whole study, so it is ordered and factori
 once; a Newton step then costs a numeric factorisation and two triangular solves. MKL's PARDISO
 does both 3 to 12 times faster than SciPy's SuperLU, which serves where MKL has no wheels.
 
-What installs from wheels, in ms on one core of an AMD EPYC, for the turbinate's rest stiffness
-(hex20, 5 889 unknowns, 759 879 entries; in brackets turbinate-fine, 39 480 unknowns):
-
-====================== ======== ============= ========= ============ ======== =========
-solver                 analysis factorisation one solve 19 solves    licence  installed
-====================== ======== ============= ========= ============ ======== =========
-PARDISO (mkl 2026.2)   48       18    (549)   0.5 (17)  6     (79)   Intel    1.0 GB
-CHOLMOD (cvxopt 1.3)   9        27   (1277)   0.6 (26)  13   (501)   GPL      65 MB
-MUMPS (python-mumps)   22       32    (762)   1.3 (32)  6     (91)   CeCILL-C 55 MB
-SuperLU (SciPy 1.17)   each time 69   (6727)  1.7 (53)  14   (386)   BSD      with SciPy
-CHOLMOD (cholespy 2.2) each time 131  (7031)  0.7 (28)  7    (200)   BSD      12 MB
-====================== ======== ============= ========= ============ ======== =========
-
-The wheel of MUMPS needs NumPy 1, and cholespy cannot keep its analysis.
+What installs from wheels, on one core of an AMD EPYC: PARDISO factorises the turbinate's rest
+stiffness (hex20, 5 889 unknowns) in 18 ms, CHOLMOD (cvxopt 1.3, GPL) in 27, MUMPS (needs NumPy 1)
+in 32 and SuperLU, which cannot keep its analysis, in 69; 39 480 unknowns take 0.5, 1.3, 0.8 and
+6.7 s.
 """
 
 import ctypes
@@ -25,7 +15,6 @@ import weakref
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,56 +31,17 @@ class NotPositiveDefinite(PalpateError):
         super().__init__("the stiffness matrix is not positive definite")
 
 
-class SparseSolver(Protocol):
-    """A symmetric matrix of fixed sparsity, factorised anew whenever its values change.
+class Pardiso:
+    """PARDISO of Intel's MKL: supernodal Cholesky factorisation.
 
-    A solver works on one core, for one thread at a time, and lets other threads run meanwhile.
-    """
-
-    def factorise(self, data: NDArray[np.float64]) -> None:
-        """Factorise the matrix of the given values.
-
-        Parameters
-        ----------
-        data : ndarray, shape (nnz,)
-            Values in the order of the pattern's ``data``.
-
-        Raises
-        ------
-        NotPositiveDefinite
-            Then there is no factorisation to solve with.
-        """
-
-    def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Solve with the last factorisation.
-
-        Parameters
-        ----------
-        rhs : ndarray, shape (n,) or (n, k)
-            All k together take half the time of one after the other.
-
-        Returns
-        -------
-        x : ndarray, same shape
-        """
-
-
-def sparse_solver(pattern: csr_matrix) -> SparseSolver:
-    """Return the fastest solver this machine has.
+    It works on one core, for one thread at a time, and lets other threads run meanwhile.  Minimum
+    degree leaves less fill in small systems, nested dissection in large ones (5 889 unknowns: 17
+    against 23 ms; 39 480: 1660 against 570 ms), so both are tried.
 
     Parameters
     ----------
     pattern : csr_matrix, shape (n, n)
         Both triangles with the whole diagonal, column indices sorted; values do not matter.
-    """
-    return Pardiso(pattern) if mkl() else ScipyLU(pattern)
-
-
-class Pardiso:
-    """PARDISO of Intel's MKL: supernodal Cholesky factorisation.
-
-    Minimum degree leaves less fill in small systems, nested dissection in large ones (5 889
-    unknowns: 17 against 23 ms; 39 480: 1660 against 570 ms), so both are tried.
     """
 
     def __init__(self, pattern: csr_matrix) -> None:
@@ -109,7 +59,18 @@ class Pardiso:
         weakref.finalize(self, self._job, _PardisoJob.RELEASE)
 
     def factorise(self, data: NDArray[np.float64]) -> None:
-        """Factorise the matrix of the given values; see `SparseSolver`."""
+        """Factorise the matrix of the given values.
+
+        Parameters
+        ----------
+        data : ndarray, shape (nnz,)
+            Values in the order of the pattern's ``data``.
+
+        Raises
+        ------
+        NotPositiveDefinite
+            Then there is no factorisation to solve with.
+        """
         np.take(data, self._upper, out=self._job.values)
         # PARDISO takes a NaN for a positive pivot.
         if not np.isfinite(self._job.values).all():
@@ -117,7 +78,10 @@ class Pardiso:
         self._job(_PardisoJob.FACTORISE)
 
     def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Solve with the last factorisation; see `SparseSolver`."""
+        """Solve with the last factorisation, for right-hand sides (n,) or (n, k).
+
+        All k together take half the time of one after the other.
+        """
         rhs = np.asfortranarray(rhs, dtype=np.float64)
         x = np.empty_like(rhs, order="F")
         self._job(_PardisoJob.SOLVE, rhs, x)
@@ -160,24 +124,14 @@ class _PardisoJob:
         assert library is not None
         columns = 1 if rhs is None or rhs.ndim == 1 else rhs.shape[1]
         error = ctypes.c_int32()
+        # one matrix of the pattern and that the first; no ordering of our own; print nothing
+        one, silent = _integer(1), _integer(0)
         library.pardiso(
-            _pointer(self._handle),
-            _integer(1),  # matrices that share the pattern
-            _integer(1),  # which of them
-            _integer(self._SYMMETRIC_POSITIVE_DEFINITE),
-            _integer(phase),
-            _integer(self._starts.size - 1),
-            _pointer(self.values),
-            _pointer(self._starts),
-            _pointer(self._columns),
-            None,  # no ordering of our own
-            _integer(columns),
-            _pointer(self._settings),
-            _integer(0),  # print nothing
-            _pointer(rhs),
-            _pointer(x),
-            ctypes.byref(error),
-        )
+            _pointer(self._handle), one, one, _integer(self._SYMMETRIC_POSITIVE_DEFINITE),
+            _integer(phase), _integer(self._starts.size - 1), _pointer(self.values),
+            _pointer(self._starts), _pointer(self._columns), None, _integer(columns),
+            _pointer(self._settings), silent, _pointer(rhs), _pointer(x), ctypes.byref(error),
+        )  # fmt: skip
         if error.value == self._NEGATIVE_PIVOT:
             raise NotPositiveDefinite
         if error.value:
@@ -217,7 +171,7 @@ class ScipyLU:
         self._factors: SuperLU | None = None
 
     def factorise(self, data: NDArray[np.float64]) -> None:
-        """Factorise the matrix of the given values; see `SparseSolver`."""
+        """See ``Pardiso``."""
         self._matrix.data[:] = data
         try:
             self._factors = splu(
@@ -233,6 +187,15 @@ class ScipyLU:
             raise NotPositiveDefinite
 
     def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Solve with the last factorisation; see `SparseSolver`."""
+        """See ``Pardiso``."""
         assert self._factors is not None, "factorise first"
         return self._factors.solve(rhs)
+
+
+SparseSolver = Pardiso | ScipyLU
+"""A symmetric matrix of fixed sparsity, factorised anew whenever its values change."""
+
+
+def sparse_solver(pattern: csr_matrix) -> SparseSolver:
+    """Return the fastest solver that this machine has for matrices of a pattern."""
+    return Pardiso(pattern) if mkl() else ScipyLU(pattern)

@@ -6,7 +6,6 @@ Nodes, elements and faces are numbered by the lattice, first index slowest; degr
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +21,8 @@ from palpate.shared.geometry.elements import (
     quadrilateral,
     shape,
 )
-from palpate.shared.scene import Block, Extrusion, Patch, Scene, SceneError, divisions_of
+from palpate.shared.geometry.surface import Surface
+from palpate.shared.scene import Extrusion, Patch, Scene, SceneError, divisions_of
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -31,29 +31,19 @@ Ints = NDArray[np.int32]
 # the order in which a geometry names its sides.
 HEX_FACES = ((0, 4, 7, 3), (1, 2, 6, 5), (0, 1, 5, 4), (3, 7, 6, 2), (0, 3, 2, 1), (4, 5, 6, 7))
 
+SUBDIVISIONS = {4: 2, 8: 4}
+"""Squares per face edge: a straight face needs few, a curved one enough to be smooth to 0.01 mm."""
+
 
 @dataclass(frozen=True)
 class Mesh:
-    """A body of n nodes, e elements and f boundary faces.
+    """A body of n nodes, e elements and f boundary faces."""
 
-    Attributes
-    ----------
-    nodes : ndarray, shape (n, 3), mm
-    elements : ndarray, shape (e, 8) or (e, 20)
-        VTK hexahedron or quadratic hexahedron.
-    faces : ndarray, shape (f, 4) or (f, 8)
-        VTK quad or quadratic quad, outward by the right-hand rule.
-    clamped : ndarray, shape (n,), bool
-        Nodes held fixed.
-    accessible : ndarray, shape (f,), bool
-        Faces an endoscope can touch.
-    """
-
-    nodes: Floats
-    elements: Ints
-    faces: Ints
-    clamped: NDArray[np.bool_]
-    accessible: NDArray[np.bool_]
+    nodes: Floats  # (n, 3) mm
+    elements: Ints  # (e, 8) VTK hexahedra or (e, 20) quadratic hexahedra
+    faces: Ints  # (f, 4) VTK quads or (f, 8) quadratic quads, outward by the right-hand rule
+    clamped: NDArray[np.bool_]  # (n,) nodes held fixed
+    accessible: NDArray[np.bool_]  # (f,) faces an endoscope can touch
 
 
 def build_mesh(scene: Scene) -> Mesh:
@@ -64,17 +54,16 @@ def build_mesh(scene: Scene) -> Mesh:
     SceneError
         If the section cannot be read or meshed, or if support or surface hold no face.
     """
-    geometry = scene.geometry
+    geometry, divisions = scene.geometry, divisions_of(scene.geometry)
     if isinstance(geometry, Extrusion):
         # Along the section, along y, through the section: right-handed in this order.
-        along, through, length = divisions_of(geometry)
-        divisions, body = (along, length, through), _extrusion(scene, geometry)
-    else:
-        divisions, body = divisions_of(geometry), _block(geometry)
+        divisions = divisions[0], divisions[2], divisions[1]
     reference = HEX20_NODES if geometry.element == "hex20" else HEX_CORNERS
     parameters, elements, faces, sides = _lattice(divisions, reference)
-    nodes = body(parameters)
-
+    if isinstance(geometry, Extrusion):
+        nodes = _extruded(scene, geometry, parameters)
+    else:
+        nodes = parameters * np.array(geometry.size)
     centres = nodes[faces[:, :4]].mean(axis=1)
 
     def patch(name: str, patch: Patch) -> NDArray[np.bool_]:
@@ -93,43 +82,23 @@ def build_mesh(scene: Scene) -> Mesh:
     return Mesh(nodes, elements, faces, clamped, patch("surface", scene.surface))
 
 
-def _extrusion(scene: Scene, geometry: Extrusion) -> Callable[[Floats], Floats]:
+def _extruded(scene: Scene, geometry: Extrusion, parameters: Floats) -> Floats:
+    """Points (n, 3) mm of an extrusion for parameters in the unit cube."""
     if scene.folder is None:
         raise SceneError("geometry.section: the scene's folder is not known")
     section = map_section(read_outline(scene.folder / geometry.section), geometry.corners)
-
-    def body(parameters: Floats) -> Floats:
-        u, w, v = parameters.T
-        x, z = section(u, 1 - (1 - v) ** geometry.grading).T
-        return np.column_stack([x, geometry.length * w, z])
-
-    return body
-
-
-def _block(geometry: Block) -> Callable[[Floats], Floats]:
-    return lambda parameters: parameters * np.array(geometry.size)
+    u, w, v = parameters.T
+    x, z = section(u, 1 - (1 - v) ** geometry.grading).T
+    return np.column_stack([x, geometry.length * w, z])
 
 
 def _lattice(
     divisions: tuple[int, int, int], reference: Floats
 ) -> tuple[Floats, Ints, Ints, NDArray[np.int64]]:
-    """Cut the unit cube into hexahedra.
+    """Cut the unit cube into hexahedra whose nodes on [-1, 1]³ are ``reference`` (8 or 20, 3).
 
-    Parameters
-    ----------
-    divisions : tuple of 3 int
-        Elements along each axis.
-    reference : ndarray, shape (8 or 20, 3)
-        Nodes of the element on [-1, 1]³.
-
-    Returns
-    -------
-    parameters : ndarray, shape (n, 3)
-        Nodes in the unit cube.
-    elements, faces : ndarray, int32
-        As in `Mesh`.
-    sides : ndarray, shape (f,)
-        On which side each face lies, as an index into the sides of a geometry.
+    Returns the nodes (n, 3) in the unit cube, elements and faces as in ``Mesh``, and on which side
+    each face lies (f,), as an index into the sides of a geometry.
     """
     steps = 1 if len(reference) == 8 else 2
     grid = steps * np.array(divisions) + 1
@@ -197,21 +166,10 @@ def jacobians(mesh: Mesh, points: int) -> tuple[Floats, Floats]:
 
 
 def local_thickness(mesh: Mesh, points: Floats, normals: Floats) -> Floats:
-    """How thick the body is under points of its surface.
+    """How thick the body is (p,) mm under points (p, 3) of its boundary of given outward normals.
 
-    Parameters
-    ----------
-    mesh : Mesh
-    points : ndarray, shape (p, 3), mm
-        On the boundary.
-    normals : ndarray, shape (p, 3)
-        Outward unit normals there.
-
-    Returns
-    -------
-    thickness : ndarray, shape (p,), mm
-        Diameter of the largest ball that touches the surface at the point from inside and does not
-        reach through the opposite side; inf where there is none.
+    This is the diameter of the largest ball that touches the surface at the point from inside and
+    does not reach through the opposite side; inf where there is none.
 
     Notes
     -----
@@ -233,3 +191,32 @@ def local_thickness(mesh: Mesh, points: Floats, normals: Floats) -> Floats:
         diameter = np.sum(across**2, axis=1)[depth > 0] / depth[depth > 0]
         thickness[i] = diameter.min(initial=np.inf)
     return thickness
+
+
+def _nodal_normals(mesh: Mesh, faces: NDArray[np.int32]) -> Floats:
+    """Outward unit normals (nodes, 3): area-weighted mean over the given faces, 0 elsewhere."""
+    reference = quadrilateral(faces.shape[1])
+    _, dN = shape(reference, reference)
+    tangents = np.einsum("fai,qaj->fqij", mesh.nodes[faces], dN)
+    normals = np.zeros_like(mesh.nodes)
+    np.add.at(normals, faces, np.cross(tangents[..., 0], tangents[..., 1]))
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return normals / np.where(length > 0, length, 1)
+
+
+def accessible_surface(mesh: Mesh) -> Surface:
+    """The surface an endoscope can touch, subdivided so that it follows curved faces."""
+    faces = mesh.faces[mesh.accessible]
+    cells = SUBDIVISIONS[faces.shape[1]]
+    ticks = np.linspace(-1, 1, cells + 1)
+    grid = np.array([(x, y) for y in ticks for x in ticks])
+    N, _ = shape(quadrilateral(faces.shape[1]), grid)
+    points = np.einsum("qa,fai->fqi", N, mesh.nodes[faces]).reshape(-1, 3)
+    normals = np.einsum("qa,fai->fqi", N, _nodal_normals(mesh, faces)[faces]).reshape(-1, 3)
+    corner = np.arange((cells + 1) * cells).reshape(cells, cells + 1)[:, :-1].ravel()
+    squares = corner[:, None] + np.array([0, 1, cells + 2, cells + 1])
+    quads = (squares[None] + len(grid) * np.arange(len(faces))[:, None, None]).reshape(-1, 4)
+    _, first, weld = np.unique(points.round(9), axis=0, return_index=True, return_inverse=True)
+    triangles = weld[np.vstack([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])]
+    unit = normals[first] / np.linalg.norm(normals[first], axis=1, keepdims=True)
+    return Surface(points[first], triangles.astype(np.int32), unit)

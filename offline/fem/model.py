@@ -56,50 +56,27 @@ class NoEquilibrium(PalpateError):
 
 @dataclass(frozen=True)
 class Equilibrium:
-    """A converged state of the full model.
+    """A converged state of the full model, what the tool feels there, and how it was found."""
 
-    Attributes
-    ----------
-    displacement : ndarray, shape (nodes, 3), mm
-    energy : float, mN mm
-        Potential energy there, of tissue and load.
-    past : Past
-        To go on from.
-    iterations, load_steps : int
-    min_jacobian : float
-        Smallest det F at the quadrature points.
-    force, tangent, penetration
-        What the tool feels; see ``Reaction``.
-    """
-
-    displacement: Array
-    energy: float
-    past: Past
+    displacement: Array  # (nodes, 3) mm
+    energy: float  # mN mm, potential energy of tissue and load
+    past: Past  # to go on from
     iterations: int
     load_steps: int
-    min_jacobian: float
-    force: Array
+    min_jacobian: float  # smallest det F at the quadrature points
+    force: Array  # (3,) mN, on the tool; see ``Reaction`` for these
     tangent: Array
     penetration: float
 
 
 @dataclass
 class FullModel:
-    """Full model of one mesh and tissue.
-
-    Parameters
-    ----------
-    mesh : Mesh
-    element : {"hex8", "hex8-mean-dilatation", "hex8-fbar", "hex20"}
-    tissue : AnyTissue
-    terms : tuple of Term
-        What belongs to the tissue beside its elasticity, whatever the load.
-    """
+    """Full model of one mesh and tissue."""
 
     mesh: Mesh
     element: ElementName
     tissue: AnyTissue
-    terms: tuple[Term, ...] = ()
+    terms: tuple[Term, ...] = ()  # of the tissue beside its elasticity, whatever the load
 
     @classmethod
     def of(cls, scene: Scene, mesh: Mesh) -> FullModel:
@@ -142,18 +119,15 @@ class FullModel:
         mean = np.einsum("eq,eqai->eai", weights, self.gradients)
         return np.ascontiguousarray(mean[:, None]), np.ones((len(mean), 1))
 
-    @cached_property
-    def _number(self) -> NDArray[np.int64]:
-        """Place of every dof (3 nodes,) among the free ones; -1 is clamped."""
+    def _dofs(self, nodes: NDArray[np.int32]) -> NDArray[np.int64]:
+        """Places (p, 3 k) among the free dofs of those of nodes (p, k); -1 is clamped."""
         number = np.full(3 * len(self.mesh.nodes), -1, dtype=np.int64)
         number[self.free] = np.arange(len(self.free))
-        return number
+        return number[(3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1)]
 
     def _sparsity(self) -> tuple[NDArray[np.int32], csr_matrix]:
         """CSR pattern of the free dofs and the slot in it of every element matrix entry."""
-        dofs = self._number[
-            (3 * self.mesh.elements[:, :, None] + np.arange(3)).reshape(len(self.mesh.elements), -1)
-        ]
+        dofs = self._dofs(self.mesh.elements)
         rows = np.repeat(dofs, dofs.shape[1], axis=1).ravel()
         cols = np.tile(dofs, (1, dofs.shape[1])).ravel()
         used = (rows >= 0) & (cols >= 0)
@@ -167,7 +141,7 @@ class FullModel:
 
     def face_slots(self, faces: NDArray[np.int32]) -> NDArray[np.int32]:
         """Slots (f, 3 k, 3 k) in the pattern of the dofs of faces (f, k); -1 is clamped."""
-        dofs = self._number[(3 * faces[:, :, None] + np.arange(3)).reshape(len(faces), -1)]
+        dofs = self._dofs(faces)
         rows = np.broadcast_to(dofs[:, :, None], (*dofs.shape, dofs.shape[1]))
         cols = np.swapaxes(rows, 1, 2)
         n = len(self.free)
@@ -176,12 +150,13 @@ class FullModel:
         return np.where((rows >= 0) & (cols >= 0), slots, -1).astype(np.int32)
 
     @property
-    def _elasticity(self) -> tuple[Any, ...]:
-        """What the loops of ``assembly`` over the elements have in common."""
+    def _elasticity(self) -> tuple[Any, Any, tuple[Any, ...]]:
+        """Loops of ``assembly`` over the elements, for force and stiffness; what both need."""
         mesh = self.connectivity, self.gradients, self.weights
         if self.element in POINTWISE:
-            return *mesh, self.law
-        return *mesh, *self._theta, self.law
+            return assembly.standard_residual, assembly.standard_tangent, (*mesh, self.law)
+        own = *mesh, *self._theta, self.law
+        return assembly.dilatation_residual, assembly.dilatation_tangent, own
 
     def internal(self, displacement: Array, force: Array) -> tuple[float, float]:
         """Write the internal force (3 nodes,) mN of a displacement (3 nodes,) mm.
@@ -192,12 +167,8 @@ class FullModel:
             Stored energy (mN mm) and smallest det F.
         """
         force[:] = 0.0
-        loop: Any = (
-            assembly.standard_residual
-            if self.element in POINTWISE
-            else assembly.dilatation_residual
-        )
-        energy, smallest = loop(*self._elasticity, displacement, force)
+        loop, _, elements = self._elasticity
+        energy, smallest = loop(*elements, displacement, force)
         if smallest > 0.0:
             energy += sum(term.add_force(displacement, force) for term in self.terms)
         return energy, smallest
@@ -234,11 +205,9 @@ class FullModel:
         return csr_matrix((data, self.pattern.indices, self.pattern.indptr), copy=False)
 
     def add_stiffness(self, displacement: Array, data: Array) -> None:
-        """Add the tangent stiffness of the tissue; see ``Term``."""
-        loop: Any = (
-            assembly.standard_tangent if self.element in POINTWISE else assembly.dilatation_tangent
-        )
-        loop(*self._elasticity, displacement, self.slots, data)
+        """Add the tangent stiffness of the tissue; see ``terms.DeadLoad``."""
+        _, loop, elements = self._elasticity
+        loop(*elements, displacement, self.slots, data)
         for term in self.terms:
             term.add_stiffness(displacement, data, False)
 
@@ -246,6 +215,12 @@ class FullModel:
     def rest_stiffness(self) -> csr_matrix:
         """Stiffness (mN/mm) of the free dofs at rest."""
         return self.stiffness(np.zeros(3 * len(self.mesh.nodes)))
+
+    @cached_property
+    def deviatoric_stiffness(self) -> csr_matrix:
+        """Part of the rest stiffness that relaxes: nothing else does."""
+        share = sum(g for g, _ in self.prony)
+        return (self.rest_stiffness - self.relaxed.rest_stiffness) / share
 
     @cached_property
     def _rest_solver(self) -> SparseSolver:
@@ -257,29 +232,12 @@ class FullModel:
         """Linear response (free dofs, k) mm to loads (free dofs, k) mN: rest stiffness."""
         return self._rest_solver.solve(loads)
 
-    def relative_residuals(self, displacements: Array, loads: Array) -> Array:
-        """What displacements (k, free dofs) mm leave of loads (k, free dofs) mN, relative to them.
-
-        Both are measured as displacements in the energy of the rest state; infinite where the
-        displacement inverts an element.
-        """
-        left, sound = np.zeros_like(loads), np.ones(len(loads), dtype=bool)
-        for i, (u, load) in enumerate(zip(displacements, loads, strict=True)):
-            try:
-                left[i] = load - self.internal_free(u)
-            except PalpateError:
-                sound[i] = False
-        energies = np.sum(left.T * self.solve_linear(left.T), axis=0)
-        own = np.sum(displacements.T * (self.rest_stiffness @ displacements.T), axis=0)
-        return np.where(sound, np.sqrt(energies / own), np.inf)
-
     def solve(
         self,
         load: AppliedLoad | Array,
         past: Past | None = None,
         dt: float = 0.0,
         start: Array | None = None,
-        reuse: float = KEEP_TANGENT,
         smallest_step: float = SMALLEST_STEP,
     ) -> Equilibrium:
         """Equilibrium under a load, in one jump if that converges, else in load steps.
@@ -294,10 +252,8 @@ class FullModel:
             Since the end of the past.  May be 0, for a sudden change, or infinite.
         start : ndarray, shape (nodes, 3), mm, optional
             First guess; the last displacement of the past if absent.
-        reuse : float
-            See ``mechanics.newton.newton``.
         smallest_step : float
-            Fraction of the load below which a step is given up.
+            See ``SMALLEST_STEP``.
 
         Raises
         ------
@@ -324,7 +280,7 @@ class FullModel:
             fraction = min(1.0, reached + step)
             potential = Potential(self, [load.at(fraction), *tissue])
             status, made, energy, smallest = newton.newton(
-                potential, u, np.empty((4, len(u))), target, reuse, MAX_ITERATIONS, False,
+                potential, u, np.empty((4, len(u))), target, KEEP_TANGENT, MAX_ITERATIONS, False,
                 noise=noise,
             )  # fmt: skip
             iterations, load_steps = iterations + made, load_steps + 1

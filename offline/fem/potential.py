@@ -26,11 +26,6 @@ class Potential:
     """Elastic tissue and further terms.
 
     Only one potential of a full model can be minimised at a time: they share its linear solver.
-
-    Parameters
-    ----------
-    model : FullModel
-    terms : sequence of Term
     """
 
     def __init__(self, model: FullModel, terms: Sequence[Term]) -> None:
@@ -44,7 +39,7 @@ class Potential:
     def stiffness(self, u: Array, convex: bool = False) -> csr_matrix:
         """Tangent (mN/mm) at ``u`` (free dofs,) mm, which the next call overwrites.
 
-        For ``convex`` see ``Term.add_stiffness``.
+        For ``convex`` see ``DeadLoad.add_stiffness``.
         """
         self._displacement[self.free] = u
         self._data[:] = 0.0
@@ -84,15 +79,7 @@ class Potential:
 
 
 class Projected(Potential):
-    """The same in the span of a basis.
-
-    Parameters
-    ----------
-    model, terms
-        See ``Potential``.
-    basis : ndarray, shape (free dofs, m), mm
-        Orthonormal in the energy at rest.
-    """
+    """The same in the span of a basis (free dofs, m) mm, orthonormal in the energy at rest."""
 
     def __init__(self, model: FullModel, terms: Sequence[Term], basis: Array) -> None:
         super().__init__(model, terms)

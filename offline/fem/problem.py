@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import NamedTuple
@@ -10,10 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.fem.mesh import Mesh, build_mesh
+from palpate.offline.fem.mesh import Mesh, accessible_surface, build_mesh
 from palpate.offline.fem.model import Equilibrium, FullModel, NoEquilibrium
-from palpate.offline.fem.refine import refined, twin
-from palpate.offline.fem.surface import accessible_surface
 from palpate.offline.fem.terms import DeadLoad, Past, TipContact, TipLoad
 from palpate.shared.artifact import Artifact
 from palpate.shared.geometry.quadrature import stress_recovery
@@ -21,7 +19,7 @@ from palpate.shared.geometry.surface import Surface
 from palpate.shared.local_models import Body
 from palpate.shared.mechanics.footprint import footprint
 from palpate.shared.mechanics.sphere import tip_of, tip_surface
-from palpate.shared.mechanics.stress import StressRecovery, nodal_von_mises, nodal_von_mises_after
+from palpate.shared.mechanics.stress import StressRecovery, nodal_von_mises
 from palpate.shared.scene import Scene, parse_scene
 
 Array = NDArray[np.float64]
@@ -59,14 +57,7 @@ class Reference(NamedTuple):
 
 
 class FullProblem:
-    """The full model of a scene and what it needs to be pressed.
-
-    Parameters
-    ----------
-    scene : Scene
-    mesh : Mesh, optional
-        Built from the scene if absent.
-    """
+    """The full model of a scene, on its mesh unless another is given, and what presses it."""
 
     def __init__(self, scene: Scene, mesh: Mesh | None = None) -> None:
         self.scene = scene
@@ -98,11 +89,6 @@ class FullProblem:
         outside[layer] = False
         return outside
 
-    @cached_property
-    def remeshed(self) -> tuple[FullProblem, FullProblem]:
-        """The scene on a mesh of the other element that does not lock, and on a finer one."""
-        return FullProblem(twin(self.scene)), FullProblem(refined(self.scene))
-
     # --- loads ---------------------------------------------------------------------------------
 
     def unit_load(self, position: Array) -> tuple[Array, Array]:
@@ -119,6 +105,12 @@ class FullProblem:
         """Nodal forces (n, 3) mN."""
         nodal, _ = self.unit_load(load.position)
         return load.pressure * nodal[:, None] * load.direction
+
+    def load(self, step: Step) -> DeadLoad | TipLoad:
+        """What the endoscope does, as a term of the potential."""
+        if isinstance(step, Load):
+            return DeadLoad(self.load_vector(step).reshape(-1))
+        return self.tip_load(step.position)
 
     @cached_property
     def contact(self) -> TipContact:
@@ -140,53 +132,34 @@ class FullProblem:
         self, step: Step, past: Past | None = None, start: Array | None = None
     ) -> Equilibrium:
         """Full solution at the end of a time step; see ``FullModel.solve``."""
-        load: DeadLoad | TipLoad = (
-            DeadLoad(self.load_vector(step).reshape(-1))
-            if isinstance(step, Load)
-            else self.tip_load(step.position)
-        )
-        return self.model.solve(load, past, step.dt, start)
+        return self.model.solve(self.load(step), past, step.dt, start)
 
     def press_at(
         self, x: Array, normal: Array, traction: Array, start: Array | None = None
     ) -> tuple[Array, Array]:
         """Displacement (n, 3) mm, and its mean (3,) under the footprint, at a given contact point.
 
-        The point may be one of another mesh, whose accessible surface ends elsewhere.
-
-        Parameters
-        ----------
-        x, normal : ndarray, shape (3,)
-        traction : ndarray, shape (3,), kPa
-            Direction times pressure at the footprint's centre.
-        start : ndarray, shape (n, 3), optional
+        The point may be one of another mesh, whose accessible surface ends elsewhere; ``traction``
+        (3,) kPa is direction times pressure at the footprint's centre.
         """
         nodal = self.unit_load_at(x, normal)
         displacement = self.model.solve(np.outer(nodal, traction), start=start).displacement
         return displacement, nodal @ displacement / nodal.sum()
 
-    def follow(self, steps: Sequence[Step], start: Array | None = None) -> Iterator[Equilibrium]:
-        """Full solutions of one step after the other, the first from a guess ``start`` (n, 3)."""
-        past = None
-        for step in steps:
-            found = self.solve(step, past, start)
-            yield found
-            past, start = found.past, None
-
     def reference(self, steps: Sequence[Step], start: Array | None = None) -> Reference | None:
-        """What a reduced model is compared with, None where there is no equilibrium."""
-        try:
-            rows = [
-                (
-                    found.displacement.astype(np.float32),
-                    self.von_mises(found.displacement, found.past).astype(np.float32),
-                    found.force,
-                    found.tangent,
-                )
-                for found in self.follow(steps, start)
-            ]
-        except NoEquilibrium:
-            return None
+        """What a reduced model is compared with, None where there is no equilibrium.
+
+        The first solution is sought from a guess ``start`` (n, 3) mm.
+        """
+        rows, past = [], None
+        for step in steps:
+            try:
+                found = self.solve(step, past, start)
+            except NoEquilibrium:
+                return None
+            u, past, start = found.displacement, found.past, None
+            fields = u.astype(np.float32), self.von_mises(u, past).astype(np.float32)
+            rows.append((*fields, found.force, found.tangent))
         return Reference(*(np.array(part) for part in zip(*rows, strict=True)))
 
     @cached_property
@@ -196,12 +169,11 @@ class FullProblem:
     def von_mises(self, displacement: Array, past: Past | None = None) -> Array:
         """Nodal von Mises stress (n,) kPa at a displacement (n, 3) mm, with which a past ends."""
         out, u = np.zeros(len(self.mesh.nodes)), np.ascontiguousarray(displacement, dtype=float)
-        if past is None or not self.model.prony:
-            nodal_von_mises(self._recovery, u, out)
-            return out
-        shares = np.array([share for share, _ in self.model.prony])
-        lost = np.einsum("a,aeqi->eiq", shares, past.points[:-1])
-        nodal_von_mises_after(self._recovery, u, np.ascontiguousarray(lost), out)
+        B = None
+        if past is not None and self.model.prony:
+            shares = np.array([share for share, _ in self.model.prony])
+            B = np.ascontiguousarray(np.einsum("a,aeqi->eiq", shares, past.points[:-1]))
+        nodal_von_mises(self._recovery, u, B, out)
         return out
 
     def under(self, position: Array, displacement: Array) -> Array:

@@ -27,17 +27,10 @@ LEVELS = ((18, 3), (36, 6), (72, 12))
 
 
 def read_outline(path: Path) -> Floats:
-    """Read a closed outline from a CSV file with one header line.
+    """Read a closed outline (n, 2) mm, clockwise when x points right and z up.
 
-    Parameters
-    ----------
-    path : Path
-        Two columns, x and z in mm; the last point is joined to the first.
-
-    Returns
-    -------
-    points : ndarray, shape (n, 2), mm
-        The outline, clockwise when x points right and z up.
+    The CSV file has one header line and two columns, x and z; the last point is joined to the
+    first.
 
     Raises
     ------
@@ -54,8 +47,9 @@ def read_outline(path: Path) -> Floats:
         raise SceneError(f"geometry.section: {path} repeats a point")
     crossing = _first_crossing(points)
     if crossing is not None:
+        one, other = crossing
         raise SceneError(
-            "geometry.section: {} crosses itself between points {} and {}".format(path, *crossing)
+            f"geometry.section: {path} crosses itself between points {one} and {other}"
         )
     return points if polygon_area(points) < 0 else points[::-1]
 
@@ -138,13 +132,7 @@ def map_section(points: Floats, corners: ArrayLike) -> SectionMap:
 
 
 class _Boundary:
-    """A smooth outline cut into four sides.
-
-    Attributes
-    ----------
-    outer, tip, inner, lip : float, mm
-        Arc lengths of the sides.
-    """
+    """A smooth outline cut into four sides, of arc lengths ``outer, tip, inner, lip`` (mm)."""
 
     def __init__(self, points: Floats, corners: ArrayLike) -> None:
         closed = np.vstack([points, points[:1]])
@@ -166,14 +154,9 @@ class _Boundary:
         return 2 * cells / np.array([self.outer + self.inner, self.tip + self.lip])
 
     def place(self, grid: Floats, slid: Floats) -> None:
-        """Put the rim of a grid onto the outline.
+        """Put the rim of a grid (nu + 1, nv + 1, 2) mm onto the outline.
 
-        Parameters
-        ----------
-        grid : ndarray, shape (nu + 1, nv + 1, 2), mm
-            Overwritten on its rim.
-        slid : ndarray, shape (nu - 1,), mm
-            Where its inner nodes lie along the inner side, counted from the lip.
+        ``slid`` (nu - 1,) mm is where its inner nodes lie along the inner side, from the lip.
         """
         u, v = _uniform((grid.shape[0] - 1, grid.shape[1] - 1))
         grid[:, -1] = self._at(0, self.outer * u)
@@ -240,13 +223,8 @@ def _smooth(
 def _mean_ratio(grid: Floats, scale: Floats, epsilon: float) -> tuple[float, Floats, float]:
     """Mean ratio energy of a grid, its gradient, and the smallest scaled corner determinant.
 
-    Parameters
-    ----------
-    grid : ndarray, shape (nu + 1, nv + 1, 2), mm
-    scale : ndarray, shape (2,), 1/mm
-        Inverse of the wanted cell size along the two grid directions.
-    epsilon : float
-        Regularisation of folded cells, > 0.
+    ``scale`` (2,) 1/mm is the inverse of the wanted cell size along the two grid directions,
+    ``epsilon`` > 0 regularises folded cells.
     """
     gradient = np.zeros_like(grid)
     energy, smallest = 0.0, np.inf

@@ -8,7 +8,7 @@ and knows nothing of other terms.  The elastic tissue is the term that every bod
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar, NamedTuple, Protocol
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,12 +24,30 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-class Term(Protocol):
-    """A part of the potential energy of a body."""
+class Reaction(NamedTuple):
+    """What the tool that loads a body feels."""
+
+    force: Array  # (3,) mN, on the tool
+    tangent: Array  # (3, 3) mN/mm, derivative of the force in the tool's position
+    penetration: float  # mm, largest
+
+
+@dataclass(frozen=True)
+class DeadLoad:
+    """Nodal forces that do not change as the body moves."""
+
+    forces: Array  # (3 nodes,) mN
+    lower: ClassVar[str] = "pressure"
+    """What a user lowers where there is no equilibrium."""
 
     @property
     def size(self) -> float:
         """Force (mN) beside which a residual is judged."""
+        return float(np.linalg.norm(self.forces))
+
+    def at(self, fraction: float) -> DeadLoad:
+        """The load on its way: nothing at 0, all of it at 1."""
+        return DeadLoad(fraction * self.forces)
 
     def add_force(self, displacement: Array, force: Array) -> float:
         """Add the gradient of the energy to ``force``; return the energy, mN mm.
@@ -40,9 +58,11 @@ class Term(Protocol):
             Nowhere inverted.
         force : ndarray, shape (3 nodes,), mN
         """
+        force -= self.forces
+        return -float(self.forces @ displacement)
 
     def add_stiffness(self, displacement: Array, data: Array, convex: bool) -> None:
-        """Add the second derivative of the energy.
+        """Add the second derivative of the energy: none.
 
         Parameters
         ----------
@@ -53,71 +73,16 @@ class Term(Protocol):
             Whether to leave out what is not positive semi-definite, where the term can tell.
         """
 
-
-class Reaction(NamedTuple):
-    """What the tool that loads a body feels."""
-
-    force: Array  # (3,) mN, on the tool
-    tangent: Array  # (3, 3) mN/mm, derivative of the force in the tool's position
-    penetration: float  # mm, largest
-
-
-class AppliedLoad(Term, Protocol):
-    """A term that can be applied little by little."""
-
-    lower: ClassVar[str]
-    """What a user lowers where there is no equilibrium."""
-
-    def at(self, fraction: float) -> AppliedLoad:
-        """The load on its way: nothing at 0, all of it at 1."""
-
     def reaction(self, potential: Potential, displacement: Array) -> Reaction:
-        """What the tool feels at an equilibrium (3 nodes,) mm of a potential with this load."""
+        """What the tool feels at an equilibrium (3 nodes,) mm of a potential with this load.
 
-
-@dataclass(frozen=True)
-class DeadLoad:
-    """Nodal forces that do not change as the body moves.
-
-    Attributes
-    ----------
-    forces : ndarray, shape (3 nodes,), mN
-    """
-
-    forces: Array
-    lower: ClassVar[str] = "pressure"
-
-    @property
-    def size(self) -> float:
-        """See ``Term``."""
-        return float(np.linalg.norm(self.forces))
-
-    def at(self, fraction: float) -> DeadLoad:
-        """See ``AppliedLoad``."""
-        return DeadLoad(fraction * self.forces)
-
-    def add_force(self, displacement: Array, force: Array) -> float:
-        """See ``Term``."""
-        force -= self.forces
-        return -float(self.forces @ displacement)
-
-    def add_stiffness(self, displacement: Array, data: Array, convex: bool) -> None:
-        """Nothing: a dead load has none."""
-
-    def reaction(self, potential: Potential, displacement: Array) -> Reaction:
-        """See ``AppliedLoad``; the force on the tool does not change as the tool moves."""
+        The force does not change as the tool moves.
+        """
         return Reaction(-self.forces.reshape(-1, 3).sum(axis=0), np.zeros((3, 3)), 0.0)
 
 
 class TipContact:
-    """The surface of a full model where a rigid tip can touch it, with room for what it touches.
-
-    Parameters
-    ----------
-    model : FullModel
-    surface : TipSurface
-    tip : Tip
-    """
+    """The surface of a full model where a rigid tip can touch it, with room for what it touches."""
 
     def __init__(self, model: FullModel, surface: TipSurface, tip: Tip) -> None:
         self.tip = tip
@@ -125,7 +90,7 @@ class TipContact:
         self.size = model.tissue.young * tip.radius**2
         """The force is not known beforehand; this one dents the tissue by about the radius."""
         self._all = np.arange(len(surface.faces), dtype=np.int32)
-        self._slots = model.face_slots(surface.faces)
+        self.slots = model.face_slots(surface.faces)
         self.touching: Touching = room_for(surface, len(surface.faces))
 
     def touch(
@@ -138,53 +103,41 @@ class TipContact:
         )  # fmt: skip
         return self.surface.faces[self.touching.face[:count]], energy, deepest
 
-    def scatter(self, count: int, data: Array) -> None:
-        """Add the stiffness of the first ``count`` faces touched to CSR ``data``."""
-        slots = self._slots[self.touching.face[:count]]
-        assembly.scatter_faces(self.touching.stiffness[:count], slots, data)
-
 
 @dataclass(frozen=True)
 class TipLoad:
-    """A rigid tip held at a place, against the surface of a body.
-
-    Attributes
-    ----------
-    contact : TipContact
-    position : ndarray, shape (3,), mm
-        Centre of the tip.
-    approach : ndarray, shape (3,), mm
-        The way the tip has come: it began at ``position - approach``, without contact.
-    """
+    """A rigid tip held at a place, against the surface of a body."""
 
     contact: TipContact
-    position: Array
-    approach: Array
+    position: Array  # (3,) mm, centre of the tip
+    approach: Array  # (3,) mm, its way from ``position - approach``, where it had no contact
     lower: ClassVar[str] = "depth"
 
     @property
     def size(self) -> float:
-        """See ``Term``."""
+        """See ``DeadLoad``."""
         return self.contact.size
 
     def at(self, fraction: float) -> TipLoad:
-        """See ``AppliedLoad``."""
+        """See ``DeadLoad``."""
         return replace(self, position=self.position - (1.0 - fraction) * self.approach)
 
     def add_force(self, displacement: Array, force: Array) -> float:
-        """See ``Term``; the energy is that of the penalty."""
+        """See ``DeadLoad``; the energy is that of the penalty."""
         faces, energy, _ = self.contact.touch(self.position, displacement, sphere.FORCE)
         np.subtract.at(force.reshape(-1, 3), faces, self.contact.touching.force[: len(faces)])
         return energy
 
     def add_stiffness(self, displacement: Array, data: Array, convex: bool) -> None:
-        """See ``Term``."""
+        """See ``DeadLoad``."""
         wanted = sphere.CONVEX if convex else sphere.STIFFNESS
         faces, _, _ = self.contact.touch(self.position, displacement, wanted)
-        self.contact.scatter(len(faces), data)
+        touching = self.contact.touching
+        slots = self.contact.slots[touching.face[: len(faces)]]
+        assembly.scatter_faces(touching.stiffness[: len(faces)], slots, data)
 
     def reaction(self, potential: Potential, displacement: Array) -> Reaction:
-        """See ``AppliedLoad``.
+        """See ``DeadLoad``.
 
         With ``own`` the second derivative of the potential in the tip's position and ``coupling``
         minus the mixed one, the tangent is ``coupling^T K^-1 coupling - own``.
@@ -214,15 +167,7 @@ class Past:
 
 
 class PastStress:
-    """What a past does to the stress at the end of a time step.
-
-    Parameters
-    ----------
-    model : FullModel
-    past : Past
-    weights : Weights
-        Of the time step.
-    """
+    """What a past does to the stress at the end of a time step of given weights."""
 
     def __init__(self, model: FullModel, past: Past, weights: viscosity.Weights) -> None:
         self._mesh = model.connectivity, model.gradients, model.weights, model.law.mu
@@ -236,12 +181,12 @@ class PastStress:
         self.size = float(np.linalg.norm(force[model.free]))
 
     def add_force(self, displacement: Array, force: Array) -> float:
-        """See ``Term``."""
+        """See ``DeadLoad``."""
         energy: float = assembly.viscous_residual(*self._mesh, self._B, displacement, force)
         return energy
 
     def add_stiffness(self, displacement: Array, data: Array, convex: bool) -> None:
-        """See ``Term``."""
+        """See ``DeadLoad``."""
         assembly.viscous_tangent(*self._mesh, self._B, displacement, self._slots, data)
 
 
@@ -254,3 +199,10 @@ def advanced(model: FullModel, past: Past, displacement: Array, weights: viscosi
     assembly.drive(model.connectivity, model.gradients, displacement.reshape(-1), m)
     viscosity.advance(m.reshape(-1), weights, points.reshape(len(points), -1))
     return Past(displacement, points)
+
+
+AppliedLoad = DeadLoad | TipLoad
+"""A term that can be applied little by little."""
+
+Term = AppliedLoad | PastStress
+"""A part of the potential energy of a body."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,66 +21,44 @@ from palpate.offline.methods.cubatures import PointForces, point_forces
 from palpate.offline.methods.deim import Deim, PlainNewton, force_modes, sample
 from palpate.offline.methods.full import Full, Remeshed
 from palpate.offline.methods.galerkin import Galerkin, GalerkinAtHand
-from palpate.offline.methods.lattice import scaled
 from palpate.offline.methods.mass_spring import MassSpring
-from palpate.offline.methods.method import Case, Method, Snapshots
+from palpate.offline.methods.method import Case, Method, Snapshots, pressed_nodes
 from palpate.offline.methods.regression import Linear, Regression, compliance
 from palpate.offline.methods.shipped import Shipped, Way
 from palpate.offline.methods.spaces import Inner, krylov, mass, modal, pod, static_derivatives
-from palpate.offline.methods.tensor_mass import TensorMass
+from palpate.offline.methods.tetrahedra import TensorMass
 from palpate.offline.reduce.ritz import TANGENTIAL
 from palpate.offline.reduce.sampling import spread_points, tangents
 from palpate.shared.errors import PalpateError
 from palpate.shared.model import ReducedModel
-from palpate.shared.scene import Scene
 
 Array = NDArray[np.float64]
 
 FOOTPRINTS = 128
 """Footprints whose loads make bases: spread over the surface, and so are the first few of them."""
 
-MOMENTS = 3
-"""Blocks of a Krylov basis, which therefore takes a third of the loads of a ritz basis."""
-
-POINTS_PER_MODE, ELEMENTS_PER_MODE = 6, 2
-"""Most points, or elements, of an empirical cubature."""
-
+MOMENTS = 3  # blocks of a Krylov basis, which therefore takes a third of the loads of a ritz basis
+POINTS_PER_MODE, ELEMENTS_PER_MODE = 6, 2  # most points, or elements, of an empirical cubature
 SAMPLES_PER_MODE = 3
 """Sampled dofs per force mode where the internal force is fitted instead of interpolated."""
 
-CASES = 100
-"""Snapshots whose loads train a cubature."""
+CASES = 100  # snapshots whose loads train a cubature
 
 
 @dataclass(frozen=True)
 class Training:
-    """What methods learn from.
+    """What methods learn from."""
 
-    Attributes
-    ----------
-    atlas : ReducedModel, optional
-        The artifact of the same mesh, for the methods that query it.
-    scene : Scene, optional
-        With its files, for the full model on other meshes.
-    in_time : bool
-        Whether the methods that can are built to remember what happened before.
-    """
-
-    problem: FullProblem
+    problem: FullProblem  # with the scene's files, if there are to be methods on other meshes
     snapshots: Snapshots
-    atlas: ReducedModel | None = None
+    atlas: ReducedModel | None = None  # of the same mesh, for the methods that query it
     seed: int = 0
-    scene: Scene | None = None
-    in_time: bool = False
+    in_time: bool = False  # whether the methods that can remember what happened before
 
     @property
     def model(self) -> FullModel:
-        """The full model, to train with."""
+        """The full model."""
         return self.problem.model
-
-    def own_model(self) -> FullModel:
-        """A full model that nobody else solves with, so that it keeps its factorisation."""
-        return FullModel.of(self.problem.scene, self.problem.mesh)
 
     def rng(self, *stage: int) -> np.random.Generator:
         """Random numbers of a stage, the same whatever was built before."""
@@ -87,7 +66,7 @@ class Training:
 
     @cached_property
     def mass(self) -> csr_matrix:
-        """Mass of the free dofs; see ``offline.methods.spaces.mass``."""
+        """See ``offline.methods.spaces``."""
         return mass(self.model)
 
     @cached_property
@@ -115,21 +94,6 @@ class Training:
         return point_forces(Galerkin(self.problem, basis), cases, self.rng(basis.shape[1]))
 
 
-def build(name: str, size: float, training: Training) -> Method:
-    """Make a method.
-
-    Parameters
-    ----------
-    name : str
-        A key of ``BUILDERS``.
-    size : float
-        Number of unknowns, or fewer if there are no more; for the methods of ``MESHED``, the
-        factor on the divisions of the scene's mesh.  The artifact comes in one size only.
-    training : Training
-    """
-    return MESHED[name](size, training) if name in MESHED else BUILDERS[name](int(size), training)
-
-
 # --- one basis for the whole surface -------------------------------------------------------------
 
 
@@ -142,17 +106,13 @@ def _krylov(size: int, training: Training, moments: int = MOMENTS) -> Method:
     return _every_point(training, krylov(training.model, training.mass, loads, size))
 
 
-def _pod_ecm(size: int, training: Training, points: int = POINTS_PER_MODE) -> Method:
+def _cubature(
+    size: int, training: Training, most: int = POINTS_PER_MODE, by_element: bool = False
+) -> Method:
     basis = training.pod(size)
     forces = training.point_forces(basis)
-    cubature = forces.by_point(points * basis.shape[1], training.rng(size))
-    return Galerkin(training.problem, basis, cubature)
-
-
-def _pod_ecsw(size: int, training: Training) -> Method:
-    basis = training.pod(size)
-    forces = training.point_forces(basis)
-    cubature = forces.by_element(ELEMENTS_PER_MODE * basis.shape[1], training.rng(size))
+    choose = forces.by_element if by_element else forces.by_point
+    cubature = choose(most * basis.shape[1], training.rng(size))
     return Galerkin(training.problem, basis, cubature)
 
 
@@ -167,7 +127,7 @@ def _deim(size: int, training: Training, per_mode: int = 1) -> Method:
 
 
 def _ritz_at_hand(size: int, training: Training) -> Method:
-    model, M, nodes = training.own_model(), training.mass, len(training.problem.mesh.nodes)
+    model, M, nodes = training.model, training.mass, len(training.problem.mesh.nodes)
 
     def space(case: Case) -> Array:
         return krylov(model, M, case.load(nodes).reshape(-1, 1)[model.free], size)
@@ -176,7 +136,7 @@ def _ritz_at_hand(size: int, training: Training) -> Method:
 
 
 def _derivatives(size: int, training: Training) -> Method:
-    model, problem = training.own_model(), training.problem
+    model, problem = training.model, training.problem
 
     def space(case: Case) -> Array:
         return static_derivatives(model, loads_about(problem, case)[model.free], size)
@@ -190,10 +150,11 @@ def loads_about(problem: FullProblem, case: Case) -> Array:
     Those across turn every contact's force to the side, as far as it is tilted in use.
     """
     total = np.zeros((len(problem.mesh.nodes), 3, 3))
-    for contact, share in zip(case.contacts, case.shares, strict=True):
+    for contact, foot in zip(case.contacts, case.feet, strict=True):
         frame = np.array([contact.direction, *tangents(contact.direction)])
         frame[1:] *= TANGENTIAL
-        total[case.nodes] += share[:, None, None] * frame.T
+        weights = contact.pressure * pressed_nodes(problem, *foot, case.radius)
+        total += weights[:, None, None] * frame.T
     return total.reshape(-1, 3)
 
 
@@ -208,24 +169,16 @@ def _shipped(size: int, training: Training, way: Way = "cold") -> Method:
     return Shipped(training.problem, training.atlas, way)
 
 
-def _full(factor: float, training: Training) -> Method:
-    if factor == 1:
-        return Full(training.problem)
-    if training.scene is None:
-        raise PalpateError("full: other meshes need the scene with its files")
-    return Remeshed(training.scene, factor)
-
-
-BUILDERS: dict[str, Callable[[int, Training], Method]] = {
+BUILDERS: dict[str, Callable[[Any, Training], Method]] = {
     "modal": lambda size, t: _every_point(t, modal(t.model, size)),
     "ritz": partial(_krylov, moments=1),
     "krylov": _krylov,
     "pod": lambda size, t: _every_point(t, t.pod(size)),
     "pod-euclidean": lambda size, t: _every_point(t, t.pod(size, "euclidean")),
     "pod, no line search": lambda size, t: PlainNewton(t.problem, t.pod(size)),
-    "pod-ecm": _pod_ecm,
-    "pod-ecm, 1 point a mode": partial(_pod_ecm, points=1),
-    "pod-ecsw": _pod_ecsw,
+    "pod-ecm": _cubature,
+    "pod-ecm, 1 point a mode": partial(_cubature, most=1),
+    "pod-ecsw": partial(_cubature, most=ELEMENTS_PER_MODE, by_element=True),
     "pod-deim": _deim,
     "pod-gappy": partial(_deim, per_mode=SAMPLES_PER_MODE),
     "ritz-at-hand": _ritz_at_hand,
@@ -235,12 +188,15 @@ BUILDERS: dict[str, Callable[[int, Training], Method]] = {
     "artifact": _shipped,
     "artifact, warm": partial(_shipped, way="warm"),
     "artifact, tip": partial(_shipped, way="tip"),
+    "full": lambda factor, t: Full(t.problem) if factor == 1 else Remeshed(t.problem, factor),
+    "mass-spring": lambda factor, t: MassSpring(t.problem, factor),
+    "tensor-mass": lambda factor, t: TensorMass(t.problem, factor),
 }
-"""Methods whose size is their number of unknowns."""
+"""Methods by name, from their size: the number of unknowns, or fewer if there are no more; of the
+last three, with a mesh of their own, the factor on the divisions of the scene's.  The artifact
+comes in one size only."""
 
-MESHED: dict[str, Callable[[float, Training], Method]] = {
-    "full": _full,
-    "mass-spring": lambda factor, t: MassSpring(t.problem, scaled(t.problem.scene, factor)),
-    "tensor-mass": lambda factor, t: TensorMass(t.problem, scaled(t.problem.scene, factor)),
-}
-"""Methods with a mesh of their own, whose size is the factor on the divisions of the scene's."""
+
+def build(name: str, size: float, training: Training) -> Method:
+    """Make a method, see ``BUILDERS``."""
+    return BUILDERS[name](size, training)

@@ -31,23 +31,15 @@ OFF_EQUILIBRIUM = 0.1
 LOOKS = 16
 """Random combinations of the modes' forces in one state, which are fitted instead of the forces."""
 
-EQUATIONS = 2
-"""Equations kept for every cubature point, or element, allowed."""
+EQUATIONS = 2  # equations kept for every cubature point, or element, allowed
 
 
 @dataclass(frozen=True)
 class PointForces:
-    """Contribution of every quadrature point to the sums that a cubature has to reproduce.
+    """Contribution of every quadrature point to the sums that a cubature has to reproduce."""
 
-    Attributes
-    ----------
-    contributions : ndarray, shape (points, sums), float32
-        Of the reduced model's full cubature.
-    weights : ndarray, shape (points,), mm^3
-    """
-
-    contributions: NDArray[np.float32]
-    weights: Array
+    contributions: NDArray[np.float32]  # (points, sums)
+    weights: Array  # (points,) mm^3
     per_element: int
 
     def by_point(self, most: int, rng: np.random.Generator) -> Cubature:

@@ -12,14 +12,13 @@ keeps Newton's method from running away.
 
 With ``p = k`` the fit interpolates.  With more dofs than modes it is one of least squares (gappy
 POD: Everson & Sirovich 1995), the known cure for the noise that interpolation amplifies
-(Peherstorfer, Drmac & Gugercin 2020).  The tangent stays unsymmetric, so it fails a little less
-often, no more; what cures that is a cubature of positive weights (``offline.methods.cubatures``).
+(Peherstorfer, Drmac & Gugercin 2020), which fails a little less often, no more; what cures that is
+a cubature of positive weights (``offline.methods.cubatures``).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -46,20 +45,11 @@ Array = NDArray[np.float64]
 MAX_ITERATIONS = 60
 
 
-@dataclass(frozen=True)
-class Samples:
-    """Where the internal force is sampled, and how its modes are fitted to the samples.
+class Samples(NamedTuple):
+    """Where the internal force is sampled, and how its modes are fitted to the samples."""
 
-    Attributes
-    ----------
-    dofs : ndarray, shape (p,), int
-        Rows of the force modes, in the order chosen.
-    fit : ndarray, shape (k, p)
-        Coefficients of the force modes per sampled value, ``(P^T U)^+``.
-    """
-
-    dofs: NDArray[np.int64]
-    fit: NDArray[np.floating]
+    dofs: NDArray[np.int64]  # (p,) rows of the force modes
+    fit: NDArray[np.floating]  # (k, p) coefficients of the modes per sampled value, (P^T U)^+
 
 
 def force_modes(model: FullModel, displacements: Array, size: int) -> Array:
@@ -80,12 +70,7 @@ def force_modes(model: FullModel, displacements: Array, size: int) -> Array:
 def sample(modes: Array, per_mode: int) -> Samples:
     """Greedy choice of dofs: for each force mode in turn, where those before it fit it worst.
 
-    Parameters
-    ----------
-    modes : ndarray, shape (free dofs, k)
-        Orthonormal.
-    per_mode : int
-        Dofs for each mode; 1 is the discrete empirical interpolation.
+    With one dof per mode (free dofs, k) that is the discrete empirical interpolation.
     """
     chosen: list[int] = []
     for k in range(modes.shape[1]):
@@ -131,12 +116,7 @@ def _newton(content, nodes, forces):
 class PlainNewton(Galerkin):
     """A reduced model by Newton's method without a line search: every step is taken whole.
 
-    Parameters
-    ----------
-    problem, basis, cubature
-        See ``Galerkin``.
-    functions : ndarray, shape (3 nodes, m), mm, optional
-        Test functions; those of the basis if absent, which is Galerkin's method.
+    Without test functions (3 nodes, m) mm it is Galerkin's method.
     """
 
     def __init__(
@@ -166,15 +146,7 @@ class PlainNewton(Galerkin):
 
 
 class Deim(PlainNewton):
-    """Interpolated internal force in a basis for the whole surface.
-
-    Parameters
-    ----------
-    basis : ndarray, shape (free dofs, m), mm
-        Orthonormal in the energy at rest.
-    modes : ndarray, shape (free dofs, k)
-        Of the force.
-    """
+    """Internal force interpolated by its modes (free dofs, k) in a basis for the whole surface."""
 
     def __init__(self, problem: FullProblem, basis: Array, modes: Array, samples: Samples) -> None:
         model, dofs = problem.model, problem.model.free[samples.dofs]

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
 
 from palpate.offline.fem.model import NoEquilibrium
-from palpate.offline.fem.problem import FullProblem, Load
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.terms import Past
-from palpate.offline.methods.lattice import coordinates, interpolation, lattice
-from palpate.offline.methods.method import Answer, Case, Method
-from palpate.shared.scene import Scene, divisions_of
+from palpate.offline.methods.method import Answer, Case, Method, pressed_nodes
+from palpate.shared.geometry.elements import hexahedron, shape
+from palpate.shared.scene import ElementName, Extrusion, Scene, divisions_of
 
 Array = NDArray[np.float64]
+
+SAME = 1e-9  # coordinates in the unit cube that differ by less are equal
 
 
 class Full(Method):
@@ -43,54 +46,80 @@ class Full(Method):
         return self.problem.von_mises(state.displacement, state)
 
 
-def divided(scene: Scene, factor: float) -> Scene:
-    """A scene with the divisions of its mesh times a factor, rounded up."""
-    divisions = tuple(int(np.ceil(factor * n)) for n in divisions_of(scene.geometry))
-    geometry = scene.geometry.model_copy(update={"divisions": divisions})
-    return scene.model_copy(update={"geometry": geometry})
-
-
 class Remeshed(Method):
     """Full model of a scene in another mesh, compared at the nodes of the scene's own.
 
     It finds the nodes that a contact loads by itself; other methods are given them.  The state is
-    the displacement of the other mesh's nodes.
+    the displacement (m, 3) mm of the other mesh's nodes, from which ``to_scene`` (n, m)
+    interpolates.
 
     Parameters
     ----------
-    scene : Scene
-        With its own mesh.
+    problem : FullProblem
+        Of a scene with its files.
     factor : float
-        By which the divisions of the mesh are multiplied.
+        By which the divisions of the mesh are multiplied, rounded up.
     """
 
-    def __init__(self, scene: Scene, factor: float) -> None:
-        other = divided(scene, factor)
-        self._other = FullProblem(other)
-        label = f"mesh of {' x '.join(map(str, divisions_of(other.geometry)))}"
-        super().__init__(FullProblem(scene), len(self._other.model.free), label)
-        at = coordinates(self.problem.mesh, lattice(scene))
-        self._to_scene = interpolation(at, lattice(other), self._other.mesh.elements)
+    def __init__(
+        self, problem: FullProblem, factor: float, element: ElementName | None = None
+    ) -> None:
+        geometry = problem.scene.geometry
+        divisions = tuple(int(np.ceil(factor * n - SAME)) for n in divisions_of(geometry))
+        changed = {"divisions": divisions, "element": element or geometry.element}
+        geometry = geometry.model_copy(update=changed)
+        self.other = FullProblem(problem.scene.model_copy(update={"geometry": geometry}))
+        label = f"mesh of {' x '.join(map(str, divisions))}"
+        super().__init__(problem, len(self.other.model.free), label)
+        self.to_scene = _interpolation(self.other, problem)
 
     def step(self, state: Array | None, case: Case, dt: float = 0.0) -> Answer:
         """See ``Method``."""
-        load = np.sum([self._load(contact) for contact in case.contacts], axis=0)
         try:
-            found = self._other.model.solve(load)
+            found = self.other.model.solve(self.load(case))
         except NoEquilibrium:
             return Answer(state, False)
         return Answer(found.displacement, True, found.iterations)
 
-    def _load(self, contact: Load) -> Array:
+    def load(self, case: Case) -> Array:
         """Nodal forces (m, 3) mN on the other mesh, pressed where the scene's own mesh is.
 
         The accessible surface of the other mesh ends at other faces: projected onto that, a
         contact on the rim would move.
         """
-        x, normal, _ = self.problem.surface.project(contact.position)
-        nodal = self._other.unit_load_at(x, normal)
-        return contact.pressure * nodal[:, None] * contact.direction
+        load = np.zeros_like(self.other.mesh.nodes)
+        for contact, foot in zip(case.contacts, case.feet, strict=True):
+            nodal = pressed_nodes(self.other, *foot, case.radius)
+            load += contact.pressure * nodal[:, None] * contact.direction
+        return load
 
     def field(self, state: Array) -> Array:
         """See ``Method``."""
-        return np.asarray(self._to_scene @ state)
+        return np.asarray(self.to_scene @ state)
+
+
+def lattice(scene: Scene) -> tuple[int, int, int]:
+    """Hexahedra of a scene along the axes of its mesh's lattice (see ``fem.mesh``)."""
+    along, second, third = divisions_of(scene.geometry)
+    return (
+        (along, third, second) if isinstance(scene.geometry, Extrusion) else (along, second, third)
+    )
+
+
+def _interpolation(source: FullProblem, target: FullProblem) -> csr_matrix:
+    """Matrix (n, m) that interpolates nodal values of one mesh of a body at another's nodes.
+
+    Both meshes map a lattice of the unit cube onto the body, so that a node of one is found in the
+    other by its coordinates in the cube.
+    """
+    mesh, elements = target.mesh, source.mesh.elements
+    own, divisions = lattice(target.scene), lattice(source.scene)
+    corner = np.moveaxis(np.indices(own), 0, -1).reshape(-1, 1, 3)
+    at = np.empty_like(mesh.nodes)
+    at[mesh.elements] = (corner + (hexahedron(mesh.elements.shape[1]) + 1) / 2) / own
+    cell = np.minimum((at * divisions + SAME).astype(int), np.array(divisions) - 1)
+    N, _ = shape(hexahedron(elements.shape[1]), 2.0 * (at * divisions - cell) - 1.0)
+    N[abs(N) < SAME] = 0.0
+    nodes = elements[np.ravel_multi_index(tuple(cell.T), divisions)]
+    rows = np.repeat(np.arange(len(at)), N.shape[1])
+    return csr_matrix((N.ravel(), (rows, nodes.ravel())), (len(at), len(source.mesh.nodes)))

@@ -19,21 +19,12 @@ from palpate.offline.fem.model import POINTWISE, FullModel
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.terms import Past
 from palpate.offline.methods.method import Answer, Case, Method
-from palpate.offline.reduce.viscous import deviatoric_stiffness
-from palpate.shared.compiled import bind, bind_compiled
+from palpate.shared.compiled import bind, bind_compiled, room
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.tensors import SYMMETRIC
 from palpate.shared.mechanics.viscosity import step_weights
 from palpate.shared.reduced.corrections import Secants, forget_secants
-from palpate.shared.reduced.past import (
-    Memory,
-    Remembering,
-    begin_step,
-    end_step,
-    last_answer,
-    opened,
-    remembering,
-)
+from palpate.shared.reduced.past import Elastic, Memory, Remembering, opened, remembering
 from palpate.shared.reduced.points import (
     LANES,
     STATE,
@@ -44,10 +35,9 @@ from palpate.shared.reduced.points import (
     nonlinear_stress,
     superpose,
 )
-from palpate.shared.reduced.press import ROUND_OFF, SMALLEST_TARGET, external_force
-from palpate.shared.reduced.problem import Problem, Work, descend
-from palpate.shared.reduced.terms import Dead, Elastic
-from palpate.shared.reduced.workspace import new_work
+from palpate.shared.reduced.press import ROUND_OFF, SMALLEST_TARGET
+from palpate.shared.reduced.problem import Problem, Work, newton_method
+from palpate.shared.reduced.terms import Dead
 
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
@@ -87,17 +77,11 @@ class Content(NamedTuple):
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc"})
 def point_gradients(connectivity, gradients, points, modes, out):
-    """Displacement gradients of modes at quadrature points, in the tiles of ``reduced.points``.
+    """Write displacement gradients of modes at quadrature points in tiles (``reduced.points``).
 
-    Parameters
-    ----------
-    connectivity : ndarray, shape (e, n), int32
-    gradients : ndarray, shape (e, q, n, 3), 1/mm
-    points : ndarray, shape (c,), int
-        Quadrature points, counted element by element.
-    modes : ndarray, shape (3 nodes, m), mm
-    out : ndarray, shape (>= m, 9 c), float32, 1/mm
-        With ``c`` filled up to whole tiles; what fills up is not written.
+    Of the elements' ``connectivity`` (e, n) and ``gradients`` (e, q, n, 3) 1/mm, at points (c,),
+    counted element by element, of modes (3 nodes, m) mm, to ``out`` (>= m, 9 c) 1/mm, with ``c``
+    filled up to whole tiles; what fills up is not written.
     """
     m = modes.shape[1]
     tile = np.zeros((9 * LANES, m))
@@ -152,17 +136,16 @@ def _step(content, nodes, forces, accurate):
     points, past, load, secants = content.points, content.past, content.load, content.secants
     q, work = content.q, content.newton
     reduce_load(content.modes, nodes, forces, load.f)
-    term = bind_compiled(begin_step(past, points.law.mu, 0, 0))
-    problem = bind_compiled(Problem(points, term, load, secants, content.work))
-    size = external_force(term, load.f, secants.external, secants.origin)
-    last_answer(past, 0, q)
-    energy, smallest = newton.potential(problem, q, work[0])
+    past.begin_step(points.law.mu, 0, 0)
+    problem = bind_compiled(Problem(points, past, load, secants, content.work))
+    size = past.external_force(load.f, secants.external, secants.origin)
+    past.last_answer(0, q)
     target = max(accurate * size, SMALLEST_TARGET)
-    status, iterations, _, _ = descend(
-        problem, q, work, energy, smallest, target, np.inf, MAX_ITERATIONS, True, ROUND_OFF
+    status, iterations, _, _ = newton_method(
+        problem, q, work, target, np.inf, MAX_ITERATIONS, True, ROUND_OFF
     )
     if status == newton.CONVERGED:
-        end_step(past, points, content.work, 0, q)
+        past.end_step(points, content.work, 0, q)
     else:
         forget_secants(secants.inverse, secants.origin)
     return status, iterations
@@ -180,8 +163,6 @@ class Galerkin(Method):
         Orthonormal in the energy at rest.
     cubature : Cubature, optional
         Every quadrature point if absent, which in time it must be.
-    in_time : bool
-        Whether the tissue remembers, at every point.
     accurate : float
         See ``TOLERANCE``.
 
@@ -222,7 +203,7 @@ class Galerkin(Method):
             past=past,
             load=Dead(np.zeros(rows)),
             secants=Secants(np.eye(rows), np.full((2, rows), np.nan), *np.zeros((2, rows))),
-            work=new_work(rows, count),
+            work=room(Work, r=rows, c=count),
             modes=np.zeros((3 * len(model.mesh.nodes), rows)),
             q=np.zeros(rows),
             newton=np.zeros((4, rows)),
@@ -238,7 +219,7 @@ class Galerkin(Method):
         content.points.gradients[m:] = 0.0
         self.gradients_of(content.modes[:, :m].copy(), content.points.gradients)
         if isinstance(content.past, Remembering):
-            soft = basis.T @ (deviatoric_stiffness(model) @ basis)
+            soft = basis.T @ (model.deviatoric_stiffness @ basis)
             content.past.deviatoric[0, :m, :m] = soft
 
     def gradients_of(self, functions: Array, out: Field) -> None:
@@ -315,14 +296,7 @@ class Galerkin(Method):
 class GalerkinAtHand(Galerkin):
     """A basis made for each case while the user waits, with every quadrature point.
 
-    The state is the basis and the coordinates in it.
-
-    Parameters
-    ----------
-    size : int
-        Most vectors of a basis.
-    space : callable
-        Gives the basis (free dofs, <= size) of a case.
+    ``space`` gives the basis (free dofs, <= size) of a case; the state is it and the coordinates.
     """
 
     def __init__(self, problem: FullProblem, size: int, space: Callable[[Case], Array]) -> None:

@@ -1,61 +1,65 @@
 """What every method of deforming tissue has in common: it answers loads, one after the other.
 
-A study asks many methods the same cases.  ``Method.step`` is what is timed: everything that depends
-on the load and that a user waits for, but no field of mesh size.  ``displacement`` and
-``von_mises`` recover the fields.
+``Method.step`` is what studies time: everything that depends on the load and that a user waits for,
+but no field of mesh size.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.offline.fem.problem import FullProblem, Load
+from palpate.shared.mechanics.footprint import footprint
 
 Array = NDArray[np.float64]
 
 
+def pressed_nodes(
+    problem: FullProblem, x: Array, normal: Array, radius: float | None = None
+) -> Array:
+    """Nodal weights (n,) mm^2 of a unit pressure at a point; the scene's radius (mm) if absent."""
+    nodal = np.zeros(len(problem.mesh.nodes))
+    footprint(problem.body.boundary, x, normal, radius or problem.scene.endoscope.radius, nodal)
+    return nodal
+
+
 @dataclass(frozen=True)
 class Case:
-    """Footprints that press at the same time, and the nodal forces they amount to.
-
-    Attributes
-    ----------
-    nodes : ndarray, shape (k,), int
-        The loaded nodes.
-    forces : ndarray, shape (k, 3), mN
-        On the loaded nodes.
-    shares : ndarray, shape (contacts, k), mN
-        The part of each contact, in its direction.
-    radius : float, optional
-        Of the footprints, mm; the scene's if absent.
-    """
+    """Footprints that press at the same time, and the nodal forces they amount to."""
 
     contacts: tuple[Load, ...]
-    nodes: NDArray[np.int64]
-    forces: Array = field(repr=False)
-    shares: Array = field(default_factory=lambda: np.empty((0, 0)), repr=False)
-    radius: float | None = None
+    nodes: NDArray[np.int64]  # (k,) that are loaded
+    forces: Array  # (k, 3) mN, on those
+    feet: tuple[tuple[Array, Array], ...] = ()  # where each presses, mm, and the normal there
+    radius: float | None = None  # mm, of the footprints; the scene's if absent
 
     @classmethod
     def of(cls, problem: FullProblem, *contacts: Load) -> Case:
-        """Case of one or more pressed footprints on a scene's body."""
-        return cls.pressed(contacts, [problem.unit_load(x.position)[0] for x in contacts])
+        """Case of one or more footprints pressed on the accessible surface of a scene's body."""
+        feet = [problem.surface.project(contact.position)[:2] for contact in contacts]
+        return cls.pressed(problem, contacts, feet)
 
     @classmethod
     def pressed(
-        cls, contacts: tuple[Load, ...], weights: Sequence[Array], radius: float | None = None
+        cls,
+        problem: FullProblem,
+        contacts: tuple[Load, ...],
+        feet: Sequence[tuple[Array, Array]],
+        radius: float | None = None,
     ) -> Case:
-        """Case of contacts, each with the nodal weights (n,) mm^2 of its unit pressure."""
-        shares = np.array([x.pressure * own for x, own in zip(contacts, weights, strict=True)])
-        nodes = np.flatnonzero(np.any(shares != 0.0, axis=0))
-        directions = np.array([contact.direction for contact in contacts])
-        return cls(contacts, nodes, shares[:, nodes].T @ directions, shares[:, nodes], radius)
+        """Case of contacts at given places of the body."""
+        forces = np.zeros((len(problem.mesh.nodes), 3))
+        for contact, foot in zip(contacts, feet, strict=True):
+            weights = contact.pressure * pressed_nodes(problem, *foot, radius)
+            forces += np.outer(weights, contact.direction)
+        nodes = np.flatnonzero(forces.any(axis=1))
+        return cls(contacts, nodes, forces[nodes], tuple(feet), radius)
 
     @classmethod
     def of_tip(cls, position: Array, direction: Array) -> Case:
@@ -75,34 +79,25 @@ Steps = Sequence[tuple[Case, float]]
 
 @dataclass(frozen=True)
 class Snapshots:
-    """Full solutions to learn from: loads, and displacements (k, 3 n) mm."""
+    """Full solutions to learn from."""
 
     loads: Sequence[Load]
-    displacements: Array
+    displacements: Array  # (k, 3 n) mm
 
 
 @dataclass(frozen=True)
 class Answer:
     """Result of a method's step.
 
-    Attributes
-    ----------
-    state : object
-        State of the body at the end of the step: its fields are recovered from it, and the next
-        step starts from it.  Without an answer, the state before the step.
-    converged : bool
-        Whether the method reports an answer at all.
-    doubted : bool
-        Whether the method says that the answer may be wrong.  Most cannot tell.
-    refused : bool
-        Whether it declined the case instead of trying.
+    Its fields are recovered from the state of the body at the end of the step, from which the next
+    step starts.  Without an answer that is the state before the step.
     """
 
-    state: Any = field(repr=False)
-    converged: bool = True
+    state: Any
+    converged: bool = True  # whether there is an answer at all
     iterations: int = 0
-    doubted: bool = False
-    refused: bool = False
+    doubted: bool = False  # whether the method says that it may be wrong; most cannot tell
+    refused: bool = False  # whether the method declined the case instead of trying
 
     @property
     def trusted(self) -> bool:
@@ -111,17 +106,7 @@ class Answer:
 
 
 class Method(ABC):
-    """A way to answer cases.
-
-    Parameters
-    ----------
-    problem : FullProblem
-        Of the scene.
-    unknowns : int
-        Numbers solved for in a step.
-    label : str
-        Describes the size of the method, for people.
-    """
+    """A way to answer cases: how many numbers it solves for in a step, and that for people."""
 
     def __init__(self, problem: FullProblem, unknowns: int, label: str) -> None:
         self.problem, self.unknowns, self.label = problem, unknowns, label
@@ -134,8 +119,7 @@ class Method(ABC):
     def step(self, state: Any, case: Case, dt: float = 0.0) -> Answer:
         """Answer a case that is reached ``dt`` (s) after a state, which is not changed.
 
-        Methods for elastic tissue depend on the case alone.  A load without an answer is reported,
-        not raised.
+        A load without an answer is reported, not raised.
 
         Raises
         ------
@@ -158,10 +142,3 @@ class Method(ABC):
     def solve(self, case: Case) -> Answer:
         """Answer a case from rest: one step of no time."""
         return self.step(self.at_rest(), case)
-
-    def follow(self, steps: Iterable[tuple[Case, float]]) -> list[Any]:
-        """States at the ends of steps, one after the other from rest."""
-        states = [self.at_rest()]
-        for case, dt in steps:
-            states.append(self.step(states[-1], case, dt).state)
-        return states[1:]

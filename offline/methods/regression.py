@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.interpolate import RBFInterpolator
 
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.methods.galerkin import reduce_load
@@ -15,11 +15,12 @@ from palpate.offline.reduce.ritz import energy_pod
 
 Array = NDArray[np.float64]
 
+KERNELS = ("linear", "thin_plate_spline", "cubic")
+
 LENGTHS = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Millimetres on the surface that weigh as much as a unit of direction, or of median pressure."""
 
-HELD_BACK = 5
-"""One in this many samples is held back to choose kernel and lengths by."""
+HELD_BACK = 5  # one in this many samples is held back to choose kernel and lengths by
 
 
 def compliance(problem: FullProblem) -> Array:
@@ -29,22 +30,13 @@ def compliance(problem: FullProblem) -> Array:
     footprints.  Since they are orthonormal in the energy at rest, ``V V^T f`` is the best
     approximation of ``K^-1 f`` in them: a query needs nothing else.
     """
-    model = problem.model
-    nodes = np.unique(problem.body.boundary.nodes[_within_reach(problem)])
-    loaded = np.flatnonzero(np.isin(model.free // 3, nodes))
+    model, boundary = problem.model, problem.body.boundary
+    radius = problem.scene.endoscope.radius
+    covered = [problem.surface.project(x)[2] <= radius for x in boundary.points]
+    loaded = np.flatnonzero(np.isin(model.free // 3, boundary.nodes[covered]))
     unit = np.zeros((len(model.free), len(loaded)))
     unit[loaded, np.arange(len(loaded))] = 1.0
     return energy_pod(model, model.solve_linear(unit), len(loaded))[0]
-
-
-def _within_reach(problem: FullProblem) -> NDArray[np.int64]:
-    """Integration points of the boundary that some footprint can cover."""
-    vertices = cKDTree(problem.surface.vertices)
-    # no point of a triangle is farther from a vertex than its longest edge
-    corners = problem.surface.vertices[problem.surface.triangles]
-    edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
-    distance, _ = vertices.query(problem.body.boundary.points)
-    return np.flatnonzero(distance <= problem.scene.endoscope.radius + edge)
 
 
 class _InModes(Method):
@@ -61,14 +53,9 @@ class _InModes(Method):
 
 
 class Linear(_InModes):
-    """Superposition of compressed nodal compliances.
+    """Superposition of compressed nodal compliances, the leading modes of ``compliance``.
 
     It answers every load, and cannot tell when its answer is wrong.
-
-    Parameters
-    ----------
-    basis : ndarray, shape (free dofs, m), mm
-        The leading modes of ``compliance``.
     """
 
     def __init__(self, problem: FullProblem, basis: Array) -> None:
@@ -81,28 +68,10 @@ class Linear(_InModes):
         return Answer(q)
 
 
-# --- radial basis functions ----------------------------------------------------------------------
-
-KERNELS = {
-    "linear": lambda r: -r,
-    "thin_plate_spline": lambda r: r * r * np.log(np.maximum(r, 1e-300)),
-    "cubic": lambda r: r**3,
-}
-"""Of the distance, conditionally positive definite: as in ``scipy.interpolate.RBFInterpolator``."""
-
-
 class Interpolant:
-    """Values (k, m) per pressure at features (k, 7), by kernels and a linear polynomial.
+    """Values (k, m) per unit of pressure, which removes the main trend, at features (k, 7).
 
-    Parameters
-    ----------
-    features : ndarray, shape (k, 7)
-        Contact point (mm), direction, pressure (kPa).
-    values : ndarray, shape (k, m)
-        Interpolated per unit of pressure, which removes the main trend.
-    kernel : {"linear", "thin_plate_spline", "cubic"}
-    lengths : (float, float)
-        Millimetres that weigh as much as a unit of direction, and of median pressure.
+    Lengths are millimetres that weigh as much as a unit of direction, and of median pressure.
     """
 
     def __init__(
@@ -114,49 +83,30 @@ class Interpolant:
         # on a flat surface a coordinate never changes, and polynomials in it cannot be told apart
         _, spread, axes = np.linalg.svd(scaled - scaled.mean(axis=0), full_matrices=False)
         self._axes = scales[:, None] * axes[spread > 1e-6 * spread[0]].T
-        self._kernel, self._centres = KERNELS[kernel], features @ self._axes
-        k, d = self._centres.shape
-        system = np.zeros((k + d + 1, k + d + 1))
-        system[:k] = [self._terms(x) for x in self._centres]
-        system[k:, :k] = system[:k, k:].T
-        wanted = np.vstack([values / features[:, -1:], np.zeros((d + 1, values.shape[1]))])
-        self._coefficients = np.linalg.solve(system, wanted)
-
-    def _terms(self, x: Array) -> Array:
-        """Kernels (k,) round every centre at x (d,), then 1 and x."""
-        away = self._centres - x
-        distance = np.sqrt(np.einsum("kd,kd->k", away, away))
-        return np.concatenate([self._kernel(distance), [1.0], x])
+        per_pressure = values / features[:, -1:]
+        self._found = RBFInterpolator(features @ self._axes, per_pressure, kernel=kernel, degree=1)
 
     def __call__(self, features: Array) -> Array:
-        """Values (m,) at features (7,)."""
-        found: Array = features[-1] * (self._terms(features @ self._axes) @ self._coefficients)
-        return found
+        """Values (q, m) at features (q, 7)."""
+        return np.asarray(features[:, -1:] * self._found(features @ self._axes))
 
 
 def fit_interpolant(features: Array, values: Array) -> Interpolant:
     """Interpolant with the kernel and lengths of least error on samples held back."""
     back = np.arange(len(features)) % HELD_BACK == 0
 
-    def error(kernel: str, lengths: tuple[float, float]) -> float:
-        trial = Interpolant(features[~back], values[~back], kernel, lengths)
-        guess = np.array([trial(x) for x in features[back]])
-        off = np.linalg.norm(guess - values[back], axis=1)
-        return float(np.mean(off / np.linalg.norm(values[back], axis=1)))
+    def error(choice: tuple[str, tuple[float, float]]) -> float:
+        off = Interpolant(features[~back], values[~back], *choice)(features[back]) - values[back]
+        return float(np.mean(np.linalg.norm(off, axis=1) / np.linalg.norm(values[back], axis=1)))
 
     choices = itertools.product(KERNELS, itertools.product(LENGTHS, LENGTHS))
-    return Interpolant(features, values, *min(choices, key=lambda choice: error(*choice)))
+    return Interpolant(features, values, *min(choices, key=error))
 
 
 class Regression(_InModes):
     """Coordinates of POD modes by radial basis functions of the load; no mechanics.
 
     It refuses several contacts and answers every single one.
-
-    Parameters
-    ----------
-    basis : ndarray, shape (free dofs, m), mm
-        Orthonormal in the energy at rest.
     """
 
     def __init__(self, problem: FullProblem, basis: Array, snapshots: Snapshots) -> None:
@@ -171,7 +121,7 @@ class Regression(_InModes):
         """See ``Method``."""
         if len(case.contacts) != 1:
             return Answer(state, False, refused=True)
-        return Answer(self._interpolant(_features(case.contacts[0])))
+        return Answer(self._interpolant(_features(case.contacts[0])[None])[0])
 
 
 def _features(load: Load) -> Array:

@@ -25,13 +25,10 @@ Way = Literal["cold", "warm", "in time", "tip"]
 class Shipped(Method):
     """Queries of a reduced model; the state is the last answer, or None at rest.
 
-    Parameters
-    ----------
-    way : {"cold", "warm", "in time", "tip"}
-        Elastic tissue, every answer from scratch or from the last one; steps in time of
-        visco-elastic tissue under footprints, or under the rigid tip, whose centre a case tells.
-        On visco-elastic tissue the warm queries are its *elastic twin*: the same local models and
-        points, asked as if there were no past.
+    Ways are: elastic tissue, every answer from scratch or from the last one; steps in time of
+    visco-elastic tissue under footprints, or under the rigid tip, whose centre a case tells.  On
+    visco-elastic tissue warm queries are those of its *elastic twin*: the same local models and
+    points, asked as if there were no past.
     """
 
     def __init__(self, problem: FullProblem, atlas: ReducedModel, way: Way = "cold") -> None:

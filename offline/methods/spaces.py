@@ -1,20 +1,9 @@
 """Bases that a reduced model can be built on, all orthonormal in the energy of the rest state.
 
-Theory.  Every space here spans displacements (free dofs, m) with ``V^T K V = I``, ``K`` the rest
-stiffness, so that ``V^T f`` are the coordinates of the linear response in it.  They differ in what
-they are made of:
-
-======================= ====================================================== =====================
-space                   spans                                                  knows of
-======================= ====================================================== =====================
-``modal``               eigenmodes of least frequency, ``K x = omega^2 M x``   stiffness and mass
-``krylov``              ``K^-1 F``, ``K^-1 M K^-1 F``, ... of a block of loads and the loads
-``static_derivatives``  ``dU/dt`` and second and third derivatives at rest     and the tissue law
-``pod``                 the main directions of full solutions                  what it was shown
-======================= ====================================================== =====================
-
-The first two, and POD, are the MOD, RITZ and POD of Radermacher & Reese.  In a quasi-static body
-the mass has one effect only: it makes a sequence of ever shorter waves out of one load.
+Every space spans displacements (free dofs, m) with ``V^T K V = I``, ``K`` the rest stiffness, so
+that ``V^T f`` are the coordinates of the linear response in it.  ``modal``, ``krylov`` and ``pod``
+are the MOD, RITZ and POD of Radermacher & Reese.  In a quasi-static body the mass has one effect
+only: it makes a sequence of ever shorter waves out of one load.
 """
 
 from __future__ import annotations
@@ -74,23 +63,10 @@ def modal(model: FullModel, size: int) -> Array:
 def krylov(model: FullModel, M: csr_matrix, loads: Array, size: int) -> Array:
     """Load-dependent vectors (free dofs, <= size): one block of loads, moment after moment.
 
-    The space is ``K^-1 F, (K^-1 M) K^-1 F, (K^-1 M)^2 K^-1 F, ...``.  For a single load that is
-    Wilson's sequence of Ritz vectors (Wilson, Yuan & Dickens 1982); for a block, the Krylov space
-    that matches the moments of the frequency response about zero (Bai 2002).  They are the same
-    space up to the block, hence the same code.  For a static body only the first block counts: a
-    mass does no more than choose what follows.
-
-    Parameters
-    ----------
-    M : csr_matrix, shape (free dofs, free dofs)
-    loads : ndarray, shape (free dofs, b)
-    size : int
-        Vectors wanted; fewer come back if the sequence ends before.
-
-    Returns
-    -------
-    modes : ndarray
-        Whole blocks are nested.
+    The space is ``K^-1 F, (K^-1 M) K^-1 F, (K^-1 M)^2 K^-1 F, ...`` of loads ``F`` (free dofs, b);
+    whole blocks are nested.  For a single load that is Wilson's sequence of Ritz vectors (Wilson,
+    Yuan & Dickens 1982); for a block, the Krylov space that matches the moments of the frequency
+    response about zero (Bai 2002).
     """
     V, KV = np.empty((len(loads), 0)), np.empty((len(loads), 0))
     KX = loads
@@ -121,30 +97,16 @@ def _orthonormal(V: Array, KV: Array, X: Array, KX: Array) -> tuple[Array, Array
 def static_derivatives(model: FullModel, loads: Array, size: int) -> Array:
     """Ritz vectors of three loads carried to third order: (free dofs, <= min(size, 19)).
 
-    First, second and third derivatives at rest of the equilibrium under any combination of the
-    loads (``reduce.ritz``); of fewer than 19, those that lead in energy at these loads.
-
-    Parameters
-    ----------
-    loads : ndarray, shape (free dofs, 3), mN
-        Scaled to the loads expected.
+    First, second and third derivatives at rest of the equilibrium under any combination of loads
+    (free dofs, 3) mN (``reduce.ritz``); of fewer than 19, those that lead in energy at these loads.
     """
     return energy_pod(model, ritz_vectors(model, loads), size)[0]
 
 
-def pod(
-    model: FullModel,
-    displacements: Array,
-    size: int,
-    inner: Inner = "energy",
-) -> Array:
-    """Proper orthogonal decomposition of solutions, (free dofs, <= size), nested.
+def pod(model: FullModel, displacements: Array, size: int, inner: Inner = "energy") -> Array:
+    """Proper orthogonal decomposition (free dofs, <= size), nested, of displacements (k, 3 n) mm.
 
-    Parameters
-    ----------
-    displacements : ndarray, shape (k, 3 n), mm
-    inner : {"energy", "euclidean"}
-        Product in which the modes are best; the modes come back orthonormal in the energy anyhow.
+    The modes are best in the ``inner`` product, and orthonormal in the energy anyhow.
     """
     snapshots = displacements[:, model.free].T.astype(float)
     if inner == "energy":

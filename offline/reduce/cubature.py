@@ -1,4 +1,4 @@
-"""Empirical cubature: few quadrature points of positive weight that do the work of all.
+"""Empirical cubature, few quadrature points that do the work of all, and polynomial fits.
 
 The reduced internal force is a sum over quadrature points ``sum_q w_q G_q^T P_q``.  Points ``c``
 and weights ``x_c > 0`` are chosen by non-negative least squares so that ``sum_c x_c G_c^T P_c``
@@ -9,16 +9,23 @@ equilibrium the sum is the load, whatever the tissue does, and says little about
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import qr_delete, solve, solve_triangular
+from scipy.linalg import qr_delete, qr_insert, solve, solve_triangular
 
+from palpate.offline.fem.problem import FullProblem, Step
 from palpate.shared.mechanics.tissue import Law
-from palpate.shared.reduced.points import LANES, add_past_stress, nonlinear_stress
+from palpate.shared.reduced.features import RESIDUAL_FEATURES, residual_features
+from palpate.shared.reduced.points import LANES, Points, add_past_stress, nonlinear_stress
 
 Array = NDArray[np.float64]
+Past = tuple[NDArray[np.float32], NDArray[np.float32]]
+
+OFF_EQUILIBRIUM = 0.03
+"""Size of the random departure from equilibrium, relative to each mode's part in the states."""
 
 RESIDUAL_DAMPING = 0.15
 """Of the fit of the residuals' logs: they scatter about any smooth function."""
@@ -38,20 +45,9 @@ def compress(
 ) -> tuple[Array, Array]:
     """Replace many equations by few of the same least squares (randomised range finder).
 
-    Parameters
-    ----------
-    contributions : ndarray, shape (q, r)
-        Contribution of each point (row) to each sum (column).
-    size : int
-        Equations to keep.
-
-    Returns
-    -------
-    A : ndarray, shape (size, q)
-        Equations: ``|A x|`` is ``|contributions.T x|`` but for what ``size`` directions of ``x``
-        do not catch.
-    b : ndarray, shape (size,)
-        Their sums over all points.
+    From contributions (q, r) of each point to each sum, returns equations A (size, q) and their
+    sums over all points (size,): ``|A x|`` is ``|contributions.T x|`` but for what ``size``
+    directions of ``x`` do not catch.
     """
     noise = rng.standard_normal((contributions.shape[1], size))
     Q = np.linalg.qr(contributions @ noise.astype(contributions.dtype))[0]
@@ -60,32 +56,13 @@ def compress(
     return A, A.sum(axis=1)
 
 
-def combined(
-    columns: NDArray[np.float32], count: int, rng: np.random.Generator
-) -> NDArray[np.float32]:
-    """Random combinations (q, count) of columns (q, k), whose squares add up to about the same."""
-    noise = rng.standard_normal((columns.shape[1], count), dtype=np.float32)
-    return columns @ (noise / np.float32(np.sqrt(count)))
-
-
 def nonnegative(
     A: NDArray[np.floating[Any]], b: Array, most: int
 ) -> tuple[NDArray[np.int64], Array]:
     """Sparse non-negative solution of ``A x ~ b`` (Lawson & Hanson 1974, stopped early).
 
-    Parameters
-    ----------
-    A : ndarray, shape (r, q)
-        In single precision it is searched twice as fast.
-    b : ndarray, shape (r,)
-    most : int
-        Largest number of points.
-
-    Returns
-    -------
-    chosen : ndarray, shape (c,)
-        Columns with positive weight, ascending.
-    weights : ndarray, shape (c,)
+    A (r, q) is searched twice as fast in single precision.  Returns the columns with positive
+    weight, ascending and at ``most`` so many, and their weights.
     """
     norms, tiny = np.linalg.norm(A, axis=0), np.finfo(A.dtype).tiny
     usable = norms > 1e-12 * norms.max()
@@ -102,7 +79,7 @@ def nonnegative(
         best = int(np.argmax(gain))
         if not gain[best] > 0:
             break
-        Q, R = _append(Q, R, A[:, best].astype(float))
+        Q, R = qr_insert(Q, R, A[:, best].astype(float), len(chosen), which="col")
         chosen.append(best)
         x = np.append(x, 0.0)
         while True:
@@ -126,19 +103,19 @@ def nonnegative(
     return np.array(chosen, dtype=np.int64)[order], x[order]
 
 
-def _append(Q: Array, R: Array, column: Array) -> tuple[Array, Array]:
-    """Thin QR with one more column (twice-iterated Gram-Schmidt)."""
-    r = Q.T @ column
-    rest = column - Q @ r
-    again = Q.T @ rest
-    rest -= Q @ again
-    norm = np.linalg.norm(rest)
-    k = R.shape[0]
-    grown = np.zeros((k + 1, k + 1))
-    grown[:k, :k] = R
-    grown[:k, k] = r + again
-    grown[k, k] = norm
-    return np.column_stack([Q, rest / norm]), grown
+def points_alone(points: Points) -> tuple[NDArray[np.float32], tuple[Array, Law]]:
+    """Gradients (r, 9 c) of the modes at the points of the first local model, in tiles, 1/mm.
+
+    Also their weights (c,) mm^3 and their law (c,).
+    """
+    rows = points.gradients[0] * points.steps[0][:, None]
+    return rows, (points.weights[0], points.law.at(0))
+
+
+def by_point(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Gradients (c, 9, r) of modes, from those in tiles (r, 9 c)."""
+    tiles = rows.reshape(len(rows), -1, 9, LANES)
+    return np.ascontiguousarray(tiles.transpose(1, 3, 2, 0).reshape(-1, 9, len(rows)))
 
 
 def point_forces(
@@ -146,20 +123,12 @@ def point_forces(
     weights: Array,
     law: Law,
     state: Array,
-    past: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None,
+    past: Past | None = None,
 ) -> NDArray[np.float32] | None:
     """Nonlinear force of every point (c, r) at a state (r,) of a local model; None if inverted.
 
-    Parameters
-    ----------
-    gradients : ndarray, shape (c, 9, r), 1/mm
-        Of the modes; c is a multiple of ``LANES``.
-    weights : ndarray, shape (c,), mm^3
-    law : Law
-        Of the points (c,).
-    state : ndarray, shape (r,)
-    past : (ndarray, ndarray), shape (6 c,), optional
-        Of tissue that remembers: ``B`` and ``S`` of ``reduced.points.predict_points``.
+    Gradients (c, 9, r) 1/mm of the modes at points, a multiple of ``LANES``, of weights (c,) mm^3.
+    ``past`` (6 c,) of tissue that remembers is ``B`` and ``S`` of ``points.predict_points``.
     """
     H = np.dot(gradients, state.astype(np.float32)).reshape(-1, LANES, 9)
     rows = np.ascontiguousarray(H.transpose(0, 2, 1)).reshape(-1)
@@ -181,17 +150,18 @@ def linear_forces(
     P = law.mu[:, None, None, None] * (H + H.swapaxes(1, 2))
     P += (law.lam[:, None] * np.trace(H, axis1=1, axis2=2))[:, None, None] * np.eye(3)[..., None]
     P = (weights[:, None, None, None] * P).reshape(len(gradients), 9, -1).astype(np.float32)
-    return np.asarray((gradients.swapaxes(1, 2) @ P).reshape(len(gradients), -1))
+    return (gradients.swapaxes(1, 2) @ P).reshape(len(gradients), -1)
 
 
-def with_linear_forces(
-    forces: NDArray[np.float32],
+def training_forces(
     gradients: NDArray[np.float32],
     law: tuple[Array, Law],
+    states: Sequence[tuple[Array, Array, Past | None]],
     count: int,
+    responses: int,
     rng: np.random.Generator,
 ) -> NDArray[np.float32]:
-    """Forces (c, k) of every point, and those of linear elasticity in random states beside them.
+    """What each point (row) contributes to internal forces in and off equilibrium (columns).
 
     A local model adds to linear elasticity what the points have beyond it.  Points of great weight
     do that well in training states and are far too stiff for linear elasticity in other directions,
@@ -199,32 +169,42 @@ def with_linear_forces(
 
     Parameters
     ----------
-    forces : ndarray, shape (c, k)
-    gradients : ndarray, shape (c, 9, r), 1/mm
-    law : (ndarray, shape (c,), and Law)
-        Weights (mm^3) and parameters of the points.
+    gradients, law
+        See ``point_forces``; weights of the points and their law.
+    states : sequence of (ndarray, shape (r,); ndarray, shape (r, k); past)
+        Equilibria, what the components of a force there count for, and what the tissue remembers.
     count : int
-        Of random states.
-    rng : Generator
+        Random combinations of the k sums that stand for them; their errors add up alike.
+    responses : int
+        Random displacements in which the points have to do what linear elasticity does.
     """
+    columns = []
+    for q, looks, past in states:
+        departure = OFF_EQUILIBRIUM * np.abs(q) * rng.standard_normal(len(q))
+        for state in (q, q + departure):
+            force = point_forces(gradients, *law, state, past)
+            if force is not None:
+                columns.append(force @ _combined(looks.astype(np.float32), count, rng))
+    forces = np.hstack(columns)
     size = np.linalg.norm(forces.sum(axis=0)) / np.sqrt(forces.shape[1])
-    states = rng.standard_normal((count, gradients.shape[2]))
-    states *= LINEAR * size / np.linalg.norm(states, axis=1, keepdims=True)
-    linear = linear_forces(gradients, *law, states)
-    return np.hstack([forces, combined(linear, 2 * count, rng)])
+    small = rng.standard_normal((responses, gradients.shape[2]))
+    small *= LINEAR * size / np.linalg.norm(small, axis=1, keepdims=True)
+    linear = linear_forces(gradients, *law, small)
+    return np.hstack([forces, _combined(linear, 2 * responses, rng)])
+
+
+def _combined(
+    columns: NDArray[np.float32], count: int, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """Random combinations (q, count) of columns (q, k), whose squares add up to about the same."""
+    noise = rng.standard_normal((columns.shape[1], count), dtype=np.float32)
+    return columns @ (noise / np.float32(np.sqrt(count)))
 
 
 def nonlinear_forces(rows: NDArray[np.float32], weights: Array, law: Law, states: Array) -> Array:
     """Nonlinear force of all points together (k, r) at states (k, r); NaN where inverted.
 
-    Parameters
-    ----------
-    rows : ndarray, shape (r, 9 c), 1/mm
-        Gradients of the modes in tiles.
-    weights : ndarray, shape (c,), mm^3
-    law : Law
-        Of the points (c,).
-    states : ndarray, shape (k, r)
+    ``rows`` (r, 9 c) 1/mm are gradients of the modes in tiles.
     """
     forces = np.empty(states.shape)
     J, part, linear = np.empty((3, len(weights)))
@@ -245,16 +225,47 @@ def damped_fit(A: Array, B: Array, damping: float = 1e-4) -> Array:
     scale = np.sqrt(np.mean(A**2, axis=0)) + 1e-300
     A = A / scale
     normal = A.T @ A + damping**2 * len(A) * np.eye(A.shape[1])
-    return np.asarray(solve(normal, A.T @ B, assume_a="pos")) / scale[:, None]
+    fitted: Array = solve(normal, A.T @ B, assume_a="pos") / scale[:, None]
+    return fitted
 
 
-def fit_of_residuals(A: Array, residuals: Array) -> Array:
-    """Logs of residuals (k,) as sums of features A (k, f), the first of which is one; (f,).
+def fit_residual(
+    problem: FullProblem,
+    frame: Array,
+    centre: Array,
+    nodal: NDArray[np.float32],
+    known: Sequence[tuple[Step, Array, float, Array]],
+) -> Array:
+    """Fit the log of the relative residual (RESIDUAL_FEATURES,) left in the full model by answers.
 
-    Residuals that are zero or infinite do not count.
+    ``known`` are loads, their directions (3,), their shares of the largest, and the answers (r,) in
+    modes ``nodal`` (r, 3 n) mm; see ``reduced.features.residual_features`` for frame and centre.
     """
+    rows = np.empty((len(known), RESIDUAL_FEATURES))
+    for row, (load, direction, share, _) in zip(rows, known, strict=True):
+        residual_features(frame, centre, load.position, direction, share, row)
+    displacements = np.array([q for *_, q in known]) @ nodal.astype(float)
+    residuals = residuals_left(problem, displacements, [load for load, *_ in known])
     kept = (residuals > 0) & np.isfinite(residuals)
     logs = np.log(residuals[kept])
-    fitted = damped_fit(A[kept], (logs - logs.mean())[:, None], RESIDUAL_DAMPING)[:, 0]
+    fitted = damped_fit(rows[kept], (logs - logs.mean())[:, None], RESIDUAL_DAMPING)[:, 0]
     fitted[0] += logs.mean()
     return fitted
+
+
+def residuals_left(problem: FullProblem, displacements: Array, loads: Sequence[Step]) -> Array:
+    """What displacements (k, 3 n) mm leave of loads in the full model, relative to them, (k,).
+
+    Both are measured as displacements in the energy of the rest state; infinite where the
+    displacement inverts an element.
+    """
+    model, free = problem.model, problem.model.free
+    left, sound = np.zeros_like(displacements), np.ones(len(loads), dtype=bool)
+    for i, (u, load) in enumerate(zip(displacements, loads, strict=True)):
+        _, smallest = model.internal(u, left[i])
+        problem.load(load).add_force(u, left[i])
+        sound[i] = smallest > 0.0
+    left, moved = left[:, free].T, displacements[:, free].T
+    energies = np.sum(left * model.solve_linear(left), axis=0)
+    own = np.sum(moved * (model.rest_stiffness @ moved), axis=0)
+    return np.where(sound, np.sqrt(energies / own), np.inf)

@@ -14,20 +14,23 @@ model is asked everywhere whether its answers depend on the way.
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.sampling import cone, random_points_and_rim, tangents
 from palpate.shared.answer import Answer
 from palpate.shared.errors import QueryError
-from palpate.shared.geometry.surface import Surface
+from palpate.shared.local_models import Estimators, LocalModels
 from palpate.shared.mechanics.footprint import TIP_DEPTH, pressure_limit
 from palpate.shared.model import ReducedModel
-from palpate.shared.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -71,114 +74,123 @@ Ask = Callable[[str, Callable[..., float], Rows], Iterable[float]]
 """Values of a function of the reduced model at places, its further arguments; under a title."""
 
 
-class Search(NamedTuple):
-    """How a limit is lowered."""
-
-    title: str
-    field: int  # of the limits
-    share: Callable[..., float]  # of the limit up to which the reduced model shows no fault
-    rows: Callable[[Iterable[Array]], Rows]  # its arguments at points, the contact first
-    first: int  # contact points
-    closer: int  # more points near each whose limit is lowered
-    reach: float  # mm
-
-
-def lowered_limits(
-    surface: Surface, limits: Array, scene: Scene, patches: int, ask: Ask, rng: np.random.Generator
-) -> Array:
+def lowered_limits(model: ReducedModel, ask: Ask, rng: np.random.Generator) -> Array:
     """Load range (v, LIMIT_FIELDS) whose pressures are lowered where tissue gives way."""
 
     def rows(points: Iterable[Array]) -> Rows:
         found: Rows = []
         for i, point in enumerate(points):
-            x, normal, _, fields = surface.locate(point, limits)
-            direction = cone(normal, scene.endoscope.max_tilt, 1, rng, border=i % 2 == 0)[0]
+            x, normal, _, fields = model.surface.locate(point, model.limits)
+            tilt = model.scene.endoscope.max_tilt
+            direction = cone(normal, tilt, 1, rng, border=i % 2 == 0)[0]
             found.append((x, direction, pressure_limit(fields, normal, direction)))
         return found
 
-    first = PATHS_PER_PATCH * patches
-    search = Search("giving way", 0, limit_load_share, rows, first, CLOSER, REACH)
-    return _lowered(surface, limits, search, ask, rng)
+    ask_there = partial(ask, "giving way", limit_load_share)
+    return _lowered(model, 0, rows, ask_there, (PATHS_PER_PATCH, CLOSER), REACH, rng)
 
 
-def lowered_depths(
-    surface: Surface, limits: Array, patches: int, ask: Ask, rng: np.random.Generator
-) -> Array:
+def lowered_depths(model: ReducedModel, ask: Ask, rng: np.random.Generator) -> Array:
     """The same, depths of the tip lowered to where an answer does not depend on the way."""
 
     def rows(points: Iterable[Array]) -> Rows:
-        return [(surface.project(point)[0], rng.uniform(0.0, 2.0 * np.pi)) for point in points]
+        return [(model.surface.project(x)[0], rng.uniform(0.0, 2.0 * np.pi)) for x in points]
 
-    first = CONTACTS_PER_PATCH * patches
-    search = Search(
-        "slipping off", TIP_DEPTH, path_independent_share, rows, first, CONTACTS_CLOSER, SLIP_REACH
-    )
-    return _lowered(surface, limits, search, ask, rng)
+    ask_there = partial(ask, "slipping off", path_independent_share)
+    counts = CONTACTS_PER_PATCH, CONTACTS_CLOSER
+    return _lowered(model, TIP_DEPTH, rows, ask_there, counts, SLIP_REACH, rng)
 
 
 def _lowered(
-    surface: Surface, limits: Array, search: Search, ask: Ask, rng: np.random.Generator
+    model: ReducedModel,
+    field: int,
+    rows: Callable[[Iterable[Array]], Rows],
+    ask_there: Callable[[Rows], Iterable[float]],
+    counts: tuple[int, int],
+    reach: float,
+    rng: np.random.Generator,
 ) -> Array:
+    """Load range with a field lowered to the shares of it that the reduced model bears.
+
+    ``counts`` are points for each local model, and more of them near each that does not bear all.
+    """
+    surface, (first, closer) = model.surface, counts
     vertices = cKDTree(surface.vertices)
 
-    def lacking(title: str, points: Iterable[Array]) -> list[tuple[Array, float]]:
-        rows = search.rows(points)
-        shares = ask(title, search.share, rows)
-        return [(row[0], s) for row, s in zip(rows, shares, strict=True) if s < 1.0]
+    def lacking(points: Iterable[Array]) -> list[tuple[Array, float]]:
+        asked = rows(points)
+        shares = zip(asked, ask_there(asked), strict=True)
+        return [(x, share) for (x, *_), share in shares if share < 1.0]
 
-    found = lacking(search.title, random_points_and_rim(surface, search.first, rng))
-    near = [rng.choice(vertices.query_ball_point(x, search.reach), search.closer) for x, _ in found]
+    found = lacking(random_points_and_rim(surface, first * len(model.models.centres), rng))
+    near = [rng.choice(vertices.query_ball_point(x, reach), closer) for x, _ in found]
     if near:
-        closer = surface.vertices[np.concatenate(near)]
-        found += lacking(f"{search.title}, closer", closer)
-    share = np.ones(len(limits))
+        found += lacking(surface.vertices[np.concatenate(near)])
+    share = np.ones(len(surface.vertices))
     for x, bearable in found:
-        lowered = vertices.query_ball_point(x, search.reach)
+        lowered = vertices.query_ball_point(x, reach)
         share[lowered] = np.minimum(share[lowered], bearable)
-    limits = limits.copy()
-    limits[:, search.field] *= share
+    limits = model.limits.copy()
+    limits[:, field] *= share
     return limits
 
 
-def limit_load_share(atlas: ReducedModel, x: Array, direction: Array, limit: float) -> float:
+def untested(problem: FullProblem, models: LocalModels, limits: Array) -> ReducedModel:
+    """Reduced model of local models and a load range, without error estimates."""
+    scene = problem.scene
+    return ReducedModel(
+        scene.name, scene, {}, problem.body, problem.surface, limits, models, Estimators()
+    )
+
+
+@lru_cache(maxsize=1)
+def _pickled(problem: FullProblem, path: Path) -> ReducedModel:
+    return untested(problem, *pickle.loads(path.read_bytes()))
+
+
+def ask(
+    problem: FullProblem, path: Path, function: Callable[..., float], rows: Rows
+) -> list[float]:
+    """Values of a function of a reduced model and of further arguments; for ``run.workers``.
+
+    ``path`` is a pickle of the local models and their load range.
+    """
+    return [function(_pickled(problem, path), *row) for row in rows]
+
+
+def limit_load_share(model: ReducedModel, x: Array, direction: Array, limit: float) -> float:
     """Share of a pressure (kPa) up to which tissue yields gradually, with ``MARGIN``; at most 1."""
     moved = np.full(len(SHARES), np.nan)  # where it does not converge an answer says so itself
     for i, share in enumerate(SHARES):
-        solution = atlas.press(x, share * limit, direction)
-        if solution.converged:
-            moved[i] = sum(weight * np.linalg.norm(wide) for _, weight, wide in solution.parts)
+        answer = model.press(x, share * limit, direction)
+        if answer.converged:
+            moved[i] = sum(weight * np.linalg.norm(q) for _, weight, q in answer.parts)
     exponents = np.diff(np.log(moved)) / np.diff(np.log(SHARES))
     sudden = np.flatnonzero(np.diff(exponents) > SUDDEN)
     return float(SHARES[sudden[0] + 1]) / MARGIN if len(sudden) else 1.0
 
 
-def path_independent_share(atlas: ReducedModel, x: Array, turn: float = 0.0) -> float:
+def path_independent_share(model: ReducedModel, x: Array, turn: float = 0.0) -> float:
     """Share of the depth limit at a contact up to which the tip's way there does not matter.
 
-    Parameters
-    ----------
-    atlas : ReducedModel
-    x : ndarray, shape (3,), mm
-        On the surface.
-    turn : float
-        Of the ways about the normal, rad.
+    ``turn`` is the angle (rad) of the ways about the normal.
     """
     for share in DEPTH_SHARES:
-        if not _depends_on_way(atlas, x, share, turn):
+        if not _depends_on_way(model, x, share, turn):
             return float(share) if share == 1.0 else float(share) / MARGIN
     return float(DEPTH_SHARES[-1]) / MARGIN
 
 
-def _depends_on_way(atlas: ReducedModel, x: Array, share: float, turn: float) -> bool:
+def _depends_on_way(model: ReducedModel, x: Array, share: float, turn: float) -> bool:
     """Whether a tip that comes sliding finds another equilibrium than one pressed in."""
-    pressed = atlas.touch(_over(atlas, x, share))
-    state = atlas.new_warm()
+    pressed = model.touch(_over(model, x, share))
+    state = model.new_warm()
     for angle in turn + 2.0 * np.pi * np.arange(WAYS) / WAYS:
         state.forget()
         slid = None
-        for place in reversed(_way(atlas, x, angle)):
+        for place in reversed(_way(model, x, angle)):
             try:
-                slid = atlas.touch(_over(atlas, place, share), warm=state)
+                slid = model.touch(_over(model, place, share), warm=state)
             except QueryError:  # in a fold the tip's centre can be below the other side
                 continue
         if slid is not None and _apart(pressed, slid):
@@ -186,18 +198,18 @@ def _depends_on_way(atlas: ReducedModel, x: Array, share: float, turn: float) ->
     return False
 
 
-def _over(atlas: ReducedModel, x: Array, share: float) -> Array:
+def _over(model: ReducedModel, x: Array, share: float) -> Array:
     """Centre of a tip pressed in at a point of the surface by a share of the depth limit."""
-    x, normal, _, fields = atlas.surface.locate(x, atlas.limits)
-    return x + (atlas.scene.endoscope.radius - share * fields[TIP_DEPTH]) * normal
+    x, normal, _, fields = model.surface.locate(x, model.limits)
+    return x + (model.scene.endoscope.radius - share * fields[TIP_DEPTH]) * normal
 
 
-def _way(atlas: ReducedModel, x: Array, angle: float) -> list[Array]:
+def _way(model: ReducedModel, x: Array, angle: float) -> list[Array]:
     """Points of the surface from one point on, as far as it goes."""
-    places, normal = [x], atlas.surface.project(x)[1]
+    places, normal = [x], model.surface.project(x)[1]
     heading = np.array([np.cos(angle), np.sin(angle)]) @ np.array(tangents(normal))
     for _ in range(round(FAR / STRIDE)):
-        on, normal = atlas.surface.project(places[-1] + STRIDE * heading)[:2]
+        on, normal = model.surface.project(places[-1] + STRIDE * heading)[:2]
         heading = heading - heading @ normal * normal
         size = float(np.linalg.norm(heading))
         if size < 1e-6 or np.linalg.norm(on - places[-1]) < 0.3 * STRIDE:

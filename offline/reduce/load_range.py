@@ -18,7 +18,7 @@ from palpate.offline.fem.model import FullModel, NoEquilibrium
 from palpate.offline.fem.potential import Projected
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.terms import DeadLoad
-from palpate.offline.reduce.ritz import energy_pod, path_vectors
+from palpate.offline.reduce.ritz import energy_pod, ritz_vectors
 from palpate.shared.mechanics import newton
 
 Array = NDArray[np.float64]
@@ -39,28 +39,16 @@ SHALLOWEST = 0.02
 
 
 class LoadPath:
-    """The full model in the first three derivatives of the path under ``p load``.
-
-    Parameters
-    ----------
-    model : FullModel
-    load : ndarray, shape (free dofs,), mN
-        Of a unit pressure.
-    """
+    """The full model in the first three derivatives of the path under ``p load`` (free dofs,)."""
 
     def __init__(self, model: FullModel, load: Array) -> None:
         self._model = model
         self._load = model.filled(load)
-        self._basis, _ = energy_pod(model, path_vectors(model, load), 3)
+        self._basis, _ = energy_pod(model, ritz_vectors(model, load[:, None]), 3)
         self._q = np.zeros(self._basis.shape[1])
 
     def solve(self, pressure: float, start: Array | None) -> Array:
-        """Displacement (n, 3) mm at a pressure, from the last found unless ``start`` is None.
-
-        Raises
-        ------
-        NoEquilibrium
-        """
+        """Displacement (n, 3) mm at a pressure, from the last found unless ``start`` is None."""
         load = pressure * self._load
         path = Projected(self._model, [DeadLoad(load)], self._basis)
         q = np.zeros_like(self._q) if start is None else self._q.copy()
@@ -81,31 +69,12 @@ def pressure_that_moves(
     exponent: float | None = None,
     start: Array | None = None,
 ) -> tuple[float, float, Array | None]:
-    """Pressure at which the tissue moves by ``wanted`` mm, or beyond which it has no equilibrium.
+    """Pressure at which a node moves by ``wanted`` mm, or beyond which there is no equilibrium.
 
-    Parameters
-    ----------
-    solve : callable
-        Displacement (n, 3) at a pressure, from a first guess; raises ``NoEquilibrium``.
-    wanted : float, mm
-        Largest nodal displacement.
-    pressure : float, kPa
-        First guess.
-    exponent : float, optional
-        Displacement as a power of the pressure near there, if known.
-    start : ndarray, shape (n, 3), optional
-        Displacement at the first guess, if known.
-
-    Returns
-    -------
-    pressure, exponent : float
-    displacement : ndarray, shape (n, 3), or None
-        Near there.
-
-    Raises
-    ------
-    NoEquilibrium
-        If there is none at ``LEAST`` of the first guess either.
+    ``solve`` finds the displacement (n, 3) at a pressure from a first guess or raises
+    ``NoEquilibrium``, as this does if there is none at ``LEAST`` of the first guess either. Taken
+    and returned: a pressure (kPa), the power of it by which the displacement grows near there, and
+    a displacement there.
     """
     least = LEAST * pressure
     low, high, last = 0.0, np.inf, None
@@ -139,7 +108,7 @@ def pressure_that_moves(
 
 
 def load_range(problem: FullProblem, position: Array) -> Array:
-    """Load range at a surface point: fields (8,) of ``mechanics.footprint.pressure_limit``.
+    """Load range (LIMIT_FIELDS,) at a surface point; see ``mechanics.footprint.pressure_limit``.
 
     The limit along the normal is where the tissue moves by the scene's indentation, or beyond
     which it has no equilibrium; the depth of the tip is how far the footprint has sunk then.

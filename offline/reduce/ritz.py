@@ -1,4 +1,4 @@
-"""Reduced spaces: nonlinear Ritz vectors of pressed footprints and their compression.
+"""Reduced spaces: nonlinear Ritz vectors of pressed footprints, the common basis of a region.
 
 Theory.  Let ``u(t)`` be the equilibrium under the load ``sum_i t_i f_i`` (three directions of one
 footprint).  Differentiating ``R(u(t)) = sum t_i f_i`` at rest gives vectors that all cost one
@@ -12,6 +12,8 @@ The 3 + 6 + 10 vectors span what the equilibrium does under that footprint in an
 third order in the load: load-dependent Ritz vectors carried into the nonlinear range (cf. Idelsohn
 & Cardona 1985, path derivatives).  Second and third order vectors enter through the derivatives
 along the lines ``t = s d`` of as many directions ``d`` as there are vectors.
+
+The vectors of all footprints of a region are compressed to one basis.
 """
 
 from __future__ import annotations
@@ -21,9 +23,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from palpate.offline.fem.model import FullModel
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.sampling import tangents
+from palpate.shared.geometry.surface import Surface
 
 Array = NDArray[np.float64]
 
@@ -31,35 +36,36 @@ RITZ_VECTORS = 19
 SECOND_STEP, THIRD_STEP = 0.01, 0.03
 """Largest nodal displacement (mm) at which the internal force is differenced."""
 
-
-def _lattice(order: int) -> Array:
-    """Directions on which every form of this order in three variables is determined."""
-    points = [p for p in itertools.product(range(order + 1), repeat=3) if sum(p) == order]
-    return np.array(points, dtype=float) / order
-
-
 FILL = 1e-13
 """Energy of what fills up modes, relative to that of the vectors: just above round-off."""
 
 TANGENTIAL = 0.6
 """Weight of tangential against normal load in the Ritz vectors: about sin 30 degrees and some."""
 
+POINTS_IN_BASIS = 50
+"""Footprints all of whose Ritz vectors make up a basis; of further ones only the linear do."""
+
+RESPONSES = 24
+"""Modes that the responses to nodal forces add to those of footprints, for the rigid tip."""
+
+RESOLUTION = 2e-6
+"""Displacement (mm) that a step of a stored mode amounts to where the mode is at work: a mode of
+small amplitude is stored in coarse steps, which compress well."""
+
 
 @dataclass(frozen=True)
 class Footprint:
-    """Where and how hard the endoscope presses for Ritz vectors.
+    """Where and how hard the endoscope presses."""
 
-    Attributes
-    ----------
-    point, normal : ndarray, shape (3,)
-        mm, and outward normal.
-    pressure : float, kPa
-        Scale of the load.
-    """
+    point: Array  # (3,) mm
+    normal: Array  # (3,) outward
+    pressure: float  # kPa, scale of the load
 
-    point: Array
-    normal: Array
-    pressure: float
+    @classmethod
+    def of(cls, surface: Surface, point: Array, limits: Array) -> Footprint:
+        """At a point near the surface, with the load range ``limits`` at its vertices."""
+        x, normal, _, fields = surface.locate(point, limits)
+        return cls(x, normal, float(fields[0]))
 
     @property
     def loads(self) -> Array:
@@ -68,65 +74,52 @@ class Footprint:
         frame[1:] *= TANGENTIAL
         return self.pressure * frame
 
-    def path_derivatives(self, vectors: Array, loads: Array) -> tuple[Array, Array, Array]:
-        """First, second and third derivative (n, k) along the paths to ``loads`` (n, 3) kPa.
+    def series(self, vectors: Array, loads: Array) -> tuple[Array, Array, Array]:
+        """Displacements (n, k) under ``loads`` (n, 3) kPa of first, second and third order in them.
 
         ``vectors`` (k, 19) are coefficients of its ``ritz_vectors``: forms in the load, given by
         their values on lattices.
         """
-        t = _solve(self.loads.T, loads.T).T
-        second = _solve(_monomials(_lattice(2), 2).T, _monomials(t, 2).T)
-        third = _solve(_monomials(_lattice(3), 3).T, _monomials(t, 3).T)
-        first = vectors[:, :3] @ t.T
-        return first.T, 2 * (vectors[:, 3:9] @ second).T, 6 * (vectors[:, 9:] @ third).T
+        t = np.asarray(np.linalg.solve(self.loads.T, loads.T).T, float)
+        second, third = _form(t, 2), _form(t, 3)
+        return t @ vectors[:, :3].T, second @ vectors[:, 3:9].T, third @ vectors[:, 9:].T
 
 
 def ritz_vectors(model: FullModel, loads: Array) -> Array:
-    """Nonlinear Ritz vectors of a footprint's three load directions.
+    """Nonlinear Ritz vectors (free dofs, k) mm of some load directions.
 
-    Parameters
-    ----------
-    model : FullModel
-    loads : ndarray, shape (free dofs, 3), mN
-        One column per direction, scaled to the loads expected.
-
-    Returns
-    -------
-    vectors : ndarray, shape (free dofs, 19), mm
-        3 of first, 6 of second (over 2!), 10 of third order (over 3!).
+    They are of first, second (over 2!) and third order (over 3!): 3 + 6 + 10 of three directions.
+    ``loads`` (free dofs, d) mN, a column per direction, are scaled to the loads expected.
     """
     first = model.solve_linear(loads)
-    second_at, third_at = _lattice(2), _lattice(3)
-    paths = first @ second_at.T
+    second_at, third_at = (_lattice(order, loads.shape[1]) for order in (2, 3))
     second = model.solve_linear(
-        np.stack([-_even_part(model, a, SECOND_STEP) for a in paths.T], axis=1)
+        np.stack([-_even_part(model, a, SECOND_STEP) for a in second_at @ first.T], axis=1)
     )
-    # the second-order vector of any direction follows from those six: a quadratic form
-    forms = np.linalg.solve(_monomials(second_at, 2).T, _monomials(third_at, 2).T).T
-    rows = [
-        -_odd_part(model, a, b, THIRD_STEP)
-        for a, b in zip((first @ third_at.T).T, (second @ forms.T).T, strict=True)
-    ]
-    third = model.solve_linear(np.stack(rows, axis=1))
+    # the second-order vector of any direction follows from those: a quadratic form
+    paths = zip(third_at @ first.T, _form(third_at, 2) @ second.T, strict=True)
+    third = model.solve_linear(
+        np.stack([-_odd_part(model, a, b, THIRD_STEP) for a, b in paths], axis=1)
+    )
     return np.hstack([first, second / 2, third / 6])
 
 
-def path_vectors(model: FullModel, load: Array) -> Array:
-    """First three derivatives (free dofs, 3) of the equilibrium along the path of a load (mN)."""
-    first = model.solve_linear(load[:, None])[:, 0]
-    second = model.solve_linear(-_even_part(model, first, SECOND_STEP)[:, None])[:, 0]
-    third = model.solve_linear(-_odd_part(model, first, second, THIRD_STEP)[:, None])[:, 0]
-    return np.stack([first, second, third], axis=1)
-
-
-def _solve(A: Array, B: Array) -> Array:
-    return np.asarray(np.linalg.solve(A, B), dtype=float)
+def _lattice(order: int, variables: int) -> Array:
+    """Directions on which every form of this order is determined."""
+    points = [p for p in itertools.product(range(order + 1), repeat=variables) if sum(p) == order]
+    return np.array(points, dtype=float) / order
 
 
 def _monomials(t: Array, degree: int) -> Array:
-    """All monomials of a degree in three variables: (k, 3) to (k, 6) or (k, 10)."""
-    factors = itertools.combinations_with_replacement(range(3), degree)
+    """All monomials of a degree in the columns of t (n, variables)."""
+    factors = itertools.combinations_with_replacement(range(t.shape[1]), degree)
     return np.stack([t[:, list(f)].prod(axis=1) for f in factors], axis=1)
+
+
+def _form(t: Array, degree: int) -> Array:
+    """Weights (n, k) of a form's values on its lattice in those at t (n, variables)."""
+    at = _monomials(_lattice(degree, t.shape[1]), degree)
+    return np.asarray(np.linalg.solve(at.T, _monomials(t, degree).T).T, float)
 
 
 def _even_part(model: FullModel, a: Array, step: float) -> Array:
@@ -144,20 +137,10 @@ def _odd_part(model: FullModel, a: Array, b: Array, step: float) -> Array:
 
 
 def energy_pod(model: FullModel, vectors: Array, size: int) -> tuple[Array, Array]:
-    """Proper orthogonal decomposition in the energy of the rest state.
+    """Proper orthogonal decomposition of vectors (free dofs, k) mm in the energy at rest.
 
-    Parameters
-    ----------
-    vectors : ndarray, shape (free dofs, k), mm
-    size : int
-        Modes wanted; fewer come back if the vectors have no more to give.
-
-    Returns
-    -------
-    modes : ndarray, shape (free dofs, <= size)
-        ``modes.T @ K @ modes = I``.
-    energies : ndarray, shape (k,)
-        Eigenvalues of the Gram matrix, descending.
+    Returns modes (free dofs, <= size), ``modes.T @ K @ modes = I``, fewer if the vectors have no
+    more to give, and eigenvalues (k,) of the Gram matrix, descending.
     """
     gram = vectors.T @ (model.rest_stiffness @ vectors)
     energies, Q = np.linalg.eigh(gram)
@@ -196,3 +179,80 @@ def local_modes(coefficients: Array, size: int) -> Array:
     gram[filled, filled] += FILL * np.trace(gram)
     Q = np.linalg.eigh(gram)[1]
     return np.ascontiguousarray(Q[:, : -size - 1 : -1])
+
+
+@dataclass(frozen=True)
+class Region:
+    """Basis of a region, and what local models learn from."""
+
+    basis: NDArray[np.int16]  # (M, 3 n) in steps
+    steps: NDArray[np.float32]  # (M,) mm
+    orthonormal: NDArray[np.float32]  # (M, M) columns, in the basis: orthonormal in energy at rest
+    ritz: NDArray[np.float32]  # (k, M, 19 or more) in those, of the relaxed tissue last
+
+    def truncate(self, modes: int) -> Region:
+        """The leading modes; ``orthonormal`` is triangular, so its leading block stays right."""
+        basis, steps, ritz = self.basis[:modes], self.steps[:modes], self.ritz[:, :modes]
+        return Region(basis, steps, self.orthonormal[:modes, :modes], ritz)
+
+
+def region(problem: FullProblem, footprints: list[Footprint], modes: int) -> Region:
+    """Basis of a region and the Ritz vectors of footprints in it."""
+    model = problem.model
+    vectors = np.stack([_ritz(problem, footprint) for footprint in footprints], axis=1)
+    first = np.arange(vectors.shape[2]) % RITZ_VECTORS < 3
+    apart = -(-len(footprints) // POINTS_IN_BASIS)
+    linear, rest = vectors[:, :, first], vectors[:, ::apart, ~first]
+    wanted = [part.reshape(len(model.free), -1) for part in (linear, rest)]
+    basis, _ = energy_pod(model, np.hstack(wanted), modes)
+    vectors = vectors.reshape(len(model.free), -1)
+    amplitude = np.sqrt(np.mean(((model.rest_stiffness @ basis).T @ vectors) ** 2, axis=1))
+    if problem.scene.endoscope.tip:
+        points = np.array([footprint.point for footprint in footprints])
+        responses = _nodal_responses(problem, points, basis)
+        # in front, where a truncation does not reach; in the finest steps
+        basis = np.hstack([responses, basis])
+        amplitude = np.concatenate([np.full(responses.shape[1], np.inf), amplitude])
+    largest = np.abs(basis).max(axis=0)
+    steps = np.clip(RESOLUTION / amplitude, largest / np.iinfo(np.int16).max, largest / 100)
+    stored = np.round(basis / steps).astype(np.int16)
+    # rounding costs the modes their orthonormality: give it back by a change of coordinates
+    rounded = stored * steps.astype(np.float32)
+    stiff = model.rest_stiffness @ rounded
+    L = np.linalg.cholesky(rounded.T @ stiff)
+    full = np.zeros((len(steps), 3 * len(problem.mesh.nodes)), np.int16)
+    full[:, model.free] = stored.T
+    ritz = np.linalg.solve(L, stiff.T @ vectors).reshape(len(steps), len(footprints), -1)
+    return Region(
+        basis=full,
+        steps=steps.astype(np.float32),
+        orthonormal=np.linalg.inv(L).T.astype(np.float32),
+        ritz=np.moveaxis(ritz, 1, 0).astype(np.float32),
+    )
+
+
+def _nodal_responses(problem: FullProblem, points: Array, basis: Array) -> Array:
+    """Modes (free dofs, <= RESPONSES) of the responses to normal forces on single nodes.
+
+    The nodes are those near the points (k, 3) mm.  Footprints spread a load over a disc, which a
+    rigid tip does not; what the basis holds already is left out.
+    """
+    model, radius = problem.model, problem.scene.endoscope.radius
+    nodes = problem.body.touchable[1]
+    nodes = nodes[~problem.mesh.clamped[nodes]]
+    nodes = nodes[cKDTree(points).query(problem.mesh.nodes[nodes])[0] < radius]
+    loads = np.zeros((len(problem.mesh.nodes), 3, len(nodes)))
+    for i, node in enumerate(nodes):
+        loads[node, :, i] = problem.surface.project(problem.mesh.nodes[node])[1]
+    responses = model.solve_linear(loads.reshape(-1, len(nodes))[model.free])
+    for _ in range(2):  # twice is enough for orthogonality
+        responses -= basis @ ((model.rest_stiffness @ basis).T @ responses)
+    return energy_pod(model, responses, RESPONSES)[0]
+
+
+def _ritz(problem: FullProblem, footprint: Footprint) -> Array:
+    """Nonlinear Ritz vectors, and those of the relaxed tissue if time changes it."""
+    nodal, _ = problem.unit_load(footprint.point)
+    loads = (nodal[:, None, None] * footprint.loads.T).reshape(-1, 3)[problem.model.free]
+    models = [problem.model, problem.model.relaxed] if problem.model.prony else [problem.model]
+    return np.hstack([ritz_vectors(model, loads) for model in models])

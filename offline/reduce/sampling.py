@@ -17,23 +17,18 @@ Array = NDArray[np.float64]
 CANDIDATES = 20
 """Random candidates per point wanted, from which the farthest are taken."""
 
-
 LLOYD_SAMPLE, LLOYD_STEPS = 100, 40
 
 
-def area(surface: Surface) -> float:
-    """Area of the surface, mm^2."""
-    return float(_triangle_areas(surface).sum())
-
-
-def _triangle_areas(surface: Surface) -> Array:
+def triangle_areas(surface: Surface) -> Array:
+    """Areas (t,) of the triangles of a surface, mm^2."""
     a, b, c = np.moveaxis(surface.vertices[surface.triangles], 1, 0)
     return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
 
 
 def random_points(surface: Surface, count: int, rng: np.random.Generator) -> Array:
     """Points uniform over the surface, (count, 3) mm."""
-    areas = _triangle_areas(surface)
+    areas = triangle_areas(surface)
     triangle = rng.choice(len(areas), count, p=areas / areas.sum())
     r, s = np.sqrt(rng.random(count)), rng.random(count)
     weights = np.stack([1 - r, r * (1 - s), r * s], axis=1)
@@ -95,7 +90,7 @@ def fewer(count: int, tolerance: Tolerance) -> int:
 
 def spacing_count(surface: Surface, spacing: float) -> int:
     """How many points have the given mean spacing (mm) on the surface (hexagonal packing)."""
-    return max(1, round(area(surface) * 2 / (math.sqrt(3) * spacing**2)))
+    return max(1, round(triangle_areas(surface).sum() * 2 / (math.sqrt(3) * spacing**2)))
 
 
 def neighbours(points: Array, at: Array, radius: float) -> list[NDArray[np.int64]]:
@@ -119,10 +114,6 @@ def cone(
 
 def tangents(normal: Array) -> tuple[Array, Array]:
     """Two unit vectors that complete ``normal`` to an orthonormal frame."""
-    i = int(np.argmin(np.abs(normal)))
-    j, k = (i + 1) % 3, (i + 2) % 3
-    across = math.hypot(normal[j], normal[k])
-    t, b = np.zeros(3), np.empty(3)
-    t[j], t[k] = normal[k] / across, -normal[j] / across  # normal x axis i
-    b[i], b[j], b[k] = -across, normal[i] * normal[j] / across, normal[i] * normal[k] / across
-    return t, b
+    t = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    t /= np.linalg.norm(t)
+    return t, np.cross(normal, t)

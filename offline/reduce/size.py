@@ -9,14 +9,21 @@ pay for trials of large models.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.fem.norms import statistics
+from palpate.offline.fem.norms import relative, statistics
+from palpate.offline.fem.problem import FullProblem
+from palpate.offline.reduce.footprint_models import LocalTrainer, RandomLoads, train_patch
+from palpate.offline.reduce.join import nodal_modes
+from palpate.offline.reduce.layout import Patch
+from palpate.offline.reduce.ritz import region
+from palpate.offline.run.streams import Stage, stream
 from palpate.shared.mechanics.laws import AnyTissue
 from palpate.shared.mechanics.tissue import lame
 from palpate.shared.scene import Budget, Size, Tolerance
@@ -50,9 +57,10 @@ MARGIN = 0.8
 WORST = 3.0
 """Multiple of the tolerance that its largest error may reach."""
 
+TRIAL_LOADS = 10
 
-@dataclass(frozen=True)
-class TrialResult:
+
+class TrialResult(NamedTuple):
     """One patch on loads it has not seen: relative errors (k,) and median time of a solve, s."""
 
     displacement: Array
@@ -60,9 +68,35 @@ class TrialResult:
     seconds: float
 
 
+def try_patch(problem: FullProblem, patch: Patch) -> TrialResult:
+    """Train a local model by itself and judge it on loads it has not seen."""
+    basis = region(problem, patch.footprints, patch.size.region_modes)
+    trained = train_patch(problem, basis, patch, tip=False)
+    models = replace(trained, basis=basis.basis[None], steps=basis.steps[None])
+    trainer, nodal = LocalTrainer(problem, models), nodal_modes(models, models.modes[0])
+    loads = RandomLoads(problem.scene, patch, stream(patch.seed, Stage.TRIAL_LOADS))
+    kept, errors = problem.beyond_clamped_layer, list[tuple[float, float]]()
+    seconds = list[float]()
+    while len(seconds) < TRIAL_LOADS:
+        load = loads.any()
+        known = problem.reference([load])
+        if known is None:
+            continue
+        started = time.perf_counter()
+        sample = trainer.solve(load)
+        seconds.append(time.perf_counter() - started)
+        errors.append((np.inf, np.inf))
+        if sample is not None:
+            u = (sample.q @ nodal).reshape(-1, 3)
+            stress = relative(problem.von_mises(u)[kept], known.s[0][kept])
+            errors[-1] = relative(u, known.u[0]), stress
+    displacement, von_mises = np.transpose(errors)
+    return TrialResult(displacement, von_mises, float(np.median(seconds)))
+
+
 @dataclass(frozen=True)
 class Trial:
-    """A size on all the patches it was tried on."""
+    """A size on all the patches it was tried on, as an artifact keeps it."""
 
     size: Size
     displacement: dict[str, float]
@@ -71,57 +105,48 @@ class Trial:
     solve_us: float
 
     @classmethod
-    def of(cls, size: Size, results: list[TrialResult]) -> Trial:
+    def of(cls, size: Size, results: Sequence[TrialResult]) -> Trial:
         """Gather the results of the patches, without the one of the largest error.
 
         Where the tissue gives way the load range is lowered only after training: loads beyond that
         say nothing about a size.
         """
-        worst = np.argmax([r.displacement.max() for r in results])
-        kept = [r for i, r in enumerate(results) if i != worst] or results
-        displacement = np.concatenate([r.displacement for r in kept])
-        return cls(
-            size,
-            statistics(displacement),
-            statistics(np.concatenate([r.von_mises for r in kept])),
-            len(displacement),
-            1e6 * float(np.median([r.seconds for r in results])),
-        )
+        worst = np.argmax([result.displacement.max() for result in results])
+        kept = [result for i, result in enumerate(results) if i != worst] or results
+        displacement = np.concatenate([result.displacement for result in kept])
+        von_mises = statistics(np.concatenate([result.von_mises for result in kept]))
+        seconds = float(np.median([result.seconds for result in results]))
+        loads = len(displacement)
+        return cls(size, statistics(displacement), von_mises, loads, round(1e6 * seconds, 1))
 
     def meets(self, tolerance: Tolerance) -> bool:
         """Whether errors are within tolerance, with a margin."""
-        return max(self._shares(tolerance)) <= 1.0
+        return self.over(tolerance) <= 1.0
 
-    def _shares(self, tolerance: Tolerance) -> list[float]:
-        """Errors over what they may be."""
-        return [
+    def over(self, tolerance: Tolerance) -> float:
+        """Largest ratio of an error to what it may be, less the margin."""
+        return max(
             errors[key] / (share * allowed)
             for errors, allowed in (
                 (self.displacement, tolerance.displacement),
                 (self.von_mises, tolerance.von_mises),
             )
             for key, share in (("p95", MARGIN), ("max", WORST))
-        ]
+        )
 
     def rungs_to(self, tolerance: Tolerance) -> int:
         """How many sizes further up a tolerance may just be met, by the fall of the error."""
-        worst = max(self._shares(tolerance))
-        return math.ceil(math.log(worst) / -math.log(RUNG)) if 0 < worst < math.inf else 1
+        over = self.over(tolerance)
+        return math.ceil(math.log(over) / -math.log(RUNG)) if 0 < over < math.inf else 1
 
-    @property
-    def document(self) -> dict[str, Any]:
-        """What an artifact keeps of it."""
-        return {
-            "size": self.size.model_dump(),
-            "displacement": self.displacement,
-            "von_mises": self.von_mises,
-            "loads": self.loads,
-            "solve_us": round(self.solve_us, 1),
-        }
+    def __str__(self) -> str:
+        return (
+            f"95th percentile of errors on {self.loads} trial loads "
+            f"{self.displacement['p95']:.2%} displacement, {self.von_mises['p95']:.2%} von Mises"
+        )
 
 
-@dataclass(frozen=True)
-class Choice:
+class Choice(NamedTuple):
     """A chosen size, the trials from the smallest to the largest, and why in words."""
 
     size: Size
@@ -131,7 +156,8 @@ class Choice:
     @property
     def document(self) -> dict[str, Any]:
         """What an artifact keeps of it."""
-        return {"why": self.why, "tried": [trial.document for trial in self.trials]}
+        tried = [vars(trial) | {"size": trial.size.model_dump()} for trial in self.trials]
+        return {"why": self.why, "tried": tried}
 
 
 def ladder(tissue: AnyTissue) -> tuple[Size, ...]:
@@ -158,17 +184,9 @@ def first_place(tolerance: Tolerance) -> int:
 def choose(
     sizes: Sequence[Size], tolerance: Tolerance, budget: Budget, attempt: Callable[[Size], Trial]
 ) -> Choice:
-    """Find the smallest size of a ladder that meets the tolerance.
+    """Find the smallest of sizes in ascending order that meets the tolerance.
 
-    Parameters
-    ----------
-    sizes : sequence of Size
-        From the smallest to the largest.
-    tolerance : Tolerance
-    budget : Budget
-        A size over it is chosen all the same, and the reason says so.
-    attempt : callable
-        Tries a size.
+    A size over the budget is chosen all the same, and the reason says so.
     """
     trials: dict[int, Trial] = {}
     low, high = 0, len(sizes) - 1
@@ -192,24 +210,16 @@ def _reason(
     tolerance: Tolerance, budget: Budget, chosen: Trial, tried: list[Trial], sizes: int
 ) -> str:
     if chosen.meets(tolerance):
-        why = f"the smallest of {sizes} sizes that meets the tolerance: {_errors(chosen)}"
+        why = f"the smallest of {sizes} sizes that meets the tolerance: {chosen}"
     else:
         why = (
             f"no size meets the tolerance of {tolerance.displacement:.2%} and "
-            f"{tolerance.von_mises:.2%}; this is the most accurate: {_errors(chosen)}"
+            f"{tolerance.von_mises:.2%}; this is the most accurate: {chosen}"
         )
     allowed = 1e6 * budget.query
     if chosen.solve_us > allowed:
         why += f"; it takes {chosen.solve_us:.0f} µs to solve, over the budget of {allowed:.0f} µs"
         within = [trial for trial in tried if trial.solve_us <= allowed]
         if within:
-            best = within[-1]
-            why += f"; the best within it: {_errors(best)} in {best.solve_us:.0f} µs"
+            why += f"; the best within it: {within[-1]} in {within[-1].solve_us:.0f} µs"
     return why
-
-
-def _errors(trial: Trial) -> str:
-    return (
-        f"95th percentile of errors on {trial.loads} trial loads "
-        f"{trial.displacement['p95']:.2%} displacement, {trial.von_mises['p95']:.2%} von Mises"
-    )

@@ -1,14 +1,21 @@
-"""Tasks on many cores: worker processes with a full model each, results as they come.
+"""Tasks on many cores, and their results on disk, so that a killed run goes on where it stopped.
 
 A task is a function of a ``FullProblem`` with its further arguments, which are picklable.  Any
 executor with the ``concurrent.futures`` interface can run it, if ``open_scene`` or
 ``open_artifact`` initializes its workers.
+
+Each result is a file of its own, written aside and moved into place: whatever the moment of
+a kill, a result is there or it is not.  The folder is named by a hash of everything the results
+depend on, so stale ones are never read.
 """
 
 from __future__ import annotations
 
+import hashlib
 import multiprocessing
 import os
+import pickle
+import shutil
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
@@ -18,14 +25,13 @@ from typing import Any
 from tqdm import tqdm
 
 from palpate.offline.fem.problem import FullProblem
-from palpate.offline.run.checkpoint import Checkpoint
 from palpate.shared.artifact import read_artifact
-from palpate.shared.scene import parse_scene
+from palpate.shared.scene import Extrusion, Scene, parse_scene
 
 Tasks = Mapping[str, tuple[Any, ...]]
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-
+CODE = ("offline", "shared")
 
 _problem: FullProblem | None = None
 
@@ -91,6 +97,59 @@ def completed(
     finally:
         for future in futures:
             future.cancel()
+
+
+def content_key(scene: Scene) -> str:
+    """Hash of the scene, the files it names and the code that trains it."""
+    root = Path(__file__).parents[2]
+    sha = hashlib.sha256(scene.text.encode())
+    if isinstance(scene.geometry, Extrusion) and scene.folder is not None:
+        sha.update((scene.folder / scene.geometry.section).read_bytes())
+    for package in CODE:
+        for source in sorted((root / package).rglob("*.py")):
+            sha.update(source.read_bytes())
+    return sha.hexdigest()[:16]
+
+
+class Checkpoint:
+    """Named results of one training run, in the folder where runs of this artifact keep theirs.
+
+    The key is from ``content_key``; results of other keys are removed.
+    """
+
+    def __init__(self, folder: Path, key: str) -> None:
+        self.key = key
+        self._parent = folder
+        self._folder = folder / key
+        if folder.is_dir():
+            for other in folder.iterdir():
+                if other != self._folder:
+                    shutil.rmtree(other)
+        self._folder.mkdir(parents=True, exist_ok=True)
+
+    def _path(self, name: str) -> Path:
+        return self._folder / f"{name}.pickle"
+
+    def __contains__(self, name: str) -> bool:
+        return self._path(name).is_file()
+
+    def load(self, name: str) -> Any:
+        """Read a result that is there."""
+        return pickle.loads(self._path(name).read_bytes())
+
+    def store(self, name: str, result: object) -> Path:
+        """Keep a result; return where, for workers to read it with ``pickle``."""
+        path = self._path(name)
+        temporary = path.with_suffix(".part")
+        with temporary.open("wb") as file:
+            pickle.dump(result, file)
+            file.flush()
+            os.fsync(file.fileno())
+        return temporary.replace(path)
+
+    def remove(self) -> None:
+        """Forget everything: the artifact is written."""
+        shutil.rmtree(self._parent)
 
 
 def resume(title: str, executor: Executor, checkpoint: Checkpoint, tasks: Tasks) -> dict[str, Any]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -38,38 +37,27 @@ GROUPS: dict[str, tuple[str, dict[str, str]]] = {
     "Finite elements": ("#000000", {"full": "full model, several meshes"}),
     "Modes of the body at rest": (
         "#0072B2",
-        {
-            "modal": "vibration modes",
-            "ritz": "responses to loads (Ritz)",
-            "krylov": "load-dependent vectors (Krylov)",
-        },
-    ),
-    "Modes made for each load": (
-        "#56B4E9",
-        {"ritz-at-hand": "Ritz vectors", "derivatives": "static derivatives"},
-    ),
-    "POD of full solutions": (
-        "#009E73",
-        {"pod": "energy norm", "pod-euclidean": "Euclidean norm"},
+        {"modal": "vibration modes", "ritz": "responses to loads (Ritz)",
+         "krylov": "load-dependent vectors (Krylov)"},
     ),
     "POD, hyper-reduced": (
         "#E69F00",
-        {
-            "pod-ecm": "cubature of points (ECM)",
-            "pod-ecsw": "cubature of elements (ECSW)",
-            "pod-deim": "interpolation (DEIM)",
-            "pod-gappy": "least squares (gappy POD)",
-        },
+        {"pod-ecm": "cubature of points (ECM)", "pod-ecsw": "cubature of elements (ECSW)",
+         "pod-deim": "interpolation (DEIM)", "pod-gappy": "least squares (gappy POD)"},
+    ),
+    "Modes made for each load": (
+        "#56B4E9", {"ritz-at-hand": "Ritz vectors", "derivatives": "static derivatives"}
+    ),
+    "POD of full solutions": (
+        "#009E73", {"pod": "energy norm", "pod-euclidean": "Euclidean norm"}
     ),
     "No equilibrium solved": (
-        "#CC79A7",
-        {"linear": "linear response", "regression": "regression (RBF)"},
+        "#CC79A7", {"linear": "linear response", "regression": "regression (RBF)"}
     ),
     "Springs and tetrahedra": (
-        "#7A7A7A",
-        {"mass-spring": "mass-spring", "tensor-mass": "tensor-mass"},
+        "#7A7A7A", {"mass-spring": "mass-spring", "tensor-mass": "tensor-mass"}
     ),
-}
+}  # fmt: skip
 """Colour of a group, and the names of its methods by family; a marker each, in this order."""
 
 MARKERS, OUR_MARKERS = ("o", "s", "^", "D"), ("*", "P")
@@ -107,14 +95,13 @@ def pareto(rows: Sequence[Row], error: str = "displacement_p95") -> list[Row]:
     return front
 
 
-@dataclass(frozen=True)
-class Panel:
-    """One pair of axes: a statistic of an error, and what the error is of."""
+class Panel(NamedTuple):
+    """One pair of axes: an error and a statistic of it."""
 
     title: str
-    axis: str
     field: str
     statistic: str = "p95"
+    axis: str = "error, 95th percentile"
 
     @property
     def error(self) -> str:
@@ -127,67 +114,44 @@ class Panel:
         return [row for row in known if self.field == "refined" or row["key"] != FULL]
 
 
-@dataclass(frozen=True)
-class Layout:
-    """A chart: its file, title with a place for the scene's name, what a time is of, panels."""
+class Layout(NamedTuple):
+    """A chart: its file, what a time is of, panels."""
 
     name: str
-    title: str
     per: str
     panels: tuple[Panel, ...]
-
-    @property
-    def grid(self) -> tuple[int, int]:
-        """Rows and columns of the panels and of the legend, which comes last."""
-        return (2, 2) if len(self.panels) == 3 else (1, len(self.panels) + 1)
+    grid: tuple[int, int]  # of the panels and of the legend, which comes last
 
 
-OF_LOADS = Layout(
-    "chart",
-    "Speed and accuracy of methods on the scene {!r}: lower left is better",
-    "query",
-    (
-        Panel("Displacement", "error against the full model, 95th percentile", "displacement"),
-        Panel("Von Mises stress", "error against the full model, 95th percentile", "von_mises"),
-        Panel(
-            "Displacement, error of the mesh included",
-            "error against a refined mesh, median",
-            "refined",
-            "median",
-        ),
-    ),
-)
-IN_TIME = Layout(
-    "chart_in_time",
-    "Speed and accuracy over histories of the scene {!r}: lower left is better",
-    "step",
-    (
-        Panel("Displacement", "error over a history, 95th percentile", "displacement"),
-        Panel("Von Mises stress", "error over a history, 95th percentile", "von_mises"),
-    ),
-)
+FIELD_PANELS = Panel("Displacement", "displacement"), Panel("Von Mises stress", "von_mises")
+MESH_PANEL = Panel(
+    "Displacement, error of the mesh included", "refined", "median",
+    "error against a refined mesh, median",
+)  # fmt: skip
+OF_LOADS = Layout("chart", "query", (*FIELD_PANELS, MESH_PANEL), (2, 2))
+IN_TIME = Layout("chart_in_time", "step", FIELD_PANELS, (1, 3))
+TITLE = "Speed and accuracy of methods on the scene {!r}: lower left is better"
 NOTE = """\
 A point is a method of one size; a line joins its sizes.
-Errors are relative L2 norms over random queries that no
-method has seen; whiskers show the worst. At 100 % an
-answer is no better than none. Dashed: the Pareto front;
-nothing is both faster and more accurate than what lies
-on it."""
+Errors are relative L2 norms against the full model over
+random queries, or histories, that no method has seen;
+whiskers show the worst. At 100 % an answer is no better
+than none. Dashed: the Pareto front; nothing is both
+faster and more accurate than what lies on it."""
 
 
 class Look(NamedTuple):
     """How a method is drawn."""
 
-    family: str
     name: str
     group: str
     colour: str
     marker: str
 
     @property
-    def ours(self) -> bool:
-        """Whether it is Palpate's, which stands out."""
-        return self.marker in OUR_MARKERS
+    def size(self) -> float:
+        """Of the marker, points; what is Palpate's stands out."""
+        return {"*": 17.0, "P": 11.0}.get(self.marker, 5.5)
 
 
 def looks(rows: Sequence[Row]) -> Iterator[tuple[Look, list[Row]]]:
@@ -197,7 +161,7 @@ def looks(rows: Sequence[Row]) -> Iterator[tuple[Look, list[Row]]]:
         markers = OUR_MARKERS if title == "Palpate" else MARKERS
         for (family, name), marker in zip(methods.items(), markers, strict=False):
             if own := [row for row in rows if row["family"] == family]:
-                yield Look(family, name, title, colour, marker), own
+                yield Look(name, title, colour, marker), own
 
 
 def duration(microseconds: float) -> str:
@@ -223,15 +187,18 @@ def draw(path: Path, rows: Sequence[Row], scene: Scene, layout: Layout) -> None:
     down, across = layout.grid
     figure = Figure(figsize=(6.25 * across, 5.4 * down), layout="constrained")
     grid = figure.subplots(down, across).ravel()
-    figure.suptitle(layout.title.format(scene.name), fontsize=15, fontweight="bold")
+    figure.suptitle(TITLE.format(scene.name), fontsize=15, fontweight="bold")
     for axes, panel in zip(grid, layout.panels, strict=False):
-        _draw_panel(axes, panel, rows, scene, layout.per)
+        _draw_panel(axes, panel, rows, layout.per)
+        _draw_goals(axes, panel, rows, scene, layout.per)
+        _draw_names(axes, panel, rows)
     _draw_legend(grid[-1], rows)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)
 
 
-def _draw_panel(axes: Axes, panel: Panel, rows: Sequence[Row], scene: Scene, per: str) -> None:
+def _draw_panel(axes: Axes, panel: Panel, rows: Sequence[Row], per: str) -> None:
+    """Points of all methods and the Pareto front."""
     kept, error = panel.plotted(rows), panel.error
     axes.set(xscale="log", yscale="log", xlabel=f"time per {per} on one core", ylabel=panel.axis)
     axes.set_title(panel.title, fontsize=12.5, fontweight="bold", loc="left")
@@ -243,29 +210,31 @@ def _draw_panel(axes: Axes, panel: Panel, rows: Sequence[Row], scene: Scene, per
         times, errors = [row["time_us"] for row in own], [row[error] for row in own]
         largest = [row[f"{panel.field}_max"] for row in own]
         axes.vlines(times, errors, largest, look.colour, lw=0.8, alpha=0.3)
-        size, order = {"*": 17.0, "P": 11.0}.get(look.marker, 5.5), 5 if look.ours else 3
         axes.plot(
-            times, errors, look.marker, ls="-", lw=0.9, color=look.colour, markersize=size,
-            markeredgecolor="white", markeredgewidth=0.6, zorder=order,
+            times, errors, look.marker, ls="-", lw=0.9, color=look.colour, markersize=look.size,
+            markeredgecolor="white", markeredgewidth=0.6, zorder=3,
         )  # fmt: skip
-    times = [row["time_us"] for row in rows]
-    errors = [row[error] for row in kept]
+    times, errors = [row["time_us"] for row in rows], [row[error] for row in kept]
     axes.set_xlim(min(times) / 1.8, max(times) * 2)
     axes.set_ylim(min(errors) / 3, max(2 * max(errors), 1.5))
     front = pareto(kept, error)
     times = [*(row["time_us"] for row in front), axes.get_xlim()[1]]
     errors = [row[error] for row in (*front, front[-1])]
     axes.step(times, errors, where="post", color="0.25", lw=1.3, ls=(0, (4, 2)), zorder=2)
-    _draw_full(axes, panel, rows)
-    if panel.field != "refined":
-        _draw_aim(axes, panel, scene, per)
-    _draw_names(axes, error, kept)
 
 
-def _draw_aim(axes: Axes, panel: Panel, scene: Scene, per: str) -> None:
-    """Box of the scene's tolerance, which is one of reduction, and of its budget for a query."""
+def _draw_goals(axes: Axes, panel: Panel, rows: Sequence[Row], scene: Scene, per: str) -> None:
+    """The full model on the scene's mesh, and the scene's tolerance of reduction and budget."""
+    full = next(row for row in rows if row["key"] == FULL)
+    (left, right), (bottom, top), error = axes.get_xlim(), axes.get_ylim(), full[panel.error]
+    if panel.field == "refined":
+        axes.axhline(error, color="0.4", lw=0.9, ls=":")
+        _write(axes, f"error of the\nscene's mesh: {percent(error)}", (left, error), (8, -28))
+        return
+    axes.axvline(full["time_us"], color="black", lw=0.9, ls=":")
+    where = full["time_us"], bottom ** (2 / 3) * top ** (1 / 3)
+    _write(axes, f"full model:\n{duration(full['time_us'])},\nno error", where, (6, 0))
     tolerance = getattr(scene.tolerance, panel.field)
-    (left, right), (bottom, _) = axes.get_xlim(), axes.get_ylim()
     text = f"aim: {percent(tolerance)}"
     if per == "query":
         right = 1e6 * scene.budget.query
@@ -274,33 +243,19 @@ def _draw_aim(axes: Axes, panel: Panel, scene: Scene, per: str) -> None:
     _write(axes, text, (left, bottom), (8, 8), color=DARK_ACCENT)
 
 
-def _draw_full(axes: Axes, panel: Panel, rows: Sequence[Row]) -> None:
-    """Where the full model on the scene's mesh is: a time without error, or the mesh's error."""
-    full = next(row for row in rows if row["key"] == FULL)
-    (bottom, top), time, error = axes.get_ylim(), full["time_us"], full[panel.error]
-    if panel.field == "refined":
-        axes.axhline(error, color="0.4", lw=0.9, ls=":")
-        text = f"error of the\nscene's mesh: {percent(error)}"
-        _write(axes, text, (axes.get_xlim()[0], error), (8, -28))
-        return
-    axes.axvline(time, color="black", lw=0.9, ls=":")
-    text = f"full model:\n{duration(time)},\nno error"
-    _write(axes, text, (time, bottom ** (2 / 3) * top ** (1 / 3)), (6, 0))
-
-
-def _draw_names(axes: Axes, error: str, kept: Sequence[Row]) -> None:
+def _draw_names(axes: Axes, panel: Panel, rows: Sequence[Row]) -> None:
+    kept = panel.plotted(rows)
     twin = [row["time_us"] for row in kept if row["key"] == TWIN]
     for look, own in looks(kept):
         for row in own:
-            time, at = row["time_us"], (row["time_us"], row[error])
+            at = time, error = row["time_us"], row[panel.error]
             if row["key"] in NAMES:
                 text, offset, side = NAMES[row["key"]]
                 _write(axes, text, at, offset, ha=side, color=look.colour)
             elif row["key"] == SHIPPED:
-                text = f"Palpate: {percent(row[error])}\nin {duration(time)}"
+                text = f"Palpate: {percent(error)}\nin {duration(time)}"
                 text += "".join(f",\n{time / x:.1f} x that without memory" for x in twin)
-                bold = {"fontweight": "bold", "fontsize": 11}
-                _write(axes, text, at, (12, -32), color=DARK_ACCENT, **bold)
+                _write(axes, text, at, (12, -32), color=DARK_ACCENT, fontweight="bold")
 
 
 def _write(
@@ -310,12 +265,7 @@ def _write(
     from matplotlib.patheffects import withStroke
 
     halo = [withStroke(linewidth=2.5, foreground="white", alpha=0.8)]
-    style: dict[str, Any] = {
-        "fontsize": 9.5,
-        "path_effects": halo,
-        "zorder": 6,
-        "linespacing": 1.1,
-    } | how
+    style: dict[str, Any] = {"fontsize": 9.5, "path_effects": halo, "zorder": 6} | how
     axes.annotate(text, where, offset, textcoords="offset points", **style)
 
 
@@ -324,30 +274,24 @@ def _draw_legend(axes: Axes, rows: Sequence[Row]) -> None:
     from matplotlib.lines import Line2D
 
     axes.axis("off")
-    columns: tuple[list[Line2D], list[Line2D]] = [], []
-    known, titles = [look for look, _ in looks(rows)], list(GROUPS)
-    for title in titles:
-        if own := [look for look in known if look.group == title]:
-            column = columns[titles.index(title) > 4]
-            column.append(Line2D([], [], linestyle="", label=title))
-            for look in own:
-                entry = Line2D(
-                    [], [], color=look.colour, marker=look.marker, label=look.name, lw=0.9
-                )
-                entry.set_markersize(12.0 if look.ours else 5.5)
-                column.append(entry)
-    for handles, left in zip(columns, (-0.05, 0.48), strict=True):
-        legend = axes.legend(
-            handles=handles, loc="upper left", bbox_to_anchor=(left, 1.03), frameon=False,
-            fontsize=9.5,
-        )  # fmt: skip
-        legend.set_in_layout(False)
-        axes.add_artist(legend)
-        for text in legend.get_texts():
-            if text.get_text() in GROUPS:
-                text.set_fontweight("bold")
+    handles: list[Line2D] = []
+    for title in GROUPS:
+        if own := [look for look, _ in looks(rows) if look.group == title]:
+            handles.append(Line2D([], [], ls="", label=title))
+            handles += [
+                Line2D([], [], color=look.colour, marker=look.marker, label=look.name, lw=0.9,
+                       markersize=min(look.size, 12.0)) for look in own
+            ]  # fmt: skip
+    legend = axes.legend(
+        handles=handles, loc="upper left", bbox_to_anchor=(-0.05, 1.03), frameon=False,
+        fontsize=9.5, ncols=2,
+    )  # fmt: skip
     words = axes.text(0, 0, NOTE, transform=axes.transAxes, fontsize=9.5, linespacing=1.4)
-    words.set_in_layout(False)
+    for text in legend.get_texts():
+        if text.get_text() in GROUPS:
+            text.set_fontweight("bold")
+    for artist in (legend, words):
+        artist.set_in_layout(False)
 
 
 # --- page ----------------------------------------------------------------------------------------
@@ -362,60 +306,54 @@ def write_page(path: Path, rows: Sequence[Row], scene: Scene, layout: Layout) ->
     figure = make_subplots(down, across, subplot_titles=titles)
     for number, panel in enumerate(layout.panels):
         where = {"row": 1 + number // across, "col": 1 + number % across}
-        kept, last = panel.plotted(rows), {"showlegend": panel is layout.panels[-1]}
-        for look, _ in looks(rows):
-            own = [row for row in kept if row["family"] == look.family]
-            figure.add_trace(_trace(look, own, panel) | last, **where)
-        front = _line(pareto(kept, panel.error), panel, "#404040")
-        front["line"] |= {"dash": "dash", "shape": "hv"}
-        named = {"mode": "lines", "name": "Pareto front", "hoverinfo": "skip"}
-        figure.add_trace(front | named | last, **where)
+        kept = panel.plotted(rows)
+        for look, own in looks(rows):
+            points = [row for row in kept if row["family"] == own[0]["family"]]
+            shown = {"showlegend": panel is layout.panels[-1]}
+            figure.add_trace(_trace(points, panel, look) | shown, **where)
+        front = pareto(kept, panel.error)
+        dashed = {"color": "#404040", "width": 1, "dash": "dash", "shape": "hv"}
+        line = {"mode": "lines", "line": dashed, "showlegend": False, "hoverinfo": "skip"}
+        figure.add_trace(_trace(front, panel) | line, **where)
         title = f"time per {layout.per} on one core"
         figure.update_xaxes(type="log", title=title, tickformat="~s", ticksuffix="s", **where)
         figure.update_yaxes(type="log", title=panel.axis, tickformat="~%", **where)
         if panel.field != "refined":
             left, bottom = (min(row[x] for row in kept) / 2 for x in ("time_us", panel.error))
-            tolerance = getattr(scene.tolerance, panel.field)
             figure.add_shape(
-                type="rect", x0=1e-6 * left, x1=scene.budget.query, y0=bottom, y1=tolerance,
+                type="rect", x0=1e-6 * left, x1=scene.budget.query, y0=bottom,
+                y1=getattr(scene.tolerance, panel.field),
                 fillcolor=ACCENT, opacity=0.12, line_width=0, **where,
             )  # fmt: skip
-    title = layout.title.format(scene.name)
-    figure.update_layout(title=title, template="plotly_white", height=500 * down)
+    title, height = TITLE.format(scene.name), 500 * down
+    figure.update_layout(title=title, template="plotly_white", height=height)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.write_html(path, include_plotlyjs=True)
 
 
-def _line(rows: Sequence[Row], panel: Panel, colour: str) -> dict[str, Any]:
-    return {
-        "type": "scatter",
-        "x": [1e-6 * row["time_us"] for row in rows],
-        "y": [row[panel.error] for row in rows],
-        "line": {"color": colour, "width": 1},
-    }
-
-
-def _trace(look: Look, rows: Sequence[Row], panel: Panel) -> dict[str, Any]:
+def _trace(rows: Sequence[Row], panel: Panel, look: Look | None = None) -> dict[str, Any]:
+    """Points of the page and the line that joins them; of a method with all that is known."""
+    points = [(1e-6 * row["time_us"], row[panel.error]) for row in rows]
+    trace = {"type": "scatter", "x": [x for x, _ in points], "y": [y for _, y in points]}
+    if look is None:
+        return trace
     above = [row[f"{panel.field}_max"] - row[panel.error] for row in rows]
-    return _line(rows, panel, look.colour) | {
+    return trace | {
         "mode": "lines+markers",
+        "line": {"color": look.colour, "width": 1},
         "error_y": {"array": above, "arrayminus": [0.0] * len(above), "thickness": 0.6, "width": 0},
-        "name": look.name,
         "text": [_hover(row, panel.field) for row in rows],
-        "hovertemplate": f"<b>{look.name}</b><br>%{{text}}<extra></extra>",
-        "marker": {"symbol": PAGE_MARKERS[look.marker], "size": 18 if look.ours else 9},
+        "name": look.name,
         "legendgroup": look.group,
         "legendgrouptitle": {"text": look.group},
+        "hovertemplate": f"<b>{look.name}</b><br>%{{text}}<extra></extra>",
+        "marker": {"symbol": PAGE_MARKERS[look.marker], "size": max(look.size, 9.0)},
     }
 
 
 def _hover(row: Row, field: str) -> str:
     errors = [f"{percent(row[f'{field}_{name}'])} ({name})" for name in STATISTICS]
-    return "<br>".join(
-        (
-            f"{row['label']}; {row['unknowns']} unknowns",
-            duration(row["time_us"]),
-            "error " + ", ".join(errors),
-            f"{row['unconverged']} queries without an answer",
-        )
+    return (
+        f"{row['label']}; {row['unknowns']} unknowns<br>{duration(row['time_us'])}<br>"
+        f"error {', '.join(errors)}<br>{row['unconverged']} queries without an answer"
     )

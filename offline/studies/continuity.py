@@ -14,9 +14,9 @@ from palpate.offline.bench import STEP, tip_at, walk
 from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import FullProblem, Load, TipPosition
+from palpate.offline.studies.references import opened
 from palpate.offline.validate.against_full import held_out_loads
 from palpate.offline.validate.compare import OTHER_EQUILIBRIUM
-from palpate.shared.artifact import read_artifact
 from palpate.shared.model import ReducedModel
 
 Array = NDArray[np.float64]
@@ -27,14 +27,7 @@ STATISTICS = {"median": 50, "p95": 95, "max": 100}
 def continuity(
     artifact: Path, paths: int, steps: int, seed: int, tip: bool = False
 ) -> dict[str, Any]:
-    """Compare the changes of both models' answers from step to step.
-
-    Parameters
-    ----------
-    paths, steps : int
-        Paths over the surface, and steps of 0.05 mm along each.
-    tip : bool
-        Glide with a rigid tip instead of a footprint.
+    """Compare the changes of both models' answers along paths, in steps of 0.05 mm.
 
     Returns
     -------
@@ -45,8 +38,7 @@ def continuity(
         on the path.  ``left_out``: steps at which the models rest in different equilibria, or the
         full model in none.
     """
-    atlas = ReducedModel.load(artifact)
-    problem = FullProblem.of_artifact(read_artifact(artifact))
+    atlas, problem = opened(artifact)
     rng = np.random.default_rng([seed, 8 if tip else 7])
     found = []
     for start in tqdm(held_out_loads(atlas, paths, seed), desc="paths"):

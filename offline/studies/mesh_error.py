@@ -1,14 +1,10 @@
 """What the mesh costs in accuracy: elements of about the turbinate's 6048 DOFs beside a fine mesh.
 
-Every mesh carries the same loads: one pressure, position and direction per contact point, spread
-over the whole accessible surface, its ends included, at which the tissue moves by ``INDENTATION``
-of its local thickness (``MAX_PRESSURE`` where that is less). Two displacements are compared: the
-largest of all nodes, and the mean under the footprint, which does not depend on where the nodes
-happen to lie.
-
-The reference is refined all over but keeps the scene's geometry; other fine meshes say how far it
-can be trusted. The clamped edge slows every element's convergence, so that a few per cent between
-fine meshes remain.
+Every mesh carries the same loads all over the accessible surface, under which the tissue moves by
+``INDENTATION`` of its local thickness (``MAX_PRESSURE`` where that is less). Two displacements are
+compared: the largest of all nodes, and the mean under the footprint, which does not depend on where
+the nodes happen to lie.  Other fine meshes say how far the reference can be trusted: the clamped
+edge slows every element's convergence, so that a few per cent between fine meshes remain.
 """
 
 from __future__ import annotations
@@ -30,16 +26,12 @@ from palpate.shared.scene import ElementName
 Array = NDArray[np.float64]
 
 POINTS = 12
-INDENTATION = 0.25
-"""Displacement under the footprint over the local thickness."""
-
+INDENTATION = 0.25  # displacement under the footprint over the local thickness
 MAX_PRESSURE = 5.0
 """kPa. Beyond it hex20 elements of the reference's size buckle inwardly between their 2x2x2 points
 (det F < 0 at 3x3x3 points), which neither mean dilatation nor full quadrature confirms."""
 
-PRESSURE_STEP = 0.5
-"""kPa, along the load path."""
-
+PRESSURE_STEP = 0.5  # kPa, along the load path
 VALUES = {"hex8": 9, "hex8-mean-dilatation": 72, "hex8-fbar": 18, "hex20": 9}
 """Displacement gradients (9 numbers each) that one sample of a cubature needs: a point its own,
 with F-bar the element's mean beside it, with mean dilatation all eight of the element."""
@@ -81,20 +73,8 @@ CANDIDATES = (
 )
 
 
-Contact = tuple[Array, Array, float, float]
-"""A contact point with its outward normal, local thickness (mm) and pressure (kPa)."""
-
-
-def press(
-    body: FullProblem, position: Array, normal: Array, pressure: float, start: Array | None = None
-) -> tuple[float, float, Array]:
-    """Press straight in: largest displacement, mean under the footprint (mm), and all (n, 3)."""
-    u, under = body.press_at(position, normal, -pressure * normal, start)
-    return float(np.linalg.norm(u, axis=1).max()), float(np.linalg.norm(under)), u
-
-
-def contacts(reference: FullProblem, probe: FullProblem) -> list[Contact]:
-    """Contact points all over the reference's surface, with the pressures that ``probe`` needs."""
+def contacts(reference: FullProblem, probe: FullProblem) -> list[tuple[Array, Array, Array]]:
+    """Contact points all over the reference's surface, normals, and tractions for ``probe``."""
     surface, found = reference.surface, []
     for point in spread_points(surface, POINTS, np.random.default_rng(reference.scene.seed)):
         x, normal, _ = surface.project(point)
@@ -102,21 +82,16 @@ def contacts(reference: FullProblem, probe: FullProblem) -> list[Contact]:
         target, before, pressure, under, u = INDENTATION * thickness, 0.0, 0.0, 0.0, None
         while under < target and pressure < MAX_PRESSURE:
             before, pressure = under, pressure + PRESSURE_STEP
-            _, under, u = press(probe, x, normal, pressure, u)
+            u, moved = probe.press_at(x, normal, -pressure * normal, u)
+            under = float(np.linalg.norm(moved))
         if under > target:
             pressure -= PRESSURE_STEP * (under - target) / (under - before)
-        found.append((x, normal, float(thickness), pressure))
+        found.append((x, normal, -pressure * normal))
     return found
 
 
 def mesh_error(report: Path) -> dict[str, Any]:
-    """Compare the candidates with the reference.
-
-    Parameters
-    ----------
-    report : Path
-        Folder to write ``mesh_error.csv`` (a row per mesh), ``mesh_error_points.csv`` (a row per
-        contact point) and ``mesh_error.png`` to.
+    """Compare the candidates with the reference; write ``mesh_error.csv`` to a folder.
 
     Returns
     -------
@@ -127,49 +102,22 @@ def mesh_error(report: Path) -> dict[str, Any]:
     reference = REFERENCE.body()
     loads = contacts(reference, PROBE.body())
     rows: dict[str, dict[str, Any]] = {}
-    moved: dict[str, Array] = {}
+    exact = None
     for how in tqdm((REFERENCE, *SECOND_OPINIONS, *CANDIDATES), desc="meshes"):
-        body, name = how.body(), str(how)
-        moved[name] = np.array([press(body, x, n, pressure)[:2] for x, n, _, pressure in loads])
-        error = moved[name] / moved[str(REFERENCE)] - 1
-        rows[name] = {
+        body = how.body()
+        solved = [body.press_at(*load) for load in loads]
+        moved = np.array([[np.linalg.norm(u, axis=1).max(), np.linalg.norm(v)] for u, v in solved])
+        exact = moved if exact is None else exact
+        rows[str(how)] = {
             "dofs": body.mesh.nodes.size,
             "points": 8 * len(body.mesh.elements),
             "values": VALUES[how.element],
         } | {
-            f"{name}_{key}": float(of(column))
-            for name, column in zip(("largest", "under_footprint"), error.T, strict=True)
+            f"{name}_{key}": float(of(error))
+            for name, error in zip(
+                ("largest", "under_footprint"), (moved / exact - 1).T, strict=True
+            )
             for key, of in (("least", np.min), ("mean", np.mean), ("greatest", np.max))
         }
     write_csv(report / "mesh_error.csv", [{"mesh": name} | row for name, row in rows.items()])
-    exact = moved[str(REFERENCE)]
-    errors = {name: own[:, 0] / exact[:, 0] - 1 for name, own in moved.items()}
-    table = [
-        dict(zip(("x_mm", "y_mm", "z_mm"), x.tolist(), strict=True))
-        | {"thickness_mm": thickness, "pressure_kPa": pressure}
-        | {"largest_mm": exact[i, 0], "under_footprint_mm": exact[i, 1]}
-        | {name: error[i] for name, error in errors.items()}
-        for i, (x, _, thickness, pressure) in enumerate(loads)
-    ]
-    write_csv(report / "mesh_error_points.csv", table)
-    _draw(report / "mesh_error.png", errors)
     return rows
-
-
-def _draw(path: Path, errors: dict[str, Array]) -> None:
-    """Bars from the least to the greatest error of the largest displacement, a dot per point."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 0.4 * len(errors) + 1.4), layout="constrained")
-    axes = figure.add_subplot()
-    axes.axvspan(-5, 5, color="0.92")
-    axes.axvline(0, color="0.5", linewidth=0.8)
-    for row, error in enumerate(errors.values()):
-        percent = 100 * error
-        axes.barh(row, np.ptp(percent), left=percent.min(), height=0.5, color="tab:blue", alpha=0.5)
-        axes.plot(percent, np.full(len(percent), row), ".", color="tab:blue")
-    axes.set_yticks(range(len(errors)), list(errors))
-    axes.invert_yaxis()
-    axes.margins(x=0.03)
-    axes.set_xlabel(f"error of the largest displacement against {REFERENCE}, %")
-    figure.savefig(path, dpi=110)

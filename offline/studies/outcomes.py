@@ -8,6 +8,7 @@ path does not lead to.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,9 +22,7 @@ from palpate.offline.run.tables import write_csv
 from palpate.offline.studies.hard_cases import CONTROL
 from palpate.offline.studies.references import Fields
 
-MIDDLE = -0.12
-"""Position of the bar in a cell of the map: above the middle."""
-
+MIDDLE = -0.12  # position of the bar in a cell of the map: above the middle
 ROUGHLY = 0.1
 """Displacement error up to which a wrong answer is roughly right; the artifact is nearly the only
 method within the tolerance of a scene."""
@@ -60,26 +59,16 @@ SILENT_OUTCOMES = (ANOTHER, ROUGH, SILENT, INVERTED)
 class Result:
     """What became of a method's answer to a case.
 
-    Attributes
-    ----------
-    outcome : str
-        A key of ``OUTCOMES``.
-    displacement, von_mises : float
-        Relative errors, NaN without an answer or without an equilibrium.
-    inverted, nan, crashed : bool
-        Whether the answer turns an element inside out, is vouched for but not finite, is missing
-        because the method raised.
-    drift : float, optional
-        Of a long history, how far its end is from the method's answer to a brief one.
+    Errors are relative, nan without an answer or without an equilibrium.
     """
 
-    outcome: str
-    displacement: float = float("nan")
-    von_mises: float = float("nan")
-    inverted: bool = False
-    nan: bool = False
-    crashed: bool = False
-    drift: float | None = None
+    outcome: str  # a key of ``OUTCOMES``
+    displacement: float = math.nan
+    von_mises: float = math.nan
+    inverted: bool = False  # whether the answer turns an element inside out
+    nan: bool = False  # whether it is not finite
+    crashed: bool = False  # whether the method raised
+    drift: float | None = None  # of a long history, how far it ends from a brief one's answer
 
 
 Table = Mapping[str, Mapping[str, Sequence[Result]]]
@@ -93,48 +82,34 @@ def classify(
     exact: Fields | None,
     other: Fields | None = None,
 ) -> Result:
-    """Compare an answer with the full model's.
+    """Compare an answer, for which the method vouches or not, with the full model's.
 
-    Parameters
-    ----------
-    found : Fields, optional
-        The answer; None if the method has none.
-    trusted : bool
-        Whether the method vouches for it.
-    exact, other : Fields, optional
-        The full model's answer, and another equilibrium of the same load; None if there is none.
+    ``other`` is another equilibrium of the same load.
     """
     if found is None:
         return Result(REFUSED if exact is None else DIVERGED)
     if not all(np.isfinite(values).all() for values in found):
         return Result(DIVERGED, nan=True)
-    force = np.empty(found.displacements[0].size)
+    force, tolerance = np.empty(found.displacements[0].size), problem.scene.tolerance
     inverted = any(
         not problem.model.internal(u.ravel(), force)[1] > 0.0 for u in found.displacements
     )
-    errors, right = _tolerated(problem, found, exact)
-    another = not right and _tolerated(problem, found, other)[1]
+    errors, others = (
+        (math.nan, math.nan) if fields is None else found.errors(problem, fields)
+        for fields in (exact, other)
+    )
+    right, another = (
+        displacement <= tolerance.displacement and von_mises <= tolerance.von_mises
+        for displacement, von_mises in (errors, others)
+    )
+    kind = 0 if right else 1 if another else 2
     if not trusted:
-        outcome = RIGHT_FLAGGED if right else ANOTHER_FLAGGED if another else WRONG_FLAGGED
+        outcome = (RIGHT_FLAGGED, ANOTHER_FLAGGED, WRONG_FLAGGED)[kind]
     elif inverted:
         outcome = INVERTED
-    elif right:
-        outcome = RIGHT
-    elif another:
-        outcome = ANOTHER
     else:
-        outcome = ROUGH if errors[0] <= ROUGHLY else SILENT
+        outcome = (RIGHT, ANOTHER, ROUGH if errors[0] <= ROUGHLY else SILENT)[kind]
     return Result(outcome, *errors, inverted)
-
-
-def _tolerated(
-    problem: FullProblem, found: Fields, exact: Fields | None
-) -> tuple[tuple[float, float], bool]:
-    """Errors of displacement and stress, NaN without a reference; whether they are tolerated."""
-    if exact is None:
-        return (float("nan"), float("nan")), False
-    errors, tolerance = found.errors(problem, exact), problem.scene.tolerance
-    return errors, errors[0] <= tolerance.displacement and errors[1] <= tolerance.von_mises
 
 
 # --- report --------------------------------------------------------------------------------------
@@ -159,10 +134,9 @@ def _row(method: str, kind: str, results: Sequence[Result]) -> dict[str, Any]:
     row |= {outcome: counts[outcome] for outcome in OUTCOMES}
     row["inverted"] = sum(result.inverted for result in results)
     for name in ("displacement", "von_mises"):
-        errors = np.array([getattr(result, name) for result in results])
-        errors = errors[~np.isnan(errors)]
-        for key, of in (("median", np.median), ("max", np.max)):
-            row[f"{name}_{key}"] = float(of(errors)) if len(errors) else float("nan")
+        known = [e for result in results if not math.isnan(e := getattr(result, name))]
+        row[f"{name}_median"] = float(np.median(known)) if known else math.nan
+        row[f"{name}_max"] = max(known, default=math.nan)
     return row
 
 
@@ -240,7 +214,7 @@ def _draw(
 
 def _percent(error: float) -> str:
     """Two digits for people; a dash where there is no answer."""
-    if np.isnan(error):
+    if math.isnan(error):
         return "–"
     if not 1e-4 < error < 10:
         return "< 0.01 %" if error < 1 else "> 999 %"

@@ -31,14 +31,15 @@ the pressure is smaller by the share of the shear modulus that is lost.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import spearmanr
 from tqdm import tqdm
 
 from palpate.offline.fem.norms import relative
@@ -52,65 +53,41 @@ from palpate.offline.reduce.load_range import load_range
 from palpate.offline.run.tables import write_csv
 from palpate.offline.scenes import find_scene
 from palpate.offline.studies import paper_pictures
-from palpate.offline.studies.paper_claims import (
-    FieldErrors,
-    claims_of_figure_1,
-    claims_of_figure_2,
-)
+from palpate.offline.studies.chart import play
 from palpate.offline.studies.references import Fields
 from palpate.offline.studies.relaxation import Phases, load_steps
 from palpate.shared.geometry.quadrature import surface_quadrature
+from palpate.shared.scene import Block
 
 Array = NDArray[np.float64]
+Claims = dict[str, dict[str, Any]]
 
 SNAPSHOTS = 20
-ROUNDS = 3
-"""How often every step is timed."""
-
+ROUNDS = 3  # how often every step is timed
 SIZES = (1, 2, 3, 4, 5, 7, 10, 15, 20, 30)
 """Numbers of bases; POD ends where its snapshots have no more to give."""
 
-CONTOUR_BASES = 5
-"""Of the paper's figures 2c and 2d."""
-
+CONTOUR_BASES = 5  # of the paper's figures 2c and 2d
 CUBE_PRESSURE = 2.5  # kPa
-MEDIAL = (10.0, 20.0, 11.0)
-"""In the middle of the turbinate's medial side, mm."""
-
+MEDIAL = (10.0, 20.0, 11.0)  # in the middle of the turbinate's medial side, mm
 TRAINING: Phases = ((0.2, 10, 1.0), (2.0, 14, 1.0), (0.1, 5, 0.0), (2.0, 14, 0.0))
 QUERY: Phases = ((0.3, 10, 0.9), (1.5, 14, 0.9), (0.15, 5, 0.0), (1.5, 14, 0.0))
 """Press, hold, release, rest: what POD is trained on, and what all methods answer, in time."""
 
-HELD = 23
-"""Step of both at whose end the load has been held."""
-
-EXACT = 1e-6
-"""Tolerance of the reduced solver where fields are looked at."""
+HELD = 23  # step of both at whose end the load has been held
+ACCURACIES = (0.01, 0.001)  # errors at P at which the methods' times are compared
+MARGIN = 1.25  # factor by which ratios of CPU times must differ to be told apart on a busy machine
+EXACT = 1e-6  # tolerance of the reduced solver where fields are looked at
 
 
 @dataclass(frozen=True)
 class Example:
-    """A body under a load that grows.
-
-    Attributes
-    ----------
-    load : ndarray, shape (n, 3), mN
-        At its greatest.
-    pressure : float, kPa
-        The same.
-    at : ndarray, shape (3,), mm
-        Where the load's centre is.
-    """
+    """A body under a load that grows."""
 
     problem: FullProblem
-    load: Array
-    pressure: float
-    at: Array
-
-    @property
-    def name(self) -> str:
-        """The scene's."""
-        return self.problem.scene.name
+    load: Array  # (n, 3) mN, at its greatest
+    pressure: float  # kPa, the same
+    at: Array  # (3,) mm, the load's centre
 
     @property
     def point(self) -> int:
@@ -139,16 +116,23 @@ class Example:
         return [self.steps([(0.0, (i - 0.5) / SNAPSHOTS)]) for i in range(1, SNAPSHOTS + 1)]
 
 
-def cube(scene: str, report: Path) -> dict[str, Any]:
-    """Figure 1: the cube of a scene under compression; see ``compare``."""
-    problem = FullProblem(find_scene(scene))
-    left = 1.0 - sum(share for share, _ in problem.model.prony)
-    return compare(covered(problem, left * CUBE_PRESSURE), report)
+def figures(scene: str, report: Path) -> dict[str, Any]:
+    """Figure 1 for the cube or turbinate of a scene; of the elastic turbinate 2c and 2d, too.
+
+    See ``compare``.
+    """
+    found = find_scene(scene)
+    if isinstance(found.geometry, Block):
+        return compare(covered(FullProblem(found)), report)
+    if not found.tissue.prony:
+        require_pyvista()
+    return compare(footprint(FullProblem(found)), report, contours=not found.tissue.prony)
 
 
-def covered(problem: FullProblem, pressure: float) -> Example:
-    """Pressure (kPa) all over the flat top of a block."""
+def covered(problem: FullProblem) -> Example:
+    """Pressure all over the flat top of a block."""
     mesh = problem.mesh
+    pressure = CUBE_PRESSURE * (1.0 - sum(share for share, _ in problem.model.prony))
     top = surface_quadrature(mesh.nodes, mesh.faces[mesh.accessible])
     areas = np.zeros(len(mesh.nodes))
     np.add.at(areas, top.nodes, top.areas[:, None] * top.shape)
@@ -156,18 +140,9 @@ def covered(problem: FullProblem, pressure: float) -> Example:
     return Example(problem, load, pressure, top.points.mean(axis=0))
 
 
-def turbinate(scene: str, report: Path) -> dict[str, Any]:
-    """Figure 1 for the turbinate of a scene under a footprint, and of elastic tissue 2c and 2d."""
-    found = find_scene(scene)
-    contours = not found.tissue.prony
-    if contours:
-        require_pyvista()
-    return compare(footprint(FullProblem(found), MEDIAL), report, contours=contours)
-
-
-def footprint(problem: FullProblem, position: Sequence[float]) -> Example:
+def footprint(problem: FullProblem) -> Example:
     """A footprint pressed straight in, up to the pressure that is trained for there."""
-    at, *_ = problem.surface.project(np.array(position))
+    at, *_ = problem.surface.project(np.array(MEDIAL))
     areas, normal = problem.unit_load(at)
     pressure = float(load_range(problem, at)[0])
     return Example(problem, -pressure * areas[:, None] * normal, pressure, at)
@@ -178,15 +153,8 @@ def compare(
 ) -> dict[str, Any]:
     """Errors and times of the three methods, and whether the paper's claims hold.
 
-    Parameters
-    ----------
-    report : Path
-        Folder to write ``paper_NAME.csv`` (a row per method and number of bases) and
-        ``paper_NAME.png`` (figures 1a and 1b) to.
-    sizes : sequence of int, optional
-        Numbers of bases; ``SIZES`` if absent.
-    contours : bool
-        Whether to draw ``paper_NAME_contours.png`` (figures 2c and 2d) too.
+    Writes ``paper_NAME.csv`` (a row per method and number of bases), ``paper_NAME.png`` (figures 1a
+    and 1b) and, if wanted, ``paper_NAME_contours.png`` (2c and 2d) to the folder ``report``.
 
     Returns
     -------
@@ -195,25 +163,25 @@ def compare(
         ``claims_of_figure_1`` and ``claims_of_figure_2``, in time of the moment when the load has
         been held; ``claims_with_fewer_bases``: the latter by number of bases, of elastic tissue.
     """
+    problem, name = example.problem, example.problem.scene.name
     training = snapshots(example)
     rows = measure(example, training, sizes or SIZES)
-    fewest = CONTOUR_BASES if example.in_time else 1
-    fields = {m: field_errors(example, training, m) for m in range(fewest, CONTOUR_BASES + 1)}
     moved = float(np.linalg.norm(training[:, example.point], axis=1).max())
-    title = f"{example.name}, pressed with up to {example.pressure:.3g} kPa"
+    title = f"{name}, pressed with up to {example.pressure:.3g} kPa"
     title += f"{', held and let go' if example.in_time else ''}: P moves {moved:.1f} mm"
-    write_csv(report / f"paper_{example.name}.csv", rows)
-    paper_pictures.chart(report / f"paper_{example.name}.png", rows, title)
+    write_csv(report / f"paper_{name}.csv", rows)
+    paper_pictures.chart(report / f"paper_{name}.png", rows, title)
+    claims: dict[int, Claims] = {}
+    for size in range(CONTOUR_BASES if example.in_time else 1, CONTOUR_BASES + 1):
+        values, errors = node_by_node(*last_fields(example, training, size))
+        claims[size] = claims_of_figure_2(values, errors, ~problem.beyond_clamped_layer)
     if contours:
-        path = report / f"paper_{example.name}_contours.png"
-        errors = fields[CONTOUR_BASES].errors
-        radius = example.problem.scene.endoscope.radius
-        paper_pictures.contours(path, example.problem.mesh, errors, example.at, radius)
-    claims = {size: claims_of_figure_2(own) for size, own in fields.items()}
+        path, radius = report / f"paper_{name}_contours.png", problem.scene.endoscope.radius
+        paper_pictures.contours(path, problem.mesh, errors, example.at, radius)
     return {
         "load": {
             "pressure_kPa": example.pressure,
-            "point_P_mm": example.problem.mesh.nodes[example.point].tolist(),
+            "point_P_mm": problem.mesh.nodes[example.point].tolist(),
             "P_moves_mm": moved,
         },
         "figure_1": {f"{row['method']} {row['bases']}": row for row in rows},
@@ -225,7 +193,7 @@ def compare(
 def snapshots(example: Example) -> Array:
     """Full solutions (t, n, 3) mm of the history that POD learns from."""
     full = Full(example.problem)
-    states = full.follow(tqdm(example.training(), desc="snapshots"))
+    states, *_ = play(full, tqdm(example.training(), desc="snapshots"))
     return np.array([full.displacement(state) for state in states])
 
 
@@ -242,85 +210,154 @@ def spaces(example: Example, training: Array, size: int) -> dict[str, Array]:
 
 def measure(example: Example, training: Array, sizes: Sequence[int]) -> list[dict[str, Any]]:
     """Rows of the table: a method and number of bases each."""
-    problem = example.problem
+    problem, histories = example.problem, example.queries()
     methods: dict[tuple[str, int], Method] = {("full", 0): Full(problem)}
     for name, basis in spaces(example, training, max(sizes)).items():
         for size in sizes:
             if size <= basis.shape[1]:
                 own = basis[:, :size].copy()
                 methods[name, size] = Galerkin(problem, own, in_time=example.in_time)
-    full, *others = _in_turns(example, list(methods.values()))
-    return [
-        {"method": name, "bases": size} | _errors(example, found, full)
-        for (name, size), found in zip(list(methods)[1:], others, strict=True)
-    ]
-
-
-@dataclass(frozen=True)
-class Timed:
-    """A method's fields in every history, median time (s) of a step, and steps without answer."""
-
-    fields: list[Fields]
-    seconds: float
-    unconverged: int
-
-
-def _in_turns(example: Example, methods: Sequence[Method]) -> list[Timed]:
-    """Answers of the methods to all histories, one step after the other."""
-    histories = example.queries()
-    seconds: list[list[float]] = [[] for _ in methods]
-    missed = [0] * len(methods)
-    for method in methods:  # compiled code comes in from disk
+    for method in methods.values():  # compiled code comes in from disk
         method.solve(histories[0][0][0])
+    seconds: dict[tuple[str, int], list[Array]] = {key: [] for key in methods}
     for _ in tqdm(range(ROUNDS), desc="full and reduced solves"):
-        states: list[list[list[Any]]] = [[] for _ in methods]
+        fields: dict[tuple[str, int], list[Fields]] = {key: [] for key in methods}
+        unconverged = dict.fromkeys(methods, 0)
         for history in histories:
-            for method, own in zip(methods, states, strict=True):
-                own.append([method.at_rest()])
-            for case, dt in history:
-                for i, method in enumerate(methods):
-                    started = time.perf_counter()
-                    answer = method.step(states[i][-1][-1], case, dt)
-                    seconds[i].append(time.perf_counter() - started)
-                    missed[i] += not answer.converged
-                    states[i][-1].append(answer.state)
+            for key, method in methods.items():
+                states, times, missed = play(method, history)
+                seconds[key].append(times)
+                fields[key].append(Fields.of(method, states))
+                unconverged[key] += missed
+    full, *others = methods
+    taken = {key: float(np.median(np.concatenate(own))) for key, own in seconds.items()}
     return [
-        Timed(
-            [Fields.of(method, history[1:]) for history in own],
-            float(np.median(times)),
-            count // ROUNDS,
-        )
-        for method, own, times, count in zip(methods, states, seconds, missed, strict=True)
+        {"method": key[0], "bases": key[1]}
+        | _errors(example, fields[key], fields[full])
+        | {"full_ms": 1e3 * taken[full], "reduced_ms": 1e3 * taken[key]}
+        | {"cpu_ratio": taken[full] / taken[key], "unconverged": unconverged[key]}
+        for key in others
     ]
 
 
-def _errors(example: Example, found: Timed, full: Timed) -> dict[str, Any]:
+def _errors(example: Example, found: list[Fields], full: list[Fields]) -> dict[str, float]:
     """Columns of the table; means and maxima are over histories."""
     problem, P = example.problem, example.point
-    pairs = list(zip(found.fields, full.fields, strict=True))
+    pairs = list(zip(found, full, strict=True))
     points = [(own.displacements[:, P], exact.displacements[:, P]) for own, exact in pairs]
     worst = [
         np.linalg.norm(u - exact, axis=1).max() / np.linalg.norm(exact, axis=1).max()
         for u, exact in points
     ]
-    whole = np.array([own.errors(problem, exact) for own, exact in pairs])
+    displacement, stress = np.mean([own.errors(problem, exact) for own, exact in pairs], axis=0)
     return {
         "error_at_P_mean": float(np.mean([relative(*pair) for pair in points])),
         "error_at_P_max": float(np.max(worst)),
-        "displacement_error_mean": float(whole[:, 0].mean()),
-        "von_mises_error_mean": float(whole[:, 1].mean()),
-        "full_ms": 1e3 * full.seconds,
-        "reduced_ms": 1e3 * found.seconds,
-        "cpu_ratio": full.seconds / found.seconds,
-        "unconverged": found.unconverged,
+        "displacement_error_mean": float(displacement),
+        "von_mises_error_mean": float(stress),
     }
 
 
-def field_errors(example: Example, training: Array, bases: int) -> FieldErrors:
-    """Errors in POD bases: when the load has been held, or at the greatest load that is asked."""
+def last_fields(example: Example, training: Array, bases: int) -> tuple[Fields, Fields]:
+    """Fields in POD bases and the full ones: when the load has been held, or is the greatest."""
     problem, in_time = example.problem, example.in_time
     basis = pod(problem.model, training.reshape(len(training), -1), bases)
     steps = example.queries()[-1][: HELD + 1]
-    methods = Galerkin(problem, basis, in_time=in_time, accurate=EXACT), Full(problem)
-    fields = [Fields.of(method, method.follow(steps)[-1:]) for method in methods]
-    return FieldErrors.of(problem, *fields)
+    reduced = Galerkin(problem, basis, in_time=in_time, accurate=EXACT)
+    one, other = (Fields.of(m, play(m, steps)[0][-1:]) for m in (reduced, Full(problem)))
+    return one, other
+
+
+# --- the paper's claims ------------------------------------------------------------------------
+
+
+def claims_of_figure_1(rows: list[dict[str, Any]]) -> Claims:
+    """Whether POD is the most accurate and the fastest, in numbers.
+
+    ``pod_least_error``: numbers of bases ``compared``, and at how many of them POD has the least
+    error at P and over the whole field of stress; it holds if at all of them.
+    ``pod_best_cpu_ratio``, ``at_accuracy``: each method's ratio with the fewest bases whose error
+    at P is within each of ``ACCURACIES``, None where none is.  It holds if POD's is best by
+    ``MARGIN`` at each of those.
+    """
+    sizes = [row["bases"] for row in rows if row["method"] == "POD"]
+    alike = [[row for row in rows if row["bases"] == size] for size in sizes]
+    least = {
+        name: sum(min(own, key=itemgetter(key))["method"] == "POD" for own in alike)
+        for name, key in (
+            ("least_at_P", "error_at_P_mean"),
+            ("least_in_stress", "von_mises_error_mean"),
+        )
+    }
+    ratios: dict[str, dict[str, float | None]] = {}
+    for accuracy in ACCURACIES:
+        accurate = [row for row in rows if row["error_at_P_mean"] <= accuracy]
+        first = {row["method"]: row["cpu_ratio"] for row in reversed(accurate)}
+        ratios[f"{accuracy:g}"] = {name: first.get(name) for name in ("MOD", "RITZ", "POD")}
+    fastest = [
+        (best["POD"] or 0.0) > MARGIN * max(best["MOD"] or 0.0, best["RITZ"] or 0.0)
+        for best in ratios.values()
+    ]
+    holds = set(least.values()) == {len(sizes)}
+    return {
+        "pod_least_error": {"holds": holds, "compared": len(sizes)} | least,
+        "pod_best_cpu_ratio": {"holds": all(fastest), "at_accuracy": ratios},
+    }
+
+
+def node_by_node(reduced: Fields, full: Fields) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Displacement (n,) mm and von Mises stress (n,) kPa of a moment, and relative errors of both.
+
+    Errors are nan where there is nothing to approximate.
+    """
+    (u, found), (exact, stress) = ((field[0] for field in fields) for fields in (reduced, full))
+    values = {"displacement": np.linalg.norm(exact, axis=1), "von Mises stress": stress}
+    off = np.linalg.norm(u - exact, axis=1), np.abs(found - stress)
+    return values, {
+        name: np.divide(error, value, out=np.full_like(value, np.nan), where=value > 0)
+        for (name, value), error in zip(values.items(), off, strict=True)
+    }
+
+
+def claims_of_figure_2(
+    values: dict[str, Array], errors: dict[str, Array], near_support: NDArray[np.bool_]
+) -> Claims:
+    """Where the errors are largest, in numbers; see ``node_by_node``.
+
+    ``error_largest_where_value_smallest``, for displacement and stress: median relative errors of
+    the tenth of nodes with the least and with the greatest values, and the rank correlation of
+    value and error; it holds if no other tenth has a larger median than the first.
+    ``stress_best_near_support``: medians near the support and elsewhere, and whether the largest
+    stress is near it, as the paper says too.
+    """
+    smallest = {
+        name: _tenths(value, error)
+        for name, value, error in zip(
+            ("displacement", "von_mises"), values.values(), errors.values(), strict=True
+        )
+    }
+    _, stress = values.values()
+    _, error = errors.values()
+    near, elsewhere = (float(np.nanmedian(error[w])) for w in (near_support, ~near_support))
+    holds = all(found["holds"] for found in smallest.values())
+    return {
+        "error_largest_where_value_smallest": {"holds": holds} | smallest,
+        "stress_best_near_support": {
+            "holds": near < elsewhere,
+            "near": near,
+            "elsewhere": elsewhere,
+            "largest_stress_is_near": bool(near_support[np.argmax(stress)]),
+        },
+    }
+
+
+def _tenths(value: Array, error: Array) -> dict[str, Any]:
+    known = np.isfinite(error)
+    value, error = value[known], error[known]
+    medians = [float(np.median(error[part])) for part in np.array_split(np.argsort(value), 10)]
+    return {
+        "holds": medians[0] == max(medians),
+        "least_values": medians[0],
+        "greatest_values": medians[-1],
+        "rank_correlation": float(spearmanr(value, error).statistic),
+    }

@@ -25,15 +25,11 @@ VIEWS = {
     "medial side, pressed in the ring": (1.0, -0.7, 0.35),
     "lateral side (grey: value is zero)": (-1.0, 0.7, 0.35),
 }
-DECADES = 4
-"""Most powers of ten that a scale of colours shows."""
+DECADES = 4  # most powers of ten that a scale of colours shows
 
 
 def chart(path: Path, rows: list[dict[str, Any]], title: str) -> None:
-    """Figures 1a and 1b: error at P and ratio of CPU times against the number of bases.
-
-    Bases that do not answer the load at all have no time to speak of and no mark in (b).
-    """
+    """Figures 1a and 1b: error at P and ratio of CPU times against the number of bases."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
@@ -71,17 +67,10 @@ def chart(path: Path, rows: list[dict[str, Any]], title: str) -> None:
 
 
 def contours(path: Path, mesh: Mesh, errors: dict[str, Array], at: Array, radius: float) -> None:
-    """Figures 2c and 2d: relative errors on the body, a column each, seen from both sides.
+    """Figures 2c and 2d: relative errors (n,) on the body, a column each, seen from both sides.
 
-    Parameters
-    ----------
-    path : Path
-        PNG.
-    errors : dict of ndarray, shape (n,)
-        Relative errors; nan is drawn grey: no displacement, or stress cut off at zero.
-    at : ndarray, shape (3,), mm
-    radius : float, mm
-        Centre and radius of the footprint, which is ringed.
+    Errors that are nan are grey: no displacement, or stress cut off at zero.  The footprint at
+    ``at`` (3,) mm is ringed.
     """
     _, surface = body(mesh.nodes, mesh.elements, at, errors)
     rim, plotter = ring(surface, at, radius, 0.05), new_plotter((len(VIEWS), len(errors)), SIZE)

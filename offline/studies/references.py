@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,15 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.offline.fem.norms import relative
-from palpate.offline.fem.problem import FullProblem, Load, Step, TipPosition
+from palpate.offline.fem.problem import FullProblem, Load, TipPosition
 from palpate.offline.methods.full import Remeshed
 from palpate.offline.methods.method import Case, Method, Snapshots, Steps
-from palpate.offline.reduce.queries import random_histories, random_loads
-from palpate.offline.run.checkpoint import Checkpoint, content_key
-from palpate.offline.run.workers import resume
-from palpate.shared.errors import PalpateError
+from palpate.offline.run.workers import (
+    Checkpoint,
+    content_key,
+    open_artifact,
+    resume,
+    worker_pool,
+)
+from palpate.offline.validate.queries import random_histories, random_loads
+from palpate.shared.artifact import read_artifact
+from palpate.shared.errors import PalpateError, QueryError
 from palpate.shared.model import ReducedModel
-from palpate.shared.scene import Scene
+from palpate.shared.scene import Scene, parse_scene
 
 Array = NDArray[np.float64]
 
@@ -42,9 +48,8 @@ class Fields(NamedTuple):
 
     @classmethod
     def at_once(cls, problem: FullProblem, displacements: Sequence[Array]) -> Fields:
-        """Fields of tissue that remembers nothing, with displacements (3 n,) or (n, 3) mm."""
-        u = np.reshape(displacements, (len(displacements), -1, 3))
-        return cls(u, np.array([problem.von_mises(x) for x in u]))
+        """Fields of tissue that remembers nothing, with displacements (n, 3) mm."""
+        return cls(np.array(displacements), np.array([problem.von_mises(u) for u in displacements]))
 
     def errors(self, problem: FullProblem, exact: Fields) -> tuple[float, float]:
         """Relative L2 errors over the moments and all nodes, or those beyond the clamped layer."""
@@ -53,10 +58,46 @@ class Fields(NamedTuple):
         return relative(self.displacements, u), relative(self.stresses[:, kept], s[:, kept])
 
 
+def opened(
+    artifact: Path, scene: Scene | None = None, in_time: bool = False
+) -> tuple[ReducedModel, FullProblem]:
+    """Reduced and full model of an artifact; of its scene with the files, if that is given.
+
+    Raises
+    ------
+    PalpateError
+        If the artifact was trained on another scene.
+    QueryError
+        If it is to answer in time and its tissue is elastic.
+    """
+    atlas = ReducedModel.load(artifact)
+    if in_time and atlas.models.viscous is None:
+        raise QueryError("scene", f"{atlas.name!r} is elastic: it has no histories")
+    problem = FullProblem.of_artifact(read_artifact(artifact))
+    if scene is None:
+        return atlas, problem
+    if atlas.scene.text != scene.text:
+        raise PalpateError(f"{artifact}: trained on another scene than {scene.name!r}")
+    return atlas, FullProblem(scene, problem.mesh)
+
+
 def kept_results(artifact: Path, scene: Scene, name: str, settings: object) -> Checkpoint:
     """What a killed study goes on from: named by all that its results depend on."""
     sha = hashlib.sha256(artifact.read_bytes() + str(settings).encode()).hexdigest()[:16]
     return Checkpoint(artifact.parent / f".{artifact.stem}.{name}", f"{content_key(scene)}-{sha}")
+
+
+def in_parallel(
+    artifact: Path,
+    checkpoint: Checkpoint,
+    title: str,
+    tasks: Mapping[str, list[tuple[Any, ...]]],
+) -> dict[str, list[Any]]:
+    """Results of the tasks of each kind (``run.workers``), from worker processes or kept ones."""
+    named = {f"{kind} {i}": task for kind, own in tasks.items() for i, task in enumerate(own)}
+    with worker_pool(open_artifact, artifact) as pool:
+        found = resume(title, pool, checkpoint, named)
+    return {kind: [found[f"{kind} {i}"] for i in range(len(own))] for kind, own in tasks.items()}
 
 
 def random_steps(
@@ -70,53 +111,38 @@ def random_steps(
     return [[(Case.of(problem, load), load.dt) for load in history] for history in histories]
 
 
-def full_histories(
-    histories: Mapping[str, Steps],
-    pool: Executor,
-    checkpoint: Checkpoint,
-    tips: frozenset[str] = frozenset(),
-) -> dict[str, Fields]:
-    """Full solutions of the histories that the full model can follow.
+def followed(problem: FullProblem, steps: Steps, tip: bool = False) -> Fields | None:
+    """The full model's answers, if it has any; a task for ``run.workers``.
 
-    Parameters
-    ----------
-    histories : mapping of str to Steps
-        Of one contact each.
-    tips : set of str
-        Names of the histories of the rigid tip, whose contacts tell its centre.
+    The steps are of one contact each, which tells the centre of the rigid tip if that presses.
     """
-    queries: dict[str, list[Step]] = {}
-    for name, steps in histories.items():
-        contacts = [replace(case.contacts[0], dt=dt) for case, dt in steps]
-        queries[name] = [
-            TipPosition(load.position, load.dt) if name in tips else load for load in contacts
-        ]
-    tasks = {name: (FullProblem.reference, query) for name, query in queries.items()}
-    found = resume("full histories", pool, checkpoint, tasks)
-    return {name: Fields(own.u, own.s) for name, own in found.items() if own is not None}
+    contacts = [replace(case.contacts[0], dt=dt) for case, dt in steps]
+    found = problem.reference([TipPosition(x.position, x.dt) if tip else x for x in contacts])
+    return None if found is None else Fields(found.u, found.s)
 
 
-def snapshots(histories: Sequence[Steps], found: Sequence[Fields]) -> Snapshots:
+def snapshots(solved: Sequence[tuple[Steps, Fields | None]]) -> Snapshots:
     """What methods learn from full solutions of histories; an error if there are none."""
+    found = [(steps, own) for steps, own in solved if own is not None]
     if not found:
         raise PalpateError("snapshots: the full model could follow none of the histories")
-    loads = [case.contacts[0] for steps in histories for case, _ in steps]
-    rows = np.concatenate([own.displacements for own in found]).astype(float)
+    loads = [case.contacts[0] for steps, _ in found for case, _ in steps]
+    rows = np.concatenate([own.displacements for _, own in found]).astype(float)
     return Snapshots(loads, rows.reshape(len(rows), -1))
 
 
-_kept: dict[float, Remeshed] = {}
-"""Refined meshes of a worker process, kept from one task to the next."""
+@lru_cache(maxsize=1)
+def _remeshed(text: str, folder: Path | None, factor: float) -> Remeshed:
+    return Remeshed(FullProblem(parse_scene(text, folder)), factor)
 
 
 def refined(problem: FullProblem, scene: Scene, factor: float, load: Load) -> Array:
     """Displacement (n, 3) mm of a scene's nodes in a finer mesh, nan without an equilibrium.
 
-    A task for ``run.workers``, all of one scene.
+    A task for ``run.workers``.
     """
-    if factor not in _kept:
-        _kept[factor] = Remeshed(scene, factor)
-    answer = _kept[factor].solve(Case.of(problem, load))
+    method = _remeshed(scene.text, scene.folder, factor)
+    answer = method.solve(Case.of(problem, load))
     if answer.converged:
-        return _kept[factor].displacement(answer.state)
+        return method.displacement(answer.state)
     return np.full((len(problem.mesh.nodes), 3), np.nan)

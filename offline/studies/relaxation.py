@@ -10,19 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from palpate.offline.fem.problem import FullProblem, Load
+from palpate.offline.fem.problem import Load
 from palpate.offline.methods.full import Full
 from palpate.offline.methods.method import Case
 from palpate.offline.methods.shipped import Shipped
 from palpate.offline.run.tables import write_csv
-from palpate.shared.artifact import read_artifact
-from palpate.shared.errors import QueryError
-from palpate.shared.model import ReducedModel
+from palpate.offline.studies.chart import play
+from palpate.offline.studies.references import opened
 
 Array = NDArray[np.float64]
 
-PRESSED = 0.8
-"""Pressure over its limit."""
+PRESSED = 0.8  # pressure over its limit
 
 Phases = Sequence[tuple[float, int, float]]
 """Seconds, steps, and the share of the load at the end of each phase of a history."""
@@ -32,14 +30,9 @@ PHASES = ((0.2, 10, 1.0), (4.0, 40, 1.0), (0.1, 5, 0.0), (4.0, 40, 0.0))
 
 
 def relaxation(artifact: Path, position: Sequence[float] | None = None) -> dict[str, Any]:
-    """Press one place of an artifact's surface, hold, release, wait.
+    """Press one place (mm) of an artifact's surface, or its middle, hold, release, wait.
 
     Writes ``relaxation.csv`` and ``relaxation.png`` to the report beside the artifact.
-
-    Parameters
-    ----------
-    position : sequence of 3 floats, mm, optional
-        The middle of the surface if absent.
 
     Returns
     -------
@@ -47,10 +40,7 @@ def relaxation(artifact: Path, position: Sequence[float] | None = None) -> dict[
         Depths (mm) at once and after the hold, the depth left after the rest, the largest
         difference of the two models' depths, and the median time of a step (µs).
     """
-    atlas = ReducedModel.load(artifact)
-    if atlas.models.viscous is None:
-        raise QueryError("scene", f"{atlas.name!r} is elastic: nothing relaxes")
-    problem = FullProblem.of_artifact(read_artifact(artifact))
+    atlas, problem = opened(artifact, in_time=True)
     vertices = atlas.surface.vertices
     middle = vertices[np.linalg.norm(vertices - vertices.mean(axis=0), axis=1).argmin()]
     at = middle if position is None else np.array(position)
@@ -62,8 +52,8 @@ def relaxation(artifact: Path, position: Sequence[float] | None = None) -> dict[
     ]
     reduced, full = Shipped(problem, atlas, "in time"), Full(problem)
     reduced.solve(steps[0][0])  # compiles
-    answers = reduced.follow(steps)
-    exact = [problem.under(x, state.displacement) for state in full.follow(tqdm(steps, "full"))]
+    answers, *_ = play(reduced, steps)
+    exact = [problem.under(x, past.displacement) for past in play(full, tqdm(steps, "full"))[0]]
     moved = list(zip(exact, [answer.contact_displacement for answer in answers], strict=True))
     times, depth = np.cumsum([dt for _, dt in steps]), -np.array(moved) @ normal
     force = np.array([np.linalg.norm(answer.force) for answer in answers])

@@ -8,7 +8,7 @@ scene has one, with the rigid tip, in the same places.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 
 import numpy as np
@@ -17,37 +17,30 @@ from numpy.typing import NDArray
 from palpate.offline.bench import limit_at
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.methods.method import Case
-from palpate.offline.reduce.queries import LIFTED
 from palpate.offline.reduce.sampling import random_points_and_rim, tangents
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.studies.hard_cases import HardCase
 from palpate.offline.studies.relaxation import load_steps
+from palpate.offline.validate.queries import LIFTED
 from palpate.shared.mechanics.footprint import TIP_DEPTH
-from palpate.shared.mechanics.tissue import Tissue
 from palpate.shared.model import ReducedModel
 
 Array = NDArray[np.float64]
 
 CONTROL = "press, hold, let go"
 
-DEEP = 0.8
-"""Load of most histories, over its limit."""
-
-SMALL, LONG = 1e-5, 1e4
-"""Shortest step and longest hold, s."""
-
+DEEP = 0.8  # load of most histories, over its limit
+SMALL, LONG = 1e-5, 1e4  # shortest step and longest hold, s
 SHORT = 100.0
 """Length of large steps, and of the hold in many steps, over the slowest time constant."""
 
-TILT = 25.0
-"""Degrees to either side of a load that is flipped."""
-
+TILT = 25.0  # degrees to either side of a load that is flipped
 PERIOD, PERIODS = 50, 10
 """Steps in a period of the periodic movement, and periods after which the full model repeats."""
 
 Step = tuple[Case, float]
-Maker = Callable[[Array], HardCase]
-"""Makes the history of a kind in a place."""
+Course = Callable[[Array], Iterable[Step]]
+"""Steps of a kind of history in a place."""
 
 
 class Presser:
@@ -80,88 +73,94 @@ class Presser:
         x, normal, _ = surface.project(at)
         return surface.project(x + distance * tangents(normal)[0])[0]
 
+    def levels(self, shares: Sequence[float] | Array, dt: float | Array, at: Array) -> list[Step]:
+        """Press at a place to one level after the other."""
+        times = np.broadcast_to(dt, len(shares)).tolist()
+        return [self(at, float(share), t) for share, t in zip(shares, times, strict=True)]
+
 
 def histories(
     atlas: ReducedModel, problem: FullProblem, tip: bool, cases: int, seed: int, many: int
 ) -> dict[str, list[HardCase]]:
-    """Histories of every kind by its name, in so many places; the longest of ``many`` steps in one.
+    """Histories of every kind by its name; the longest of ``many`` steps in one place only.
 
     They are of footprints, or of the rigid tip.
     """
     rng = stream(atlas.scene.seed, Stage.HARD_CASES_IN_TIME, seed)
     # the first is on the rim
     places = list(random_points_and_rim(atlas.surface, cases, rng))
-    makers = _makers(Presser(atlas, problem, tip), atlas.scene.tissue, rng, places, many)
-    return {
-        name: [make(at) for at in (places[-1:] if name.endswith("steps") else places)]
-        for name, make in makers.items()
+    press, tissue = Presser(atlas, problem, tip), atlas.scene.tissue
+    large = SHORT * max(tau for _, tau in tissue.prony)
+
+    def case(steps: Sequence[Step], brief: Sequence[Step] = (), nonsense: bool = False) -> HardCase:
+        return HardCase(
+            steps, tissue.poisson, history=True, tip=tip, brief=brief, end_only=bool(brief),
+            nonsense=nonsense,
+        )  # fmt: skip
+
+    found = {
+        name: [case(list(course(at)), nonsense=name.startswith("time ")) for at in places]
+        for name, course in _courses(press, large, rng, places).items()
         if not (tip and "direction" in name)
     }
+    at, few = places[-1], many // 10
+    pressed = _pressed(press, at)
+    for seconds, steps, shown in ((LONG, few, "10 000"), (large, many, f"{large:g}")):
+        held = press.levels(np.full(steps, DEEP), seconds / steps, at)
+        brief = list(_growing(press, seconds, at))
+        found[f"held for {shown} s, {steps} steps"] = [case([*pressed, *held], brief)]
+    phase = 2 * np.pi * np.arange(1, PERIOD + 1) / PERIOD
+    period = press.levels(0.5 + 0.3 * np.cos(phase), 0.02, at)
+    repeats = max(many // PERIOD, 1)
+    periodic = case(repeats * period, min(repeats, PERIODS) * period)
+    return found | {f"moves periodically, {many} steps": [periodic]}
 
 
-def _makers(
-    press: Presser, tissue: Tissue, rng: np.random.Generator, places: Sequence[Array], many: int
-) -> dict[str, Maker]:
-    slowest = max(tau for _, tau in tissue.prony)
+def _pressed(press: Presser, at: Array) -> list[Step]:
+    return press.levels([0.25 * DEEP, 0.5 * DEEP, 0.75 * DEEP, DEEP], 0.02, at)
 
-    def of(steps: Callable[[Array], Iterator[Step]], nonsense: bool = False) -> Maker:
-        return lambda at: HardCase(tuple(steps(at)), tissue.poisson, nonsense=nonsense)
 
-    def levels(shares: Sequence[float] | Array, dt: float | Array, at: Array) -> Iterator[Step]:
-        for share, seconds in zip(shares, np.broadcast_to(dt, len(shares)), strict=True):
-            yield press(at, float(share), float(seconds))
+def _growing(press: Presser, seconds: float, at: Array) -> Iterator[Step]:
+    yield from _pressed(press, at)
+    ends = np.concatenate([[0.0], np.geomspace(0.01, seconds, 24)])
+    yield from press.levels(np.full(24, DEEP), np.diff(ends), at)
 
-    def pressed(at: Array) -> Iterator[Step]:
-        return levels([0.25 * DEEP, 0.5 * DEEP, 0.75 * DEEP, DEEP], 0.02, at)
+
+def _courses(
+    press: Presser, large: float, rng: np.random.Generator, places: Sequence[Array]
+) -> dict[str, Course]:
+    """Kinds of histories that the full model follows step by step, by name."""
 
     def simple(at: Array) -> Iterator[Step]:
         phases = ((0.2, 6, DEEP), (2.0, 8, DEEP), (0.1, 4, 0.0), (2.0, 8, 0.0))
         return (press(at, share, dt) for dt, share in load_steps(phases))
-
-    def growing(seconds: float, at: Array) -> Iterator[Step]:
-        yield from pressed(at)
-        ends = np.concatenate([[0.0], np.geomspace(0.01, seconds, 24)])
-        yield from levels(np.full(24, DEEP), np.diff(ends), at)
-
-    def even(seconds: float, steps: int, at: Array) -> HardCase:
-        held = levels(np.full(steps, DEEP), seconds / steps, at)
-        brief = tuple(growing(seconds, at))
-        return HardCase((*pressed(at), *held), tissue.poisson, brief=brief, end_only=True)
-
-    def periodic(steps: int, at: Array) -> HardCase:
-        phase = 2 * np.pi * np.arange(1, PERIOD + 1) / PERIOD
-        period = tuple(levels(0.5 + 0.3 * np.cos(phase), 0.02, at))
-        repeats = max(steps // PERIOD, 1)
-        brief = min(repeats, PERIODS) * period
-        return HardCase(repeats * period, tissue.poisson, brief=brief, end_only=True)
 
     def slides(at: Array) -> Iterator[Step]:
         for distance in 2.0 * np.sin(np.linspace(0.0, 1.5 * np.pi, 30)):
             yield press(press.aside(at, distance), 0.6, 1e-3)
 
     def flipped(at: Array) -> Iterator[Step]:
-        yield from pressed(at)
+        yield from _pressed(press, at)
         for side in (1.0, -1.0, 1.0, -1.0):
             yield press(at, DEEP, 0.0, side * TILT)
             yield press(at, DEEP, 0.1, side * TILT)
 
     def teleports(at: Array) -> Iterator[Step]:
-        yield from pressed(at)
+        yield from _pressed(press, at)
         for i in range(12):
             other = places[i % len(places)] if i % 3 == 0 else _anywhere(places, rng)
             yield press(other, rng.uniform(0.3, 0.9), 0.02)
 
     def goes(step: float, at: Array) -> Iterator[Step]:
-        yield from pressed(at)
+        yield from _pressed(press, at)
         yield press(at, DEEP, step)
 
     lengths = np.random.default_rng(1)
     sudden = np.tile([DEEP, 0.0, DEEP, 0.5 * DEEP], 4)
-    small, large = np.append(np.full(39, SMALL), 1.0), SHORT * slowest
     series: dict[str, tuple[Array, float | Array]] = {
         "steps of 0.01 ms": (np.linspace(0.1, 1.0, 20) * DEEP, SMALL),
         "steps of 100 time constants": (np.tile([DEEP, 0.3, 0.0], 4), large),
-        "steps of 0.01 ms, held": (np.full(40, DEEP), small),
+        "steps of 0.01 ms, held": (np.full(40, DEEP), np.append(np.full(39, SMALL), 1.0)),
         "steps of a day": (np.tile([DEEP, 0.3], 5), 86400.0),
         "steps of all lengths": (lengths.uniform(0.2, 0.9, 40), 10 ** lengths.uniform(-6, 3, 40)),
         "taps at 20 Hz": (np.tile([0.4, DEEP, 0.4, 0.0], 12), 0.0125),
@@ -171,17 +170,14 @@ def _makers(
         "3 x the limit": (np.linspace(0.2, 3.0, 16), 0.05),
     }
     return {
-        CONTROL: of(simple),
-        **{name: of(partial(levels, *own)) for name, own in series.items()},
-        "slides at 300 mm per s": of(slides),
-        "direction flipped at once": of(flipped),
-        "contact teleports": of(teleports),
-        "held for 10 000 s": of(partial(growing, LONG)),
-        f"held for 10 000 s, {many // 10} steps": partial(even, LONG, many // 10),
-        f"held for {large:g} s, {many} steps": partial(even, large, many),
-        f"moves periodically, {many} steps": partial(periodic, many),
-        "time runs back": of(partial(goes, -0.1), nonsense=True),
-        "time is not a number": of(partial(goes, np.nan), nonsense=True),
+        CONTROL: simple,
+        **{name: partial(press.levels, *own) for name, own in series.items()},
+        "slides at 300 mm per s": slides,
+        "direction flipped at once": flipped,
+        "contact teleports": teleports,
+        "held for 10 000 s": partial(_growing, press, LONG),
+        "time runs back": partial(goes, -0.1),
+        "time is not a number": partial(goes, np.nan),
     }
 
 

@@ -10,32 +10,21 @@ import numpy as np
 from tqdm import tqdm
 
 from palpate.offline.fem.problem import FullProblem, Load, Step
-from palpate.offline.reduce.queries import random_loads
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.tables import write_csv
 from palpate.offline.run.workers import completed, open_artifact, worker_pool
 from palpate.offline.validate.compare import Row, compare, play, summarise
 from palpate.offline.validate.kinds import Kind
+from palpate.offline.validate.queries import random_loads
 from palpate.shared.artifact import read_artifact
-from palpate.shared.errors import PalpateError
+from palpate.shared.errors import PalpateError, QueryError
 from palpate.shared.model import ReducedModel
 
 
 def against_full(
     artifact: Path, kind: Kind, count: int, seed: int, csv: Path | None = None
 ) -> dict[str, Any]:
-    """Compare an artifact with its full model on new random queries.
-
-    Parameters
-    ----------
-    artifact : Path
-    kind : Kind
-    count : int
-        Queries, over the whole surface and range of loads.
-    seed : int
-        Of the queries; those of training come from none.
-    csv : Path, optional
-        Where to write one row per query.
+    """Compare an artifact with its full model on new random queries, written one by one to a CSV.
 
     Returns
     -------
@@ -51,7 +40,9 @@ def against_full(
         If the artifact has none to this kind.
     """
     model = ReducedModel.load(artifact)
-    kind.check(model)
+    lack = kind.lacks(model.models)
+    if lack:
+        raise QueryError("scene", f"{model.name!r} {lack}")
     problem = FullProblem.of_artifact(read_artifact(artifact))
     queries = kind.random(model, count, held_out(model, seed))
     tasks = {str(i): reference_task(model, query) for i, query in enumerate(queries)}

@@ -17,24 +17,15 @@ Array = NDArray[np.float64]
 class KnownAnswer:
     """An answer of the reduced model whose errors are known.
 
-    Attributes
-    ----------
-    errors : ndarray, shape (quantities,)
-        Largest errors until then, relative to the largest norms until then, which do not vanish
-        where an error changes its sign.
-    features : ndarray
-        Of the error estimate.
-    converged : bool
-    comparable : bool
-        Whether it counts for the error estimate: both models rest in the same equilibrium.
-    estimated : ndarray, shape (quantities,)
+    The errors are the largest until then, relative to the largest norms until then, which do not
+    vanish where an error changes its sign.
     """
 
-    errors: Array
-    features: Array
+    errors: Array  # (quantities,)
+    features: Array  # of the error estimate
     converged: bool
-    comparable: bool
-    estimated: Array = field(default_factory=lambda: np.empty(0))
+    comparable: bool  # counts for the estimate: both models rest in the same equilibrium
+    estimated: Array = field(default_factory=lambda: np.empty(0))  # (quantities,)
 
 
 def calibrate(known: Sequence[KnownAnswer], share: float, damping: float) -> Estimator:
@@ -42,14 +33,8 @@ def calibrate(known: Sequence[KnownAnswer], share: float, damping: float) -> Est
 
     A least-squares fit of their logs is raised by a constant for each quantity.  The answers that
     need not be covered are those that would raise one most.  What counts is how far an answer lies
-    from a fit to the others, or the estimate would cover fewer of new ones.
-
-    Parameters
-    ----------
-    known : sequence of KnownAnswer
-    share : float
-    damping : float
-        Holds the coefficients back, since known errors are few for many features.
+    from a fit to the others, or the estimate would cover fewer of new ones.  ``damping`` holds the
+    coefficients back, since known errors are few for many features.
     """
     known = [answer for answer in known if answer.comparable]
     X = np.array([answer.features for answer in known])

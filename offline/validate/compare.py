@@ -32,20 +32,17 @@ def play(model: ReducedModel, query: Sequence[Step]) -> list[Answer]:
     past, warm = (REST, model.new_warm()) if in_time else (None, None)
     answers: list[Answer] = []
     for step in query:
-        answer = (
-            model.press(
-                step.position, step.pressure, step.direction, past=past, dt=step.dt, warm=warm
-            )
-            if isinstance(step, Load)
-            else model.touch(step.position, past=past, dt=step.dt, warm=warm)
-        )
-        answers.append(answer)
-        past = answer.past
+        time: dict[str, Any] = {"past": past, "dt": step.dt, "warm": warm}
+        if isinstance(step, Load):
+            answers.append(model.press(step.position, step.pressure, step.direction, **time))
+        else:
+            answers.append(model.touch(step.position, **time))
+        past = answers[-1].past
     return answers
 
 
 class Compared(NamedTuple):
-    """A quantity at the ends of time steps, by both models, each (t, ...)."""
+    """A quantity at the ends of time steps, by both models, each (t, k)."""
 
     reduced: Array
     full: Array
@@ -58,12 +55,12 @@ class Compared(NamedTuple):
     @property
     def away(self) -> Array:
         """Size of the error (t,) at each moment."""
-        return _sizes(self.reduced - self.full)
+        return np.linalg.norm(self.reduced - self.full, axis=1)
 
     @property
     def largest(self) -> Array:
         """Largest norm (t,) until each moment."""
-        return np.asarray(np.maximum.accumulate(_sizes(self.full)))
+        return np.asarray(np.maximum.accumulate(np.linalg.norm(self.full, axis=1)))
 
     @property
     def so_far(self) -> Array:
@@ -75,24 +72,15 @@ class Compared(NamedTuple):
         return np.asarray(np.maximum.accumulate(self.away) / np.maximum(self.largest, floor))
 
 
-def _sizes(values: Array) -> Array:
-    return np.asarray(np.linalg.norm(values.reshape(len(values), -1), axis=1))
-
-
 class Row(NamedTuple):
     """One query answered by both models.
 
-    Attributes
-    ----------
-    table : dict
-        What there is to tell of it; errors are relative L2 norms over all nodes (of stress outside
-        the clamped layer) and all moments.
-    known : list of KnownAnswer
-        The answers at the ends of its time steps.
+    Errors in its table are relative L2 norms over all nodes (of stress outside the clamped layer)
+    and all moments.
     """
 
     table: dict[str, float]
-    known: list[KnownAnswer]
+    known: list[KnownAnswer]  # answers at the ends of its time steps
 
 
 def compare(
@@ -106,7 +94,7 @@ def compare(
         "force": ([answer.force for answer in answers], full.f),
     }
     compared = {
-        name: Compared(*(np.array(values, float) for values in fields[name]))
+        name: Compared(*(np.array(own, float).reshape(len(query), -1) for own in fields[name]))
         for name in kind.quantities
     }
     errors = np.transpose([quantity.so_far for quantity in compared.values()])
@@ -183,7 +171,8 @@ def _history(
         for name, (reduced, full) in compared.items():
             table[f"together_{name}"] = relative(reduced[~apart], full[~apart])
         return table
-    under = [problem.under(*pair) for pair in zip(positions, moved.full, strict=True)]
+    exact = moved.full.reshape(len(query), -1, 3)
+    under = [problem.under(*pair) for pair in zip(positions, exact, strict=True)]
     contact = np.array([answer.contact_displacement for answer in answers])
     table["depth"] = relative(contact, np.array(under))
     table["last_displacement"] = float(moved.away[-1] / moved.largest[-1])
@@ -213,7 +202,7 @@ def summarise(kind: Kind, rows: Sequence[Row]) -> dict[str, Any]:
     if kind.tip and kind.in_time:
         moments = [row["apart"] for row in answered]
         summary["apart"] = {"histories": int(np.count_nonzero(moments)), "moments": sum(moments)}
-    for name in kind.columns:
+    for name in (*kind.quantities, *kind.others):
         counted = answered if name.startswith("together") else alike
         summary[name] = statistics([row[name] for row in counted])
     medians = dict(zip(kind.quantities, ratios.tolist(), strict=True))

@@ -8,45 +8,44 @@ from typing import NamedTuple
 import numpy as np
 
 from palpate.offline.fem.problem import Step
-from palpate.offline.reduce.queries import random_histories, random_loads, random_positions
 from palpate.offline.run.streams import Stage
-from palpate.shared.errors import QueryError
+from palpate.offline.validate.queries import random_histories, random_loads, random_positions
 from palpate.shared.local_models import LocalModels
 from palpate.shared.model import ReducedModel
 
 
 class Kind(NamedTuple):
-    """A kind of query.
+    """A kind of query."""
 
-    Attributes
-    ----------
-    name : str
-        Of its error estimate, see ``shared.local_models.Estimators``.
-    document, title : str
-        Of its summary in an artifact, and of its full solutions.
-    tip, in_time : bool
-        Whether the rigid tip presses, not a footprint, and whether over a history.
-    stage : Stage
-        Whose random numbers training draws.
-    coverage, damping : float
-        Of the error estimate, see ``calibrate``.  For 95 % of unseen errors to be covered, some
-        more of the known ones must be; answers within one history err alike.
-    quantities : tuple of str
-        What errors are estimated of; the force of a footprint is given.
-    columns : tuple of str
-        What a summary has statistics of.
-    """
+    name: str  # of its error estimate, see ``shared.local_models.Estimators``
+    tip: bool  # whether the rigid tip presses, not a footprint
+    in_time: bool  # whether over a history
+    stage: Stage  # whose random numbers training draws
+    damping: float  # of the error estimate, see ``calibrate``
+    others: tuple[str, ...]  # what a summary has statistics of beside the quantities
 
-    name: str
-    document: str
-    title: str
-    tip: bool
-    in_time: bool
-    stage: Stage
-    coverage: float
-    damping: float
-    quantities: tuple[str, ...]
-    columns: tuple[str, ...]
+    @property
+    def document(self) -> str:
+        """Name of its summary in an artifact."""
+        return "validation" + "_tip" * self.tip + "_histories" * self.in_time
+
+    @property
+    def title(self) -> str:
+        """What its full solutions are called."""
+        return f"full {'histories' if self.in_time else 'solutions'}" + " under the tip" * self.tip
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """What errors are estimated of; the force of a footprint is given."""
+        return ("displacement", "von_mises", "force")[: 3 if self.tip else 2]
+
+    @property
+    def coverage(self) -> float:
+        """Of the error estimate, so that it covers 95 % of unseen errors; see ``calibrate``.
+
+        Answers within one history err alike.
+        """
+        return 0.97 if self.in_time else 0.96
 
     def random(
         self, model: ReducedModel, count: int, rng: np.random.Generator
@@ -63,34 +62,16 @@ class Kind(NamedTuple):
             return "was trained without a tip"
         return "is elastic and has no histories" if self.in_time and not models.viscous else None
 
-    def check(self, model: ReducedModel) -> None:
-        """Raise ``QueryError`` if a model has no answers to this kind."""
-        lack = self.lacks(model.models)
-        if lack:
-            raise QueryError("scene", f"{model.name!r} {lack}")
 
-
-FIELDS = ("displacement", "von_mises")
-QUANTITIES = (*FIELDS, "force")
-
-LOADS = Kind(
-    "loads", "validation", "full solutions", False, False, Stage.VALIDATION, 0.96, 0.3,
-    FIELDS, (*FIELDS, "von_mises_p99"),
-)  # fmt: skip
-TIP = Kind(
-    "touches", "validation_tip", "full solutions under the tip", True, False,
-    Stage.TIP_VALIDATION, 0.96, 1.0,
-    QUANTITIES, (*QUANTITIES, "tangent", "penetration_over_depth"),
-)  # fmt: skip
+LOADS = Kind("loads", False, False, Stage.VALIDATION, 0.3, ("von_mises_p99",))
+TIP = Kind("touches", True, False, Stage.TIP_VALIDATION, 1.0, ("tangent", "penetration_over_depth"))
 HISTORIES = Kind(
-    "histories", "validation_histories", "full histories", False, True,
-    Stage.HISTORY_VALIDATION, 0.97, 30.0,
-    FIELDS, (*FIELDS, "depth", "worst_displacement", "worst_von_mises", "last_displacement"),
+    "histories", False, True, Stage.HISTORY_VALIDATION, 30.0,
+    ("depth", "worst_displacement", "worst_von_mises", "last_displacement"),
 )  # fmt: skip
 TIP_HISTORIES = Kind(
-    "courses", "validation_tip_histories", "full histories under the tip", True, True,
-    Stage.TIP_HISTORY_VALIDATION, 0.97, 30.0,
-    QUANTITIES, tuple(f"{of}{name}" for of in ("", "worst_", "together_") for name in QUANTITIES),
+    "courses", True, True, Stage.TIP_HISTORY_VALIDATION, 30.0,
+    tuple(f"{of}_{name}" for of in ("worst", "together") for name in TIP.quantities),
 )  # fmt: skip
 
 KINDS = (LOADS, TIP, HISTORIES, TIP_HISTORIES)

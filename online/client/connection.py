@@ -10,7 +10,7 @@ from urllib.parse import SplitResult, quote, urlsplit
 
 from websockets.client import ClientProtocol
 from websockets.exceptions import InvalidState, InvalidStatus
-from websockets.frames import Frame, Opcode
+from websockets.frames import Close, Frame, Opcode
 from websockets.protocol import State
 from websockets.uri import parse_uri
 
@@ -36,40 +36,30 @@ class SessionClosed(PalpateError):
 
     def __init__(self, code: int, reason: str) -> None:
         super().__init__(f"the session has ended: {reason or 'no reason given'} ({code})")
-        self.code = code
-        self.reason = reason
+        self.code, self.reason = code, reason
 
 
 class Connection:
-    """An open WebSocket at a path of a service.
-
-    Raises
-    ------
-    ServiceError
-        If the service refuses the handshake.
-    """
+    """An open WebSocket at a path of a service; `ServiceError` if the handshake is refused."""
 
     def __init__(self, url: str, path: str, token: str | None, timeout: float) -> None:
         address = f"ws://{split_address(url).netloc}{path}"
         self._received: deque[str | bytes] = deque()
         self.protocol = ClientProtocol(parse_uri(address), max_size=None)
         self.socket = connect(url, timeout)
-        try:
-            self._shake_hands(token)
-        except BaseException:
-            self.socket.close()
-            raise
-
-    def _shake_hands(self, token: str | None) -> None:
         request = self.protocol.connect()
         if token is not None:
             request.headers["Authorization"] = f"Bearer {token}"
         self.protocol.send_request(request)
-        self.flush()
-        while self.protocol.state is State.CONNECTING and self.protocol.handshake_exc is None:
-            self._take()
-        if self.protocol.handshake_exc is not None:
-            raise _refusal(self.protocol.handshake_exc)
+        try:
+            self.flush()
+            while self.protocol.state is State.CONNECTING and self.protocol.handshake_exc is None:
+                self._take()
+            if self.protocol.handshake_exc is not None:
+                raise _refusal(self.protocol.handshake_exc)
+        except BaseException:
+            self.socket.close()
+            raise
 
     def close(self) -> None:
         """Say goodbye, if there is anybody to hear it, and hang up."""
@@ -105,9 +95,7 @@ class Connection:
 
     def flush(self) -> None:
         """Send what the protocol has to say."""
-        for data in self.protocol.data_to_send():
-            if data:
-                self.socket.sendall(data)
+        self.socket.sendall(b"".join(self.protocol.data_to_send()))
 
     def _take(self) -> None:
         """Wait for bytes and sort out the messages in them."""
@@ -124,14 +112,13 @@ class Connection:
         with suppress(ConnectionError):
             self.flush()  # the protocol has answers to pings and to a close message
         for event in self.protocol.events_received():
-            if isinstance(event, Frame) and event.opcode == Opcode.BINARY:
-                self._received.append(bytes(event.data))
-            elif isinstance(event, Frame) and event.opcode == Opcode.TEXT:
-                self._received.append(bytes(event.data).decode())
+            if isinstance(event, Frame) and event.opcode in (Opcode.TEXT, Opcode.BINARY):
+                message = bytes(event.data)
+                self._received.append(
+                    message if event.opcode is Opcode.BINARY else message.decode()
+                )
         if not data and not self._received and self.protocol.handshake_exc is None:
-            closed = self.protocol.close_rcvd
-            if closed is None:
-                raise SessionClosed(1006, "the connection broke")
+            closed = self.protocol.close_rcvd or Close(1006, "the connection broke")
             raise SessionClosed(closed.code, closed.reason)
 
 
@@ -160,7 +147,6 @@ def _refusal(error: Exception) -> PalpateError:
     """Make an error of a handshake that failed."""
     if isinstance(error, InvalidStatus) and error.response.body:
         with suppress(ValueError, KeyError):
-            return ServiceError(
-                error.response.status_code, json.loads(error.response.body)["error"]
-            )
+            body = json.loads(error.response.body)
+            return ServiceError(error.response.status_code, body["error"])
     return PalpateError(f"no session: {error}")

@@ -30,11 +30,7 @@ RAMP = 100e-3
 
 
 def linear_force(reply: Reply, position: Array) -> Array:
-    """Force (3,) on a tip at a position, from the linearisation of a reply.
-
-    The step from the reply's position is shortened to its valid radius, and the force never points
-    into the tissue.
-    """
+    """Linearised force (3,) of a reply at most its valid radius away; it never points inwards."""
     step = position - reply.position
     length = math.sqrt(step @ step)
     if length > reply.valid_radius:
@@ -47,12 +43,6 @@ def without_pull(force: Array, normal: NDArray[np.float32]) -> Array:
     outward = normal.astype(np.float64)
     push = float(force @ outward)
     return force if push >= 0.0 else force - push / (outward @ outward) * outward
-
-
-def clamp(force: Array, most: float) -> Array:
-    """Shorten a force (3,) to at most `most` mN."""
-    size = math.sqrt(force @ force)
-    return force if size <= most else force * (most / size)
 
 
 def fade(age: float) -> float:
@@ -82,10 +72,7 @@ class Extrapolator:
         self._offset = np.zeros(3)
 
     def update(self, reply: Reply, now: float) -> None:
-        """Take over a reply that came at `now`.
-
-        One with `Flag.FALLBACK` repeats what is known already, and makes it no younger.
-        """
+        """Take over a reply that came at `now`; one with `Flag.FALLBACK` tells nothing new."""
         if reply.flags & Flag.FALLBACK:
             return
         position = reply.position if self._position is None else self._position
@@ -104,4 +91,6 @@ class Extrapolator:
         age = now - self._since
         left = max(0.0, 1.0 - age / BLEND) * self._offset
         force = without_pull(linear_force(self._reply, position) + left, self._reply.normal)
-        return clamp(fade(age) * force, self._most)
+        force = fade(age) * force
+        size = math.sqrt(force @ force)
+        return force if size <= self._most else force * (self._most / size)

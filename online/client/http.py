@@ -49,9 +49,7 @@ class Accessible(NamedTuple):
 
 
 class Client:
-    """One connection to a service.
-
-    Give it the `token` that the service asks for, if it does, and how long to wait (s).
+    """One connection to a service, with the `token` it asks for and how long to wait (s).
 
     Examples
     --------
@@ -104,11 +102,7 @@ class Client:
 
         The direction is by default the inward normal, the radius (mm) the scene's. `outputs` are
         the fields to return, for the nodes of `region`: ``none``, ``surface`` or ``all``.
-
-        Raises
-        ------
-        ServiceError
-            If the service refuses.
+        Raises `ServiceError` if the service refuses.
         """
         contact = {
             "position": list(position),
@@ -118,10 +112,8 @@ class Client:
         }
         body = json.dumps({"contacts": [contact], "outputs": list(outputs), "region": region})
         head, fields = self._document("POST", name, "/solve", body.encode())
-        for vector in ("force", "contact_displacement"):
-            head[vector] = np.array(head[vector])
-        found = {**head, **fields}
-        return Answer._make(map(found.get, Answer._fields))
+        vectors = {name: np.array(head[name]) for name in ("force", "contact_displacement")}
+        return Answer._make(map({**head, **vectors, **fields}.get, Answer._fields))
 
     def session(self, name: str, record: Path | None = None) -> Session:
         """Open a session of a scene, on a connection of its own; see `Session`."""

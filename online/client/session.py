@@ -13,28 +13,12 @@ from palpate.online.session.recording import Recorder
 
 
 class Session:
-    """An open session.
+    """An open session of a scene on the service at `url`, which may ask for a `token`.
 
-    Parameters
-    ----------
-    url, scene : str
-        Address of the service, and a scene that it serves.
-    token : str, optional
-        What the service asks for, if it does.
-    timeout : float, s
-        Longest wait for a reply; a session that could not send in this time is of no more use.
-    record : Path, optional
-        File to record the session to, for `palpate replay`; overwritten.
-
-    Attributes
-    ----------
-    greeting : dict
-        What the service said of the scene and of its frames.
-
-    Raises
-    ------
-    ServiceError
-        If the service refuses the session.
+    The `timeout` (s) is the longest wait for a reply; a session that could not send in this time
+    is of no more use. What is sent and answered is recorded to the file `record`, for
+    ``palpate replay``. The `greeting` is what the service said of the scene and of its frames.
+    Raises `ServiceError` if the service refuses the session.
 
     Examples
     --------
@@ -52,12 +36,10 @@ class Session:
         record: Path | None = None,
     ) -> None:
         self._seq = 0
-        self._recorder: Recorder | None = None
         self._connection = Connection(url, scene_path(scene, "/session"), token, timeout)
         try:
             self.greeting: dict[str, Any] = json.loads(self._connection.receive())
-            if record is not None:
-                self._recorder = Recorder(record, self.greeting)
+            self._recorder = None if record is None else Recorder(record, self.greeting)
         except BaseException:
             self._connection.socket.close()
             raise
@@ -89,24 +71,15 @@ class Session:
         """
         self._seq = (self._seq + 1) % 2**32
         x, y, z = position
-        now = perf_counter() if client_time is None else client_time
-        request = Request(self._seq, now, (x, y, z), outputs)
+        client_time = perf_counter() if client_time is None else client_time
+        request = Request(self._seq, client_time, (x, y, z), outputs)
         if self._recorder is not None:
             self._recorder.sent(request)
         self._connection.send(frames.encode_request(request))
         return self._seq
 
     def receive(self) -> Reply:
-        """Wait for a reply.
-
-        Raises
-        ------
-        ServiceError
-            If the service could not read a frame.
-        SessionClosed
-            If the session has ended.
-        TimeoutError
-        """
+        """Wait for a reply; raise `ServiceError`, `SessionClosed` or `TimeoutError`."""
         return self._decoded(self._connection.receive())
 
     def poll(self) -> Reply | None:
@@ -123,10 +96,7 @@ class Session:
         return reply
 
     def snapshot(self, number: int = 0) -> None:
-        """Let the service keep the state of the tissue by a number.
-
-        Replies that are still under way are dropped. Raises what `receive` raises.
-        """
+        """Let the service keep the state of the tissue; replies still under way are dropped."""
         self._command("snapshot", number)
 
     def restore(self, number: int = 0) -> None:

@@ -14,6 +14,7 @@ import socket
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
+from functools import partial
 from operator import itemgetter
 from time import perf_counter_ns
 from typing import NamedTuple
@@ -33,8 +34,7 @@ CHUNK = 1 << 18
 LOST, DROPPED, SUPERSEDED, ANSWERED = 0, 1, 2, 200
 """What became of a message; other numbers are HTTP statuses of refusals.
 
-A query is dropped that never went out, for want of a connection; a frame is superseded if the
-service says that it left it for a newer one.
+A dropped query never went out; a superseded frame was left by the service for a newer one.
 """
 
 
@@ -53,7 +53,7 @@ class Log:
 
 
 class Stream(ABC):
-    """A source of messages, with a socket or several; `complaint` says what went wrong last."""
+    """A source of messages, with its open sockets; `complaint` says what went wrong last."""
 
     def __init__(self, due: NDArray[np.float64], sockets: Sequence[socket.socket]) -> None:
         self.log = Log(due)
@@ -72,25 +72,28 @@ class Stream(ABC):
         """Send a message, now being `now` (ns)."""
 
     @abstractmethod
-    def take(self, connection: socket.socket, chunk: bytes, now: int) -> bool:
-        """Take what has come at `now` (ns); tell whether more may come on this socket."""
+    def take(self, connection: socket.socket, chunk: bytes, now: int) -> None:
+        """Take what has come at `now` (ns)."""
 
-    def lose(self, connection: socket.socket, why: str) -> bool:
-        """Do without a socket that broke; nothing comes on it any more."""
+    def lose(self, connection: socket.socket, why: str) -> None:
+        """Do without a socket that broke."""
         self.complaint = why
-        return False
+        self.sockets.remove(connection)
+        connection.close()
 
     def receive(self, connection: socket.socket, now: int) -> bool:
         """Read a socket at `now` (ns); tell whether more may come on it."""
         try:
-            chunk = connection.recv(CHUNK)
+            chunk, why = connection.recv(CHUNK), "the service hung up"
         except BlockingIOError:
             return True
         except OSError as error:
-            return self.lose(connection, f"the connection broke: {error.strerror}")
-        if not chunk:
-            return self.lose(connection, "the service hung up")
-        return self.take(connection, chunk, now)
+            chunk, why = b"", f"the connection broke: {error.strerror}"
+        if chunk:
+            self.take(connection, chunk, now)
+        else:
+            self.lose(connection, why)
+        return connection in self.sockets
 
     def close(self) -> None:
         """Hang up."""
@@ -107,22 +110,18 @@ class Machine(NamedTuple):
 
 def drive(streams: Sequence[Stream]) -> Machine:
     """Send every message of every stream when it is due, and take the answers."""
-    timetable = deque(
-        sorted(
-            (
-                (due, number, stream.send)
-                for stream in streams
-                for number, due in enumerate(stream.log.due)
-            ),
-            key=itemgetter(0),
-        )
+    messages = (
+        (due, number, stream.send)
+        for stream in streams
+        for number, due in enumerate(stream.log.due)
     )
+    timetable = deque(sorted(messages, key=itemgetter(0)))
     poll = select.poll()
-    receivers = {}
-    for stream in streams:
-        for connection in stream.sockets:
-            poll.register(connection, select.POLLIN)
-            receivers[connection.fileno()] = (stream.receive, connection)
+    receivers = {
+        c.fileno(): partial(stream.receive, c) for stream in streams for c in stream.sockets
+    }
+    for descriptor in receivers:
+        poll.register(descriptor, select.POLLIN)
     limit = timetable[-1][0] + int(1e9 * DRAIN)
     window = int(1e9 * WINDOW)
     samples = [(0, _steal())]
@@ -137,8 +136,7 @@ def drive(streams: Sequence[Stream]) -> Machine:
                 send(number, now)
                 now = perf_counter_ns() - start
             for descriptor, _ in poll.poll(0):
-                receive, connection = receivers[descriptor]
-                if not receive(connection, perf_counter_ns() - start):
+                if not receivers[descriptor](perf_counter_ns() - start):
                     poll.unregister(descriptor)
             if now - samples[-1][0] >= window:
                 samples.append((now, _steal()))

@@ -4,6 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
+from scipy.ndimage import gaussian_filter1d
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
@@ -50,8 +52,7 @@ def tool_path(surface: Accessible, tip: Tip, times: Array, rng: np.random.Genera
     swing = np.sin(2 * np.pi * along / WAVE + rng.uniform(0.0, 2 * np.pi))
     depth = (tip.depth - LIFTED) / 2 + (tip.depth + LIFTED) / 2 * swing
     centres = feet + (tip.radius - depth)[:, None] * normals
-    reached = _lengths(centres)
-    return np.stack([np.interp(way, reached, axis) for axis in centres.T], axis=1)
+    return make_interp_spline(_lengths(centres), centres, 1)(way)
 
 
 def _walk(surface: Accessible, length: float, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -67,29 +68,20 @@ def _walk(surface: Accessible, length: float, rng: np.random.Generator) -> tuple
     way = [int(rng.integers(len(vertices)))]
     walked = 0.0
     while walked < 2.0 * length + 4 * WAVE:
-        distance, before = dijkstra(
-            graph, directed=False, indices=way[-1], return_predecessors=True
-        )
+        distance, before = dijkstra(graph, False, way[-1], return_predecessors=True)
         target = int(rng.choice(np.flatnonzero(np.isfinite(distance))))
         walked += float(distance[target])
         leg = [target]
         while leg[-1] != way[-1]:
             leg.append(int(before[leg[-1]]))
         way += leg[-2::-1]
-    corners, normals = vertices[way], surface.normals[way].astype(np.float64)
-    along = _lengths(corners)
+    along = _lengths(vertices[way])
     at = np.arange(0.0, along[-1], STEP)
-    points, directions = (
-        np.stack([_smooth(np.interp(at, along, axis)) for axis in field.T], axis=1)
-        for field in (corners, normals)
+    points, normals = (
+        gaussian_filter1d(make_interp_spline(along, field[way], 1)(at), SMOOTHING / STEP, axis=0)
+        for field in (vertices, surface.normals)
     )
-    return points, directions / np.linalg.norm(directions, axis=1, keepdims=True)
-
-
-def _smooth(values: Array) -> Array:
-    reach = int(3 * SMOOTHING / STEP)
-    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) * STEP / SMOOTHING) ** 2)
-    return np.convolve(np.pad(values, reach, "edge"), kernel / kernel.sum(), "valid")
+    return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
 def _lengths(points: Array) -> Array:

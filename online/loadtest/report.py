@@ -3,7 +3,7 @@
 import os
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,40 +20,30 @@ QUANTILES = {"p50_us": 50.0, "p90_us": 90.0, "p99_us": 99.0, "p999_us": 99.9, "m
 Array = NDArray[np.float64]
 
 
-class Messages(NamedTuple):
-    """What became of n messages, in the order in which they were due; µs but for `due`."""
-
-    due: Array  # s
-    lateness: Array  # from when it was due to when its turn came; NaN if that never was
-    latency: Array  # from due to answered; NaN without an answer
-    solve: Array  # what the server says that it spent; NaN without an answer
-    recover: Array
-    outcome: NDArray[np.int64]
-    flags: NDArray[np.int64]
-
-    def where(self, chosen: NDArray[Any]) -> "Messages":
-        """Return some of them, by number or by mask."""
-        columns: tuple[Any, ...] = self
-        return Messages(*(column[chosen] for column in columns))
+Messages = np.recarray[Any, Any]
+"""What became of n messages, in the order in which they were due; see `gather`."""
 
 
 def gather(logs: Sequence[Log]) -> Messages:
-    """Put the messages of several streams in one order."""
-    due, sent, received, outcome, solve, recover, flags = (
-        np.concatenate([getattr(log, name) for log in logs])
+    """Put the messages of several streams in one table.
+
+    Its columns are `due` (s), `outcome` and `flags`, and in µs `lateness` from when it was due to
+    when its turn came, NaN if that never was; `latency` from due to answered, and what the server
+    says that it spent to `solve` and to `recover` fields, NaN without an answer.
+    """
+    columns = {
+        name: np.concatenate([getattr(log, name) for log in logs])
         for name in ("due", "sent", "received", "outcome", "solve", "recover", "flags")
-    )
-    answered = outcome == ANSWERED
-    messages = Messages(
-        1e-9 * due,
-        np.where(sent > 0, 1e-3 * (sent - due), np.nan),
-        np.where(answered, 1e-3 * (received - due), np.nan),
-        np.where(answered, solve, np.nan),
-        np.where(answered, recover, np.nan),
-        outcome,
-        flags,
-    )
-    return messages.where(np.argsort(due, kind="stable"))
+    }
+    due, sent, received = (columns[name] for name in ("due", "sent", "received"))
+    columns["due"] = 1e-9 * due
+    columns["lateness"] = np.where(sent > 0, 1e-3 * (sent - due), np.nan)
+    columns["latency"] = 1e-3 * (received - due)
+    for name in ("latency", "solve", "recover"):
+        columns[name] = np.where(columns["outcome"] == ANSWERED, columns[name], np.nan)
+    order = np.argsort(due, kind="stable")
+    dtype = [(name, column.dtype) for name, column in columns.items()]
+    return np.rec.fromarrays([column[order] for column in columns.values()], dtype=dtype)
 
 
 def clean_windows(machine: Machine, messages: Messages) -> NDArray[np.bool_]:
@@ -82,14 +72,11 @@ def quantiles(microseconds: Array) -> dict[str, float | None]:
 def summarize(
     messages: Messages, clean: NDArray[np.bool_], complaints: Sequence[str]
 ) -> dict[str, Any]:
-    """Say what became of frames or queries, those marked `clean` apart.
-
-    A query is dropped that found no free connection in time; those refused are counted by status.
-    """
+    """Say what became of frames or queries, those marked `clean` apart."""
     outcomes = Counter(messages.outcome.tolist())
-    flags = messages.flags[messages.outcome == ANSWERED]
+    flags = messages["flags"][messages.outcome == ANSWERED]
     return {
-        "due": len(messages.due),
+        "due": len(messages),
         "answered": outcomes.pop(ANSWERED, 0),
         "lost": outcomes.pop(generator.LOST, 0),
         "superseded": outcomes.pop(SUPERSEDED, 0),
@@ -141,9 +128,9 @@ def summarize_overload(
     phases = np.searchsorted([start, end], messages.due, "right")
     report: dict[str, Any] = {}
     for number, name in enumerate(("before", "during", "after")):
-        of_phase = messages.where(phases == number)
+        of_phase = messages[phases == number]
         report[name] = {
-            "due": len(of_phase.due),
+            "due": len(of_phase),
             "answered": int((of_phase.outcome == ANSWERED).sum()),
             **quantiles(of_phase.latency),
         }
@@ -161,9 +148,8 @@ def summarize_overload(
 def _worst(messages: Messages, window: NDArray[np.int64], chosen: int) -> float:
     """99th percentile of the latencies of a window; infinite if messages got no answer."""
     latency = messages.latency[(window == chosen) & (messages.outcome != SUPERSEDED)]
-    if not len(latency):
-        return np.inf
-    return float(np.percentile(np.where(np.isnan(latency), np.inf, latency), 99, method="higher"))
+    known = np.nan_to_num(latency, nan=np.inf, posinf=np.inf)
+    return float(np.percentile(known, 99, method="higher")) if len(known) else np.inf
 
 
 def table(summary: dict[str, Any]) -> str:
@@ -183,13 +169,11 @@ def table(summary: dict[str, Any]) -> str:
             f"| {name}, all windows | {counts} | {_row(kind['all'])} |",
             f"| {name}, solve alone | | | | | {_row(kind['solve_us'])} |",
         ]
-    machine = summary["machine"]
     rows += [
         "",
-        f"{machine['clean_windows']} of {machine['windows']} windows clean; steal "
-        f"{machine['steal_s']} s; load average {machine['load_average']:.1f}; generator late by "
-        f"{machine['lateness_us']['p50_us']:.1f} µs (p50), {machine['lateness_us']['p99_us']:.1f} "
-        "µs (p99)",
+        "{clean_windows} of {windows} windows clean; steal {steal_s} s; load average "
+        "{load_average:.1f}; generator late by {lateness_us[p50_us]:.1f} µs (p50), "
+        "{lateness_us[p99_us]:.1f} µs (p99)".format(**summary["machine"]),
     ]
     for name, added in summary.get("added", {}).items():
         rows.append(

@@ -1,6 +1,8 @@
 """Put a load on a service: tools over the surface, and queries beside them."""
 
 import socket
+from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
@@ -12,9 +14,8 @@ from palpate.online.client.http import Client
 from palpate.online.loadtest import report
 from palpate.online.loadtest.generator import Machine, Stream, drive
 from palpate.online.loadtest.paths import Tip, tool_path
-from palpate.online.loadtest.queries import QueryStream, write_requests
 from palpate.online.loadtest.report import Messages, clean_windows, gather, window_of
-from palpate.online.loadtest.sessions import FrameStream
+from palpate.online.loadtest.streams import FrameStream, QueryStream, write_requests
 from palpate.online.session.websocket import ECHO
 from palpate.shared.errors import PalpateError
 
@@ -48,10 +49,7 @@ class Plan:
 
 
 class Outcome(NamedTuple):
-    """What a load test found.
-
-    Messages are ``frames`` and ``queries``, and ``echoes`` and ``checks`` to compare them with.
-    """
+    """What a load test found; ``echoes`` and ``checks`` are to compare the others with."""
 
     summary: dict[str, Any]  # JSON-able
     machine: Machine
@@ -67,19 +65,17 @@ def run(plan: Plan) -> Outcome:
     """
     if not (plan.sessions or plan.queries):
         raise PalpateError("nothing to send: ask for --sessions or --queries-per-second")
-    streams: dict[str, list[Stream]] = {"frames": [], "queries": [], "echoes": [], "checks": []}
-    try:
-        _open(plan, streams)
-        machine = drive([stream for kind in streams.values() for stream in kind])
-    finally:
-        for kind in streams.values():
-            for stream in kind:
-                stream.close()
+    with ExitStack() as stack:
+        streams: list[tuple[str, Stream]] = []
+        for kind, stream in _streams(plan):
+            stack.callback(stream.close)
+            streams.append((kind, stream))
+        machine = drive([stream for _, stream in streams])
     return _judge(plan, machine, streams)
 
 
-def _open(plan: Plan, streams: dict[str, list[Stream]]) -> None:
-    """Connect to the service and make the streams of a plan."""
+def _streams(plan: Plan) -> Iterator[tuple[str, Stream]]:
+    """Connect to the service and make the streams of a plan, each with its kind."""
     rng = np.random.default_rng(plan.seed)
     with Client(plan.url, token=plan.token) as client:
         ranges = client.scene(plan.scene)["ranges"]
@@ -88,18 +84,17 @@ def _open(plan: Plan, streams: dict[str, list[Stream]]) -> None:
         due = _schedule(plan, plan.rate, i / plan.sessions)
         path = tool_path(surface, Tip(ranges["radius"], plan.depth), due, rng)
         line = _connect(plan, scene_path(plan.scene, "/session"))
-        streams["frames"].append(FrameStream(line, due, path, plan.outputs))
+        yield "frames", FrameStream(line, due, path, plan.outputs)
     if plan.sessions and plan.echo:
         due = _schedule(plan, plan.rate, 0.5 / plan.sessions)
-        streams["echoes"].append(FrameStream(_connect(plan, ECHO), due, path))
+        yield "echoes", FrameStream(_connect(plan, ECHO), due, path)
     if plan.queries:
         due = _schedule(plan, plan.queries, 0.5)
         places = rng.choice(surface.vertices, len(due))
         loads = places, rng.uniform(0.0, SHARE * ranges["pressure"][1], len(due))
-        streams["queries"].append(_queries(plan, "/solve", due, loads))
+        yield "queries", _queries(plan, "/solve", due, loads)
         if plan.echo:
-            due = _schedule(plan, plan.queries, 0.0)
-            streams["checks"].append(_queries(plan, "/check", due, loads))
+            yield "checks", _queries(plan, "/check", _schedule(plan, plan.queries, 0.0), loads)
 
 
 def _connect(plan: Plan, path: str) -> socket.socket:
@@ -122,29 +117,29 @@ def _queries(plan: Plan, verb: str, due: Array, loads: tuple[Array, Array]) -> Q
 def _schedule(plan: Plan, rate: float, shift: float) -> Array:
     """Say when the messages of a stream are due (s), `shift` of a period after the others."""
     rates = [rate] if plan.overload == 1.0 else [rate, plan.overload * rate, rate]
-    return np.concatenate(
-        [
-            LEAD + i * plan.duration + (np.arange(round(r * plan.duration)) + shift) / r
-            for i, r in enumerate(rates)
-        ]
-    )
+    due = [
+        LEAD + i * plan.duration + (np.arange(round(r * plan.duration)) + shift) / r
+        for i, r in enumerate(rates)
+    ]
+    return np.concatenate(due)
 
 
-def _judge(plan: Plan, machine: Machine, streams: dict[str, list[Stream]]) -> Outcome:
-    every = gather([stream.log for kind in streams.values() for stream in kind])
-    messages = {name: gather([s.log for s in kind]) for name, kind in streams.items() if kind}
+def _judge(plan: Plan, machine: Machine, streams: list[tuple[str, Stream]]) -> Outcome:
+    every = gather([stream.log for _, stream in streams])
+    kinds = dict.fromkeys(kind for kind, _ in streams)
+    messages = {name: gather([s.log for kind, s in streams if kind == name]) for name in kinds}
     clean = clean_windows(machine, every)
     summaries = {
         name: report.summarize(
             messages[name],
             clean[window_of(machine, messages[name])],
-            [stream.complaint for stream in streams[name]],
+            [stream.complaint for kind, stream in streams if kind == name],
         )
-        for name in ("frames", "queries")
-        if name in messages
+        for name in kinds
+        if name in ("frames", "queries")
     }
     summary: dict[str, Any] = {"plan": asdict(plan) | {"token": None}}
-    summary |= summaries.pop("frames" if plan.sessions else "queries") | summaries
+    summary |= summaries.pop(next(iter(kinds))) | summaries
     summary["machine"] = report.summarize_machine(machine, every)
     if plan.echo:
         summary["added"] = {

@@ -5,6 +5,7 @@ to its last; the number of steps of a history bounds how long others wait.
 """
 
 import math
+from itertools import pairwise
 from time import perf_counter
 from typing import Any
 
@@ -19,8 +20,8 @@ from palpate.online.serve.store import ServedModel
 from palpate.online.serve.wire import JSON
 from palpate.shared.answer import Answer, describe
 from palpate.shared.errors import QueryError
-from palpate.shared.model import ReducedModel, Warm
-from palpate.shared.reduced.transfer import REST, Past
+from palpate.shared.model import ReducedModel
+from palpate.shared.reduced.transfer import REST
 
 
 def answer(
@@ -34,21 +35,15 @@ def answer(
     """Solve a request from rest and write the answer.
 
     The same request has the same answer, whatever came before it. Sessions are for clients that
-    want a warm start.
-
-    Raises
-    ------
-    Refusal
-        If the request is malformed, a load is not one the model can be asked about, or it has no
-        equilibrium; or if a history is asked of elastic tissue.
+    want a warm start. Raises `Refusal` if the request is malformed, a load is not one the model can
+    be asked about, or it has no equilibrium; or if a history is asked of elastic tissue.
     """
     received = perf_counter()
     request = parse(kind, body)
     model = served.model
     if media_type == JSON:
         nodes = {"none": 0, "surface": len(model.surface_nodes), "all": len(model.nodes)}
-        per_node = 3 * ("displacement" in request.outputs) + ("von_mises" in request.outputs)
-        check_json_size(per_node * nodes[request.region], max_json_numbers, "region")
+        check_json_size(request.outputs, nodes[request.region], max_json_numbers, "region")
     start = perf_counter()
     if isinstance(request, HistoryRequest):
         answers = _follow(model, request)
@@ -57,59 +52,46 @@ def answer(
     solved = perf_counter()
     fields = _recover(model, answers[-1], request)
     recovered = perf_counter()
-    head: wire.Head = {"scene": model.name}
-    if isinstance(request, HistoryRequest):
-        head["steps"] = [describe(answer) for answer in answers]
-    else:
-        head |= describe(answers[0])
-    head["timing"] = {"solve_us": 1e6 * (solved - start), "recover_us": 1e6 * (recovered - solved)}
+    steps = [describe(answer) for answer in answers]
+    told = {"steps": steps} if isinstance(request, HistoryRequest) else steps[0]
+    timing = {"solve_us": 1e6 * (solved - start), "recover_us": 1e6 * (recovered - solved)}
+    head = {"scene": model.name, **told, "timing": timing}
     content = wire.encode(media_type, head, fields)
     borders = (received, start, solved, recovered, perf_counter())
     metrics.count_query(borders, all(answer.in_range for answer in answers))
-    timing = ", ".join(
-        f"{phase};dur={1e3 * (end - begin):.4f}"
-        for phase, begin, end in zip(PHASES, borders, borders[1:], strict=False)
-    )
-    return Response(content, media_type=media_type, headers={"server-timing": timing})
+    durations = (1e3 * (end - begin) for begin, end in pairwise(borders))
+    phases = ", ".join(f"{p};dur={ms:.4f}" for p, ms in zip(PHASES, durations, strict=True))
+    return Response(content, media_type=media_type, headers={"server-timing": phases})
 
 
 def _follow(model: ReducedModel, request: HistoryRequest) -> list[Answer]:
     """Answer loads over time, step by step."""
     if not model.scene.tissue.prony:
         raise Refusal("no_time", "name", "The tissue of this scene is elastic; ask it to solve")
-    past: Past | None = REST
-    warm, now, answers = model.new_warm(), 0.0, []
+    warm, now, answers = model.new_warm(), 0.0, [Answer(past=REST)]
     for number, step in enumerate(request.steps):
-        path = f"steps.{number}.contact"
-        answers.append(_press(model, step.contact, path, past, step.time - now, warm))
-        past, now = answers[-1].past, step.time
-    return answers
+        time = {"past": answers[-1].past, "dt": step.time - now, "warm": warm}
+        answers.append(_press(model, step.contact, f"steps.{number}.contact", **time))
+        now = step.time
+    return answers[1:]
 
 
-def _press(
-    model: ReducedModel,
-    contact: Contact | None,
-    path: str,
-    past: Past | None = None,
-    dt: float = 0.0,
-    warm: Warm | None = None,
-) -> Answer:
-    """Answer a load, at once or `dt` (s) after a past; `path` is where the request has it."""
+def _press(model: ReducedModel, contact: Contact | None, path: str, **time: Any) -> Answer:
+    """Answer a load that the request has at `path`, at once or, for `time`, after a past."""
     load: tuple[Any, ...] = None, 0.0
     if contact is not None:
         load = contact.position, contact.pressure, contact.direction, contact.radius
     try:
-        found = model.press(*load, past=past, dt=dt, warm=warm)
+        found = model.press(*load, **time)
     except QueryError as error:
         raise Refusal("unanswerable_query", f"{path}.{error.field}", error.message) from None
     if not found.converged:
-        raise Refusal(
-            "no_equilibrium",
-            f"{path}.pressure",
+        limit = found.pressure_limit
+        message = (
             "There is no equilibrium under this load; the model was trained for up to "
-            f"{found.pressure_limit:.3g} kPa there",
-            {"le": found.pressure_limit},
+            f"{limit:.3g} kPa there"
         )
+        raise Refusal("no_equilibrium", f"{path}.pressure", message, {"le": limit})
     if not math.isfinite(found.force.sum() + found.contact_displacement.sum() + found.min_jacobian):
         raise Refusal("no_equilibrium", f"{path}.pressure", "The answer to this load is not finite")
     return found
@@ -119,14 +101,14 @@ def _recover(
     model: ReducedModel, answer: Answer, request: SolveRequest | HistoryRequest
 ) -> wire.Arrays:
     """Get the fields that a request wants; they are finite."""
-    fields = {}
-    if request.region != "none":
+    fields, region = {}, request.region
+    if region != "none":
         displacement = model.displacement(answer)
         if "displacement" in request.outputs:
-            nodes = model.surface_nodes if request.region == "surface" else slice(None)
+            nodes = model.surface_nodes if region == "surface" else slice(None)
             fields["displacement"] = displacement[nodes]
         if "von_mises" in request.outputs:
-            fields["von_mises"] = model.von_mises(answer, request.region, displacement)
+            fields["von_mises"] = model.von_mises(answer, region, displacement)
     if not all(np.isfinite(field).all() for field in fields.values()):
         raise Refusal("no_equilibrium", "region", "The fields of this answer are not finite")
     return fields

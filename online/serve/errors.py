@@ -1,18 +1,17 @@
-"""Everything the service can refuse: one table from code to status, one shape of body.
+"""Everything the service can refuse. No input is echoed: a NaN sent is never a NaN returned."""
 
-No input is echoed, so a NaN sent is never a NaN returned.
-"""
-
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import orjson
-from fastapi import FastAPI, Request, Response
+from fastapi import Request, Response
 from fastapi.exceptions import RequestValidationError
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
+from palpate.online.session.frames import FrameError
 from palpate.shared.errors import PalpateError
 
 _CODES = {
@@ -34,6 +33,7 @@ STATUS = {code: status for status, codes in _CODES.items() for code in codes.spl
 """HTTP status of every code of a refusal."""
 
 
+@dataclass(eq=False)
 class Refusal(PalpateError):
     """A request that gets no answer.
 
@@ -41,39 +41,31 @@ class Refusal(PalpateError):
     ``contacts.0.pressure``; `allowed` what would be right, where that is short.
     """
 
-    def __init__(
-        self,
-        code: str,
-        field: str,
-        message: str,
-        allowed: Any = None,
-        headers: Mapping[str, str] | None = None,
-    ) -> None:
-        super().__init__(message)
-        self.code, self.field, self.message = code, field, message
-        self.allowed, self.headers = allowed, headers
+    code: str
+    field: str
+    message: str
+    allowed: Any = None
+    headers: Mapping[str, str] | None = None
+
+    def __str__(self) -> str:
+        return self.message
+
+    def body(self) -> bytes:
+        """Write the JSON that says so."""
+        names = "code", "field", "message", "allowed"
+        return orjson.dumps({"error": {name: getattr(self, name) for name in names}})
 
     def response(self) -> Response:
         """Make the HTTP response that says so."""
-        body = error_body(self.code, self.field, self.message, self.allowed)
-        return Response(body, STATUS[self.code], self.headers, "application/json")
+        return Response(self.body(), STATUS[self.code], self.headers, "application/json")
 
 
-def error_body(code: str, field: str, message: str, allowed: Any = None) -> bytes:
-    """Write the JSON of an error."""
-    error = {"code": code, "field": field, "message": message, "allowed": allowed}
-    return orjson.dumps({"error": error})
-
-
-def check_json_size(numbers: int, limit: int, field: str) -> None:
+def check_json_size(outputs: Collection[str], nodes: int, limit: int, field: str) -> None:
     """Refuse fields that would keep the event loop busy with writing decimals."""
+    numbers = nodes * (3 * ("displacement" in outputs) + ("von_mises" in outputs))
     if numbers > limit:
-        raise Refusal(
-            "too_large_for_json",
-            field,
-            f"{numbers} numbers are too many for JSON; ask for a binary format instead",
-            {"max_numbers": limit},
-        )
+        message = f"{numbers} numbers are too many for JSON; ask for a binary format instead"
+        raise Refusal("too_large_for_json", field, message, {"max_numbers": limit})
 
 
 def invalid(details: Sequence[Any], names: Mapping[str, Sequence[str]] | None = None) -> Refusal:
@@ -84,22 +76,23 @@ def invalid(details: Sequence[Any], names: Mapping[str, Sequence[str]] | None = 
     """
     # a misspelt key also leaves its right name missing; the misspelling comes first
     first = min(details, key=lambda detail: detail["type"] != "extra_forbidden")
-    path = [str(part) for part in first["loc"]]
-    field = ".".join(path) or "body"
-    if first["type"] == "json_invalid":
-        return Refusal("invalid_json", "body", first["msg"])
-    if first["type"] == "extra_forbidden" and names is not None:
+    path, kind, message = [str(part) for part in first["loc"]], first["type"], first["msg"]
+    if kind == "json_invalid":
+        return Refusal("invalid_json", "body", message)
+    if kind == "extra_forbidden" and names is not None:
         allowed: Any = names[path[0] if len(path) > 1 else ""]
     else:
         allowed = {k: v for k, v in first.get("ctx", {}).items() if k != "error"} or None
-    return Refusal("invalid_value", field, first["msg"], allowed)
+    return Refusal("invalid_value", ".".join(path) or "body", message, allowed)
 
 
-def _refusal(error: Exception) -> Refusal:
-    """Say in the one shape what stopped a request."""
+def as_refusal(error: Exception) -> Refusal:
+    """Say in the one shape what stopped a request or a message of a session."""
     match error:
         case Refusal():
             return error
+        case FrameError():
+            return Refusal(error.code, error.field, error.message)
         case RequestValidationError():  # path and query parameters, all that FastAPI checks here
             return invalid([{**detail, "loc": detail["loc"][1:]} for detail in error.errors()])
         case HTTPException(status_code=405):
@@ -108,20 +101,18 @@ def _refusal(error: Exception) -> Refusal:
             return Refusal("method_not_allowed", "method", message, methods, error.headers)
         case HTTPException():
             return Refusal("not_found", "path", "There is nothing at this path; see /docs")
-        case _:  # without details; it is raised on to the server, which logs it
+        case _:  # without details, which are for the log
             return Refusal("internal", "", "The service failed; its log says why")
 
 
-async def _refuse(request: Request, error: Exception) -> Response:
-    """Count a refusal and answer with it."""
+async def refuse(request: Request, error: Exception) -> Response:
+    """Count a refusal and answer with it; errors of our own also go on to the server's log."""
     if isinstance(error, ClientDisconnect):
         return Response(status_code=400)  # nobody is there to read it
-    refusal = _refusal(error)
+    refusal = as_refusal(error)
     request.app.state.service.metrics.count_refusal(refusal.code)
     return refusal.response()
 
 
-def install(app: FastAPI) -> None:
-    """Make `app` answer every error in the one shape, and count it in ``app.state.service``."""
-    for kind in (Refusal, RequestValidationError, HTTPException, ClientDisconnect, Exception):
-        app.add_exception_handler(kind, _refuse)
+KINDS = (Refusal, RequestValidationError, HTTPException, ClientDisconnect, Exception)
+"""Errors that `refuse` answers: all."""

@@ -1,13 +1,13 @@
 """Who may ask, how often, and when the service is too busy: decided before anything is read.
 
-Pure ASGI, for HTTP requests and the opening of sessions alike; Starlette's BaseHTTPMiddleware
-would cost a query more than its solve.
+Pure ASGI: Starlette's BaseHTTPMiddleware would cost a query more than its solve.
 """
 
 import hmac
 import ipaddress
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import lru_cache
 from time import perf_counter
 from urllib.parse import urlsplit
@@ -56,7 +56,7 @@ class Guard:
     def __init__(self, app: ASGIApp, settings: Settings, metrics: Metrics) -> None:
         self._app, self._metrics = app, metrics
         self._origins = frozenset(origin.encode() for origin in settings.origins)
-        self._hosts = frozenset(host.lower() for host in settings.hosts)
+        self._hosts = {"localhost", *map(str.lower, settings.hosts)} if settings.hosts else set()
         self._secret = f"Bearer {settings.token}".encode() if settings.token else None
         self._rates = RateLimit(settings.rate_limit) if settings.rate_limit else None
         self._max_wait = settings.max_wait
@@ -65,39 +65,29 @@ class Guard:
         """Answer or refuse, as ASGI asks."""
         if scope["type"] != "lifespan" and scope["path"] not in PROBES:
             try:
-                self._admit(scope)
+                headers = dict(scope["headers"])
+                self._check_names(headers)
+                self._check_token(headers)
+                if scope["path"] != METRICS:
+                    self._check_load(scope, perf_counter())
             except Refusal as refusal:
                 self._metrics.count_refusal(refusal.code)
                 await refusal.response()(scope, receive, send)
                 return
         await self._app(scope, receive, send)
 
-    def _admit(self, scope: Scope) -> None:
-        headers = dict(scope["headers"])
-        self._check_host(headers)
-        self._check_origin(headers)
-        self._check_token(headers)
-        if scope["path"] != METRICS:
-            now = perf_counter()
-            self._check_wait(now - scope.get(RECEIVED, now), scope["type"])
-            self._check_rate(scope, now)
+    def _check_names(self, headers: Mapping[bytes, bytes]) -> None:
+        """Refuse pages of other sites, and calls by other names than this machine's.
 
-    def _check_host(self, headers: Mapping[bytes, bytes]) -> None:
-        """Refuse calls by other names than this machine's (DNS rebinding).
-
-        A page of another site may have its own name lead here; its origin is then the service's.
+        By DNS rebinding a page of another site may have the service's origin.
         """
-        host = _host(headers.get(b"host", b""))
-        if self._hosts and host not in self._hosts and not _is_loopback_address(host):
+        host, origin = headers.get(b"host", b""), headers.get(b"origin")
+        if self._hosts and _host(host) not in self._hosts:
             allowed = sorted({*self._hosts, "127.0.0.1"})
             raise Refusal("foreign_host", "host", "The service does not go by this name", allowed)
-
-    def _check_origin(self, headers: Mapping[bytes, bytes]) -> None:
-        """Refuse other sites' pages: a browser would lend them the user's place in the network."""
-        origin = headers.get(b"origin")
         if origin is None or origin in self._origins or b"*" in self._origins:
             return
-        if origin.partition(b"://")[2] != headers.get(b"host"):
+        if origin.partition(b"://")[2] != host:
             message = "Pages of this origin may not use the service"
             raise Refusal("foreign_origin", "origin", message)
 
@@ -105,60 +95,39 @@ class Guard:
         given = headers.get(b"authorization", b"")
         # takes as long for a token that is nearly right as for any other
         if self._secret is not None and not hmac.compare_digest(given, self._secret):
-            raise Refusal(
-                "unauthorized",
-                "authorization",
-                "This service asks for a token: Authorization: Bearer TOKEN",
-                headers={"WWW-Authenticate": "Bearer"},
-            )
+            message = "This service asks for a token: Authorization: Bearer TOKEN"
+            said = {"WWW-Authenticate": "Bearer"}
+            raise Refusal("unauthorized", "authorization", message, headers=said)
 
-    def _check_wait(self, waited: float, kind: str) -> None:
-        if kind == "http":  # the opening of a session is no query
+    def _check_load(self, scope: Scope, now: float) -> None:
+        """Refuse what has waited too long, and clients that ask too often."""
+        waited = now - scope.get(RECEIVED, now)
+        if scope["type"] == "http":  # the opening of a session is no query
             self._metrics.count_wait(waited)
         if waited > self._max_wait:
-            raise Refusal(
-                "overloaded",
-                "",
-                f"The service is too busy: this request waited {waited:.3f} s for its turn",
-                {"max_wait_s": self._max_wait},
-                {"Retry-After": "1"},
-            )
-
-    def _check_rate(self, scope: Scope, now: float) -> None:
+            message = f"The service is too busy: this request waited {waited:.3f} s for its turn"
+            allowed = {"max_wait_s": self._max_wait}
+            raise Refusal("overloaded", "", message, allowed, {"Retry-After": "1"})
         client = scope.get("client")
         if self._rates and (wait := self._rates.take(client[0] if client else "", now)) > 0.0:
-            raise Refusal(
-                "too_many_requests",
-                "",
-                "More requests from this address than the service answers",
-                {"requests_per_second": self._rates.rate},
-                {"Retry-After": str(math.ceil(wait))},
-            )
+            message = "More requests from this address than the service answers"
+            headers = {"Retry-After": str(math.ceil(wait))}
+            allowed = {"requests_per_second": self._rates.rate}
+            raise Refusal("too_many_requests", "", message, allowed, headers)
 
 
 @lru_cache(64)
 def _host(header: bytes) -> str:
-    """Read the name or address in a Host header; empty if there is none."""
-    try:
-        return urlsplit(f"//{header.decode('latin-1')}").hostname or ""
-    except ValueError:
-        return ""
-
-
-@lru_cache(64)
-def _is_loopback_address(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
+    """Read the name or address in a Host header; addresses of loopback are ``localhost``."""
+    name = ""
+    with suppress(ValueError):
+        name = urlsplit(f"//{header.decode('latin-1')}").hostname or ""
+        return "localhost" if ipaddress.ip_address(name).is_loopback else name
+    return name
 
 
 class RateLimit:
-    """A bucket of tokens per client that fills at `rate` (1/s) and holds `BURST` seconds' worth.
-
-    Kept as the one moment at which the bucket will be full again (the generic cell rate algorithm
-    of ATM networks), so that an idle client costs nothing.
-    """
+    """A bucket per client that fills at `rate` (1/s) and holds `BURST` s (generic cell rate)."""
 
     def __init__(self, rate: float) -> None:
         self.rate = rate
@@ -173,7 +142,6 @@ class RateLimit:
             return wait
         self._full_at[client] = full_at + 1.0 / self.rate
         if len(self._full_at) > MOST_CLIENTS:
-            self._full_at = {name: at for name, at in self._full_at.items() if at > now}
-        if len(self._full_at) > MOST_CLIENTS:
-            self._full_at.clear()
+            busy = {name: at for name, at in self._full_at.items() if at > now}
+            self._full_at = busy if len(busy) <= MOST_CLIENTS else {}
         return 0.0

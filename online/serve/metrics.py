@@ -12,10 +12,10 @@ import mmap
 import os
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from itertools import accumulate, product
 from pathlib import Path
-from typing import Literal, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 from palpate.online.serve.errors import STATUS
 from palpate.online.session.frames import Flag
@@ -27,77 +27,62 @@ CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 BOUNDS = tuple(m * 10.0**e for e in range(-6, 1) for m in (1.0, 2.0, 5.0))
 """Upper bounds of the histograms' buckets, s: 1 µs to 5 s, one more beyond them."""
 
+_SUM = len(BOUNDS) + 1
+
 KINDS = ("query", "session")
 PHASES = ("decode", "solve", "recover", "encode")
-FLAGS = {
-    Flag.CONTACT: "contact",
-    Flag.CONVERGED: "unconverged",
-    Flag.IN_RANGE: "out_of_range",
-    Flag.CLAMPED: "clamped",
-    Flag.FALLBACK: "fallback",
-    Flag.STALLED: "stalled",
-}
+FLAGS = {bit: str(bit.name).lower() for bit in Flag}
+FLAGS |= {Flag.CONVERGED: "unconverged", Flag.IN_RANGE: "out_of_range"}
+_ABSENT = Flag.CONVERGED | Flag.IN_RANGE
+"""Flags that are counted where they are absent."""
+
 FRAMES = ("answered", "superseded", "refused")
 
-Borders: TypeAlias = tuple[float, float, float, float, float]
+Borders = tuple[float, float, float, float, float]
+"""Start of the first phase and ends of all, s."""
 
 
 class Family(NamedTuple):
-    """A metric and the label values it is kept for."""
+    """A metric: a histogram's cells hold its buckets and its sum."""
 
-    type: Literal["counter", "gauge", "histogram"]
+    type: str
     name: str
     help: str
     labels: tuple[str, ...] = ()
-    values: tuple[tuple[str, ...], ...] = ((),)
-
-    @property
-    def width(self) -> int:
-        """Cells of one label value: a number, or all buckets and the sum."""
-        return len(BOUNDS) + 2 if self.type == "histogram" else 1
+    values: Sequence[tuple[str, ...]] = ((),)
 
 
-_KINDS, _CODES, _OUTCOMES = (tuple(product(values)) for values in (KINDS, STATUS, FRAMES))
 _TIMED = tuple(product(KINDS, PHASES))
-_OF_FLAGS = (("query", "out_of_range"), *product(("session",), FLAGS.values()))
+_FLAGGED = (("query", "out_of_range"), *product(("session",), FLAGS.values()))
 
 FAMILIES = (
     Family("histogram", "palpate_phase_seconds", "Time per phase", ("kind", "phase"), _TIMED),
-    Family("histogram", "palpate_queue_seconds", "Wait for a turn", ("kind",), _KINDS),
-    Family("counter", "palpate_flags_total", "Answers by flag", ("kind", "flag"), _OF_FLAGS),
-    Family("counter", "palpate_refusals_total", "Requests refused", ("code",), _CODES),
-    Family("counter", "palpate_frames_total", "Session frames", ("outcome",), _OUTCOMES),
+    Family("histogram", "palpate_queue_seconds", "Wait for a turn", ("kind",), [*product(KINDS)]),
+    Family("counter", "palpate_flags_total", "Answers by flag", ("kind", "flag"), _FLAGGED),
+    Family("counter", "palpate_refusals_total", "Requests refused", ("code",), [*product(STATUS)]),
+    Family("counter", "palpate_frames_total", "Session frames", ("outcome",), [*product(FRAMES)]),
     Family("gauge", "palpate_sessions", "Open sessions"),
     Family("counter", "palpate_sessions_opened_total", "Sessions opened"),
     Family("counter", "palpate_worker_starts_total", "Starts of the worker"),
     Family("gauge", "palpate_worker_pid", "Process number of the worker"),
 )
-_FIRST = (0, *accumulate(len(family.values) * family.width for family in FAMILIES))
-WIDTH = _FIRST[-1]
-"""Cells of a row."""
-
-_CELLS = {
-    (family.name, *value): first + i * family.width
-    for family, first in zip(FAMILIES, _FIRST, strict=False)
-    for i, value in enumerate(family.values)
-}
+_KEYS = [(family, (family.name, *value)) for family in FAMILIES for value in family.values]
+_WIDTHS = (_SUM + 1 if family.type == "histogram" else 1 for family, _ in _KEYS)
+*_FIRST, WIDTH = accumulate(_WIDTHS, initial=0)
+_CELLS = dict(zip((key for _, key in _KEYS), _FIRST, strict=True))
 """First cell of each metric and label value."""
 
-_SUM = len(BOUNDS) + 1
 _QUERY_PHASES, _FRAME_PHASES = (_CELLS["palpate_phase_seconds", k, PHASES[0]] for k in KINDS)
 _QUERY_QUEUE, _FRAME_QUEUE = (_CELLS["palpate_queue_seconds", kind] for kind in KINDS)
 _QUERY_OUT_OF_RANGE = _CELLS["palpate_flags_total", "query", "out_of_range"]
 _ANSWERED, _SUPERSEDED, _REFUSED = (_CELLS["palpate_frames_total", name] for name in FRAMES)
-_SESSIONS = _CELLS[("palpate_sessions",)]
-_SESSIONS_OPENED = _CELLS[("palpate_sessions_opened_total",)]
-_STARTS = _CELLS[("palpate_worker_starts_total",)]
-_PID = _CELLS[("palpate_worker_pid",)]
+_SESSIONS, _OPENED, _STARTS, _PID = (_CELLS[family.name,] for family in FAMILIES[-4:])
 
 _FRAME_FLAGS = [
     [
-        _CELLS["palpate_flags_total", "session", name]
-        for bit, name in FLAGS.items()
-        if (flags ^ (Flag.CONVERGED | Flag.IN_RANGE)) & bit  # these two count where they are absent
+        _CELLS["palpate_flags_total", "session", FLAGS[bit]]
+        for bit in Flag
+        if (flags ^ _ABSENT) & bit
     ]
     for flags in range(2 * max(Flag))
 ]
@@ -129,16 +114,12 @@ class Metrics:
         self._observe(_QUERY_QUEUE, seconds)
 
     def count_query(self, borders: Borders, in_range: bool) -> None:
-        """Count an answered query; `borders` (s) are the start of the first phase and all ends."""
+        """Count an answered query."""
         self._observe_phases(_QUERY_PHASES, borders)
         self._row[_QUERY_OUT_OF_RANGE] += not in_range
 
     def count_frame(self, waited: float, borders: Borders, flags: int, superseded: int) -> None:
-        """Count an answered frame of a session, and those that were dropped for it.
-
-        It `waited` (s) from when it was read to when its turn came; for `borders` see
-        `count_query`.
-        """
+        """Count an answered frame, how long it waited (s), and those dropped for it."""
         self._observe(_FRAME_QUEUE, waited)
         self._observe_phases(_FRAME_PHASES, borders)
         for cell in _FRAME_FLAGS[flags]:
@@ -157,7 +138,7 @@ class Metrics:
     def count_session(self, opened: bool) -> None:
         """Count a session that was opened, or that ended."""
         self._row[_SESSIONS] += 1.0 if opened else -1.0
-        self._row[_SESSIONS_OPENED] += opened
+        self._row[_OPENED] += opened
 
     def _observe(self, first: int, *durations: float) -> None:
         """Count durations (s) in the histograms that follow one another from cell `first`."""
@@ -181,7 +162,12 @@ class Metrics:
             lines += [f"# HELP {family.name} {family.help}", f"# TYPE {family.name} {family.type}"]
             for worker, row in rows.items():
                 lines += _samples(family, worker, row)
-        lines += _memory({worker: int(row[_PID]) for worker, row in rows.items()})
+        name = "palpate_worker_resident_bytes"
+        lines += [f"# HELP {name} Memory that the worker holds", f"# TYPE {name} gauge"]
+        for worker, row in rows.items():
+            with suppress(OSError):  # not every system says it
+                pages = int(Path(f"/proc/{int(row[_PID])}/statm").read_text().split()[1])
+                lines.append(f'{name}{{worker="{worker}"}} {pages * mmap.PAGESIZE}')
         return "\n".join(lines) + "\n"
 
 
@@ -222,16 +208,3 @@ def _samples(family: Family, worker: int, row: Sequence[float]) -> Iterator[str]
             yield f'{family.name}_bucket{{{labels},le="{edge}"}} {count!r}'
         yield f"{family.name}_count{{{labels}}} {upto[-1]!r}"
         yield f"{family.name}_sum{{{labels}}} {row[first + _SUM]!r}"
-
-
-def _memory(pids: dict[int, int]) -> Iterator[str]:
-    """Write the memory of each worker, where the system says it."""
-    name = "palpate_worker_resident_bytes"
-    yield f"# HELP {name} Memory that the worker holds"
-    yield f"# TYPE {name} gauge"
-    for worker, pid in pids.items():
-        try:
-            pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-        except OSError:
-            continue
-        yield f'{name}{{worker="{worker}"}} {pages * mmap.PAGESIZE}'

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 import click
 import uvicorn
-from fastapi import FastAPI, Response
+from fastapi import FastAPI
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 from uvicorn.supervisors.multiprocess import Multiprocess
 
@@ -49,23 +49,19 @@ LAST_WAIT = 4.0
 """Seconds that workers get to end."""
 
 
-def _http(response: Response) -> bytes:
-    """Write a response as it goes over the wire."""
-    head = b"".join(name + b": " + value + b"\r\n" for name, value in response.raw_headers)
-    return STATUS_LINE[response.status_code] + head + b"\r\n" + bytes(response.body)
-
-
-_NO_PLACE = "The service has no place for another connection"
-_LIMIT, _LATER = {"max_connections": MOST_CONNECTIONS}, {"Retry-After": "1", "Connection": "close"}
-FULL = _http(Refusal("overloaded", "", _NO_PLACE, _LIMIT, _LATER).response())
-"""The response to a client for whom there is no place."""
+def _full() -> bytes:
+    """Write the response to a client for whom there is no place, as it goes over the wire."""
+    message, allowed = "The service has no place for another connection", MOST_CONNECTIONS
+    later = {"Retry-After": "1", "Connection": "close"}
+    full = Refusal("overloaded", "", message, {"max_connections": allowed}, later).response()
+    head = b"".join(name + b": " + value + b"\r\n" for name, value in full.raw_headers)
+    return STATUS_LINE[full.status_code] + head + b"\r\n" + bytes(full.body)
 
 
 class HttpProtocol(HttpToolsProtocol):
-    """Uvicorn's HTTP, which also notes when it read a request, and bounds what connections cost.
+    """Uvicorn's HTTP, which notes when it read a request, and bounds what connections cost.
 
-    One beyond `MOST_CONNECTIONS` is refused, and one whose request is not whole after `PATIENCE` is
-    closed.
+    One beyond `MOST_CONNECTIONS` is refused, one whose request takes longer than `PATIENCE` closed.
     """
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -73,7 +69,7 @@ class HttpProtocol(HttpToolsProtocol):
         super().connection_made(transport)
         self.patience = self.loop.call_later(PATIENCE, transport.abort)
         if len(self.connections) > MOST_CONNECTIONS:
-            transport.write(FULL)
+            transport.write(_full())
             transport.close()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -110,10 +106,7 @@ class Supervisor(Multiprocess):
 def serve(settings: Settings, host: str, port: int, public: bool) -> None:
     """Serve until a signal says to end; port 0 takes a free one.
 
-    Raises
-    ------
-    PalpateError
-        If there is nothing to serve, or everybody would be served and nobody asked for a token.
+    Raises `PalpateError` if there is nothing to serve, or no token for other machines.
     """
     if not any(settings.artifacts.glob("*.h5")):
         raise PalpateError(
@@ -128,14 +121,6 @@ def serve(settings: Settings, host: str, port: int, public: bool) -> None:
             )
         settings = replace(settings, hosts=("localhost", host))
     logs.set_up(settings)
-    try:
-        with tempfile.TemporaryDirectory(prefix="palpate-") as directory:
-            _run(settings, host, port, Path(directory) / "metrics")
-    finally:
-        _leave_loading()
-
-
-def _run(settings: Settings, host: str, port: int, table: Path) -> None:
     config = uvicorn.Config(
         "",  # known once the socket is bound
         factory=True,
@@ -151,27 +136,25 @@ def _run(settings: Settings, host: str, port: int, table: Path) -> None:
     # From here on clients wait for a worker that is ready rather than being turned away.
     bound.listen(config.backlog)
     url = f"http://{f'[{host}]' if ':' in host else host}:{bound.getsockname()[1]}"
-    make_table(table, settings.workers)
-    config.app = partial(_work, settings, url, table)
     # A server shuts down on a signal and then raises it again, for us to end cleanly.
     for stop in (signal.SIGTERM, signal.SIGINT):
         signal.signal(stop, lambda *_: sys.exit(0))
-    if settings.workers > 1:
-        Supervisor(config, [bound]).run()
-    else:
-        uvicorn.Server(config).run([bound])
-
-
-def _leave_loading() -> None:
-    """End the process at once if models are still being loaded.
-
-    The interpreter's own end would wait for ever for locks of the compiler, which the thread that
-    loads holds while it is halted.
-    """
-    if any(thread.daemon for thread in threading.enumerate()):
-        logging.shutdown()
-        sys.stdout.flush()
-        os._exit(0)
+    try:
+        with tempfile.TemporaryDirectory(prefix="palpate-") as directory:
+            table = Path(directory) / "metrics"
+            make_table(table, settings.workers)
+            config.app = partial(_work, settings, url, table)
+            if settings.workers > 1:
+                Supervisor(config, [bound]).run()
+            else:
+                uvicorn.Server(config).run([bound])
+    finally:
+        if any(thread.daemon for thread in threading.enumerate()):
+            # Models are being loaded. The interpreter's own end would wait for ever for locks of
+            # the compiler, which the thread that loads holds while it is halted.
+            logging.shutdown()
+            sys.stdout.flush()
+            os._exit(0)
 
 
 def _work(settings: Settings, url: str, table: Path) -> FastAPI:
@@ -189,19 +172,15 @@ def _work(settings: Settings, url: str, table: Path) -> FastAPI:
         if settings.realtime:
             logger.info(realtime.enter())
         logger.info("worker %d is ready", metrics.worker)
-        if metrics.worker == 0 and not metrics.restarted:
-            _invite(store, url)
+        if metrics.worker or metrics.restarted:
+            return  # the first worker says it once
+        for refused in store.refused:
+            click.echo(f"Refused {refused.reason}")
+        click.echo(f"Serving {', '.join(store.models) or 'nothing'} on {url} (API: {url}/docs)")
+        for name, model in list(store.models.items())[:1]:
+            click.echo(
+                f"Try: curl {url}/scenes/{name}/solve -H 'Content-Type: application/json' "
+                f"-d '{json.dumps({'contacts': [model.example]})}'"
+            )
 
     return create_app(settings, on_ready=greet, metrics=metrics)
-
-
-def _invite(store: "Store", url: str) -> None:
-    """Print what is served and a request to try."""
-    for refused in store.refused:
-        click.echo(f"Refused {refused.reason}")
-    click.echo(f"Serving {', '.join(store.models) or 'nothing'} on {url} (API: {url}/docs)")
-    for name, model in list(store.models.items())[:1]:
-        click.echo(
-            f"Try: curl {url}/scenes/{name}/solve -H 'Content-Type: application/json' "
-            f"-d '{json.dumps({'contacts': [model.example]})}'"
-        )

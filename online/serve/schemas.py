@@ -37,9 +37,7 @@ EXAMPLE_CONTACT: JsonValue = {
     "direction": [0.1, 0.0, -1.0],
 }
 EXAMPLE: JsonValue = {"contacts": [EXAMPLE_CONTACT], "region": "surface"}
-EXAMPLE_HISTORY: JsonValue = {
-    "steps": [{"time": 0.1, "contact": EXAMPLE_CONTACT}, {"time": 1.1, "contact": None}]
-}
+EXAMPLE_HISTORY: JsonValue = {"steps": [{"time": 0.1, "contact": EXAMPLE_CONTACT}, {"time": 1.1}]}
 
 
 class Strict(BaseModel):
@@ -319,11 +317,9 @@ class Size(BaseModel):
     triangles: int
 
 
-class SceneSummary(BaseModel):
+class SceneSummary(SceneEntry):
     """One scene: what may be asked and how well it is answered."""
 
-    name: str
-    description: str
     ranges: Ranges
     tolerance: dict[str, float] = Field(description="Relative L2 errors promised, as fractions.")
     size: Size

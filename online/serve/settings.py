@@ -12,8 +12,7 @@ from palpate.shared.errors import PalpateError
 class Settings:
     """Settings of one service: the options of ``palpate serve``, whose help says what they mean.
 
-    Only ``hosts`` is no option: names that clients may call the service by, besides loopback
-    addresses; any, if empty.
+    `hosts` are names that clients may call the service by, besides loopback; any, if empty.
     """
 
     artifacts: Path
@@ -35,13 +34,7 @@ class Settings:
 
 
 def is_loopback(host: str) -> bool:
-    """Tell whether an address, or every address of a name, is reached from this machine alone.
-
-    Raises
-    ------
-    PalpateError
-        If the name has no address.
-    """
+    """Tell whether every address of a name, which must have one, is of this machine alone."""
     if not host:
         return False  # any interface
     try:

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +13,13 @@ from palpate.shared.model import ReducedModel
 logger = logging.getLogger(__name__)
 
 
-@dataclass
+@dataclass(frozen=True)
 class ServedModel:
     """A reduced model that is served, and what requests need beside it."""
 
     model: ReducedModel
     example: dict[str, Any]  # `position` (mm) and `pressure` (kPa) of a contact it can answer
     tip: list[float]  # mm, a position of the tip's centre at which it presses a little
-    meshes: dict[tuple[str, str], bytes] = field(default_factory=dict)
-    """The mesh documents asked for so far, by region and media type."""
 
 
 @dataclass(frozen=True)
@@ -54,14 +52,17 @@ class Store:
                     raise PalpateError(f"{path}: another file already holds {name!r}")
                 warm(served)
             except PalpateError as error:
-                self._refuse(path, str(error))
+                reason = str(error)
             except Exception as error:
                 # a bug in reading one file is no reason to withhold the others
                 logger.exception("failed on %s", path)
-                self._refuse(path, f"{path}: cannot be used: {type(error).__name__}")
+                reason = f"{path}: cannot be used: {type(error).__name__}"
             else:
                 self.models[name] = served
                 logger.info("serving %s from %s", name, path)
+                continue
+            logger.error("refused %s", reason)
+            self.refused.append(RefusedFile(path.name, reason))
 
     def require_ready(self) -> None:
         """Raise `Refusal` while models are being loaded."""
@@ -71,22 +72,13 @@ class Store:
     def model(self, name: str) -> ServedModel:
         """Return the model called `name`; raise `Refusal` if there is none (yet)."""
         self.require_ready()
-        served = self.models.get(name)
-        if served is None:
+        if name not in self.models:
             raise Refusal("unknown_scene", "name", "No such scene is served", sorted(self.models))
-        return served
-
-    def _refuse(self, path: Path, reason: str) -> None:
-        logger.error("refused %s", reason)
-        self.refused.append(RefusedFile(path.name, reason))
+        return self.models[name]
 
 
 def _served(model: ReducedModel) -> ServedModel:
-    """Make examples that a model can answer.
-
-    A contact in the middle of its surface, at half the pressure limit; and there a position of the
-    tip's centre, a tenth of its radius deep.
-    """
+    """Make examples in the middle of the surface: half its pressure limit, a tip a tenth deep."""
     vertices, radius = model.surface.vertices, model.scene.endoscope.radius
     middle = int(((vertices - vertices.mean(axis=0)) ** 2).sum(axis=1).argmin())
     tip = vertices[middle] + 0.9 * radius * model.surface.normals[middle]

@@ -25,7 +25,7 @@ each can be viewed in place (``new Float32Array(buffer, 16 + H + offset, n)``).
 import math
 import re
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -59,8 +59,7 @@ class WireError(PalpateError):
 def encode(media_type: str, head: Head, arrays: Arrays) -> bytes:
     """Write a document in one of the formats on offer.
 
-    The head has no keys ``fields`` and ``arrays``; arrays are C-contiguous, of the dtypes float32,
-    int32 and uint8, the last kind last.
+    Arrays are C-contiguous, of the dtypes float32, int32 and uint8, the last kind last.
     """
     return _WRITERS[media_type](head, arrays)
 
@@ -95,13 +94,7 @@ _WRITERS = {JSON: _encode_json, MSGPACK: _encode_msgpack, BINARY: _encode_binary
 
 
 def decode(body: bytes) -> tuple[Head, dict[str, NDArray[Any]]]:
-    """Read a document of the binary layout: its head, and its arrays as views into `body`.
-
-    Raises
-    ------
-    WireError
-        If `body` is not a whole document.
-    """
+    """Read a document of the binary layout: its head, and its arrays as views into `body`."""
     if len(body) < _PREFIX.size:
         raise WireError(f"{len(body)} bytes are too few for a document")
     magic, version, count, head_length, payload_length = _PREFIX.unpack_from(body)
@@ -124,29 +117,20 @@ def decode(body: bytes) -> tuple[Head, dict[str, NDArray[Any]]]:
     return head, arrays
 
 
-_RANGE = re.compile(r"([\w!#$&^.+*-]+/[\w!#$&^.+*-]+)\s*((?:;[^,]*)?)", re.ASCII)
-"""A type with its subtype, and its parameters."""
-
-_QUALITY = re.compile(
-    r";\s*q\s*=\s*(?:(0(?:\.\d{0,3})?|1(?:\.0{0,3})?)\s*(?:;|$))?", re.I | re.ASCII
-)
-"""The parameter that says how much a type is liked; nothing is captured if it makes no sense."""
+_QUALITY = re.compile(r"0(\.\d{0,3})?|1(\.0{0,3})?", re.ASCII)
+"""How much a type is liked, from 0 to 1."""
 
 
 @lru_cache(maxsize=64)
 def negotiate(accept: str) -> str:
     """Choose the offered media type that `accept` likes best; JSON if it does not mind.
 
-    Of types liked equally, the one named more exactly wins, then the first on offer.
+    Of types liked equally the first on offer wins, unless another is named more exactly.
     """
-    ranges = [_parse(part) for part in accept.split(",")] if accept.strip() else [("*/*", 1.0)]
-    best, score = "", (0.0, 0)
-    for offered in OFFERED:
-        # the most exact range that matches a type decides on it, even if it says no
-        exactness, quality = max((_exactness(pattern, offered), q) for pattern, q in ranges)
-        if exactness > 0 and quality > 0.0 and (quality, exactness) > score:
-            best, score = offered, (quality, exactness)
-    if not best:
+    ranges = [_parse(part) for part in (accept.strip() or "*/*").split(",")]
+    liked = {offered: _liking(offered, ranges) for offered in OFFERED}
+    best = max(OFFERED, key=liked.__getitem__)
+    if liked[best][0] == 0.0:
         raise Refusal(
             "not_acceptable", "accept", "None of the accepted formats is on offer", OFFERED
         )
@@ -154,15 +138,15 @@ def negotiate(accept: str) -> str:
 
 
 def _parse(part: str) -> tuple[str, float]:
-    """Split a media range from its quality; a malformed one matches nothing."""
-    match = _RANGE.fullmatch(part.strip())
-    if match is None:
-        return "", 0.0
-    quality = _QUALITY.search(match[2])
-    return match[1].lower(), float(quality[1] or 0.0) if quality else 1.0
+    """Split a media range from its quality, which is zero if it makes no sense."""
+    name, *parameters = (piece.strip().lower() for piece in part.split(";"))
+    quality = next((p[2:] for p in parameters if p.startswith("q=")), "1")
+    return name, float(quality) if _QUALITY.fullmatch(quality) else 0.0
 
 
-def _exactness(pattern: str, offered: str) -> int:
-    """Rank a match: 3 for the type itself, 2 for ``application/*``, 1 for ``*/*``, 0 for none."""
+def _liking(offered: str, ranges: Sequence[tuple[str, float]]) -> tuple[float, int]:
+    """Quality of the most exact range that matches a type, even if it says no; how exact it is."""
     kinds = ("*/*", offered.split("/")[0] + "/*", offered)
-    return kinds.index(pattern) + 1 if pattern in kinds else 0
+    matching = ((kinds.index(name), quality) for name, quality in ranges if name in kinds)
+    exactness, quality = max(matching, default=(0, 0.0))
+    return quality, exactness

@@ -22,7 +22,7 @@ import math
 import struct
 from collections.abc import Sequence
 from enum import IntEnum, IntFlag
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Self, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,25 +41,36 @@ FARTHEST = 1e4
 """Largest coordinate of a position, mm."""
 
 
-class Output(IntFlag):
+class _Bits(IntFlag):
+    """Bits with their meanings."""
+
+    meaning: str
+
+    def __new__(cls, value: int, meaning: str = "") -> Self:
+        bit = int.__new__(cls, value)
+        bit._value_, bit.meaning = value, meaning
+        return bit
+
+
+class Output(_Bits):
     """What a request wants beyond the fields of every reply."""
 
-    COORDINATES = 1
-    DISPLACEMENT = 2
-    VON_MISES = 4
-    STRESS = 8
-    HALF = 16
+    COORDINATES = 1, "reduced coordinates"
+    DISPLACEMENT = 2, "displacement of the surface"
+    VON_MISES = 4, "von Mises stress of the surface"
+    STRESS = 8, "`max_von_mises` and `p99_von_mises`"
+    HALF = 16, "fields as float16"
 
 
-class Flag(IntFlag):
+class Flag(_Bits):
     """What a reply says of itself."""
 
-    CONTACT = 1
-    CONVERGED = 2
-    IN_RANGE = 4
-    CLAMPED = 8
-    FALLBACK = 16
-    STALLED = 32
+    CONTACT = 1, "the tip touches"
+    CONVERGED = 2, "an equilibrium was found at `position`"
+    IN_RANGE = 4, "the state is of the kind the model was trained for"
+    CLAMPED = 8, "the step was too long for its time: `position` is short of the one asked for"
+    FALLBACK = 16, "no answer there: all is the last good answer's, but the errors are infinite"
+    STALLED = 32, "more time than `longest_step` had passed, or less than none; it was cut"
 
 
 class Reason(IntEnum):
@@ -69,23 +80,6 @@ class Reason(IntEnum):
     NO_EQUILIBRIUM = 1
     BELOW_SURFACE = 2
 
-
-OUTPUTS_MEAN = {
-    Output.COORDINATES: "reduced coordinates",
-    Output.DISPLACEMENT: "displacement of the surface",
-    Output.VON_MISES: "von Mises stress of the surface",
-    Output.STRESS: "`max_von_mises` and `p99_von_mises`",
-    Output.HALF: "fields as float16",
-}
-
-FLAGS_MEAN = {
-    Flag.CONTACT: "the tip touches",
-    Flag.CONVERGED: "an equilibrium was found at `position`",
-    Flag.IN_RANGE: "the state is of the kind the model was trained for",
-    Flag.CLAMPED: "the step was too long for its time: `position` is short of the one asked for",
-    Flag.FALLBACK: "no answer there: all is the last good answer's, but the errors are infinite",
-    Flag.STALLED: "more time than `longest_step` had passed, or less than none: it was cut to that",
-}
 
 REASONS_MEAN = {
     Reason.NONE: "",
@@ -112,13 +106,7 @@ REQUEST_FIELDS = (
     Field("position", "float64", "mm", "centre of the tip", (3,)),
 )
 
-U16 = Annotated[int, "uint16"]
-U32 = Annotated[int, "uint32"]
-F32 = Annotated[float, "float32"]
-F64 = Annotated[float, "float64"]
-F32s = Annotated[NDArray[np.float32], "float32"]
-F64s = Annotated[NDArray[np.float64], "float64"]
-I32s = Annotated[NDArray[np.int32], "int32"]
+Array = NDArray[Any]
 
 
 class Reply(NamedTuple):
@@ -128,45 +116,50 @@ class Reply(NamedTuple):
     asked for; of `coordinates` the number stands among the fields.
     """
 
-    version: Annotated[U16, "", "of this layout, 2"]
-    flags: Annotated[U16, "", "bits"]
-    seq: Annotated[U32, "", "of the request that is answered"]
-    client_time: Annotated[F64, "s", "of the request"]
-    server_received: Annotated[F64, "s", "when the request came, on the server's clock"]
-    server_sent: Annotated[F64, "s", "when the reply went, on the server's clock"]
-    position: Annotated[F64s, "mm", "centre of the tip that all below belongs to", (3,)]
-    force: Annotated[F64s, "mN", "on the tool", (3,)]
-    tangent: Annotated[F64s, "mN/mm", "derivative of `force` by `position`, by rows", (3, 3)]
-    energy: Annotated[F64, "mN mm", "stored in the tissue"]
-    solve_time: Annotated[F32, "s", "spent on solving"]
-    valid_radius: Annotated[F32, "mm", "how far from `position` force and tangent hold"]
-    contact_point: Annotated[F32s, "mm", "on the tissue", (3,)]
-    normal: Annotated[F32s, "", "outward, unit, at the contact", (3,)]
-    depth: Annotated[F32, "mm", "of the tip below the surface at rest"]
-    penetration: Annotated[F32, "mm", "of the tip into the deformed surface"]
-    error_displacement: Annotated[F32, "", "estimated relative error; infinite: unknown"]
-    error_von_mises: Annotated[F32, "", "estimated relative error; infinite: unknown"]
-    error_force: Annotated[F32, "", "estimated relative error; infinite: unknown"]
-    min_jacobian: Annotated[F32, "", "smallest volume ratio; 1 at rest, 0 is collapse"]
-    max_von_mises: Annotated[F32, "kPa", "largest in the body; 0 if not asked for"]
-    p99_von_mises: Annotated[F32, "kPa", "99th percentile of it; 0 if not asked for"]
-    model: Annotated[I32s, "", "local models that answer, -1 for none", (MODELS,)]
-    weight: Annotated[F32s, "", "their shares", (MODELS,)]
-    superseded: Annotated[U32, "", "requests dropped for newer ones since the last reply"]
-    nodes: Annotated[U32, "", "nodes of the fields that follow, or 0"]
-    iterations: Annotated[U16, "", "Newton steps taken"]
-    steps: Annotated[U16, "", "positions solved on the way here"]
-    coordinates: Annotated[
-        NDArray[np.float32] | None,
-        "uint16",
-        "",
-        "reduced coordinates per local model that follow, or 0",
+    version: Annotated[int, "uint16", "", "of this layout, 2"]
+    flags: Annotated[int, "uint16", "", "bits"]
+    seq: Annotated[int, "uint32", "", "of the request that is answered"]
+    client_time: Annotated[float, "float64", "s", "of the request"]
+    server_received: Annotated[
+        float, "float64", "s", "when the request came, on the server's clock"
     ]
-    outputs: Annotated[U16, "", "what follows or is filled in, bits"]
-    depth_limit: Annotated[F32, "mm", "largest trained depth there"]
-    reason: Annotated[U32, "", "why `position` is not the one asked for; 0 if it is"]
-    displacement: NDArray[Any] | None
-    von_mises: NDArray[Any] | None
+    server_sent: Annotated[float, "float64", "s", "when the reply went, on the server's clock"]
+    position: Annotated[Array, "float64", "mm", "centre of the tip that all below belongs to", (3,)]
+    force: Annotated[Array, "float64", "mN", "on the tool", (3,)]
+    tangent: Annotated[
+        Array, "float64", "mN/mm", "derivative of `force` by `position`, by rows", (3, 3)
+    ]
+    energy: Annotated[float, "float64", "mN mm", "stored in the tissue"]
+    solve_time: Annotated[float, "float32", "s", "spent on solving"]
+    valid_radius: Annotated[
+        float, "float32", "mm", "how far from `position` force and tangent hold"
+    ]
+    contact_point: Annotated[Array, "float32", "mm", "on the tissue", (3,)]
+    normal: Annotated[Array, "float32", "", "outward, unit, at the contact", (3,)]
+    depth: Annotated[float, "float32", "mm", "of the tip below the surface at rest"]
+    penetration: Annotated[float, "float32", "mm", "of the tip into the deformed surface"]
+    error_displacement: Annotated[
+        float, "float32", "", "estimated relative error; infinite: unknown"
+    ]
+    error_von_mises: Annotated[float, "float32", "", "estimated relative error; infinite: unknown"]
+    error_force: Annotated[float, "float32", "", "estimated relative error; infinite: unknown"]
+    min_jacobian: Annotated[float, "float32", "", "smallest volume ratio; 1 at rest, 0 is collapse"]
+    max_von_mises: Annotated[float, "float32", "kPa", "largest in the body; 0 if not asked for"]
+    p99_von_mises: Annotated[float, "float32", "kPa", "99th percentile of it; 0 if not asked for"]
+    model: Annotated[Array, "int32", "", "local models that answer, -1 for none", (MODELS,)]
+    weight: Annotated[Array, "float32", "", "their shares", (MODELS,)]
+    superseded: Annotated[int, "uint32", "", "requests dropped for newer ones since the last reply"]
+    nodes: Annotated[int, "uint32", "", "nodes of the fields that follow, or 0"]
+    iterations: Annotated[int, "uint16", "", "Newton steps taken"]
+    steps: Annotated[int, "uint16", "", "positions solved on the way here"]
+    coordinates: Annotated[
+        Array | None, "uint16", "", "reduced coordinates per local model that follow, or 0"
+    ]
+    outputs: Annotated[int, "uint16", "", "what follows or is filled in, bits"]
+    depth_limit: Annotated[float, "float32", "mm", "largest trained depth there"]
+    reason: Annotated[int, "uint32", "", "why `position` is not the one asked for; 0 if it is"]
+    displacement: Array | None
+    von_mises: Array | None
 
     @property
     def contact(self) -> bool:
@@ -186,23 +179,15 @@ REPLY_FIELDS = tuple(
     if hasattr(hint, "__metadata__")
 )
 
-_CODES = {"uint16": "H", "uint32": "I", "int32": "i", "float32": "f", "float64": "d"}
+
+def _layout(fields: Sequence[Field]) -> tuple[np.dtype[Any], struct.Struct]:
+    dtype = np.dtype([(f.name, np.dtype(f.type).newbyteorder("<"), f.shape) for f in fields])
+    codes = (f"{math.prod(field.shape)}{np.dtype(field.type).char}" for field in fields)
+    return dtype, struct.Struct("<" + "".join(codes))
 
 
-def _struct(fields: Sequence[Field]) -> struct.Struct:
-    codes = (f"{math.prod(field.shape)}{_CODES[field.type]}" for field in fields)
-    return struct.Struct("<" + "".join(codes))
-
-
-def _dtype(fields: Sequence[Field]) -> np.dtype[Any]:
-    return np.dtype([(f.name, f"<{np.dtype(f.type).str[1:]}", f.shape) for f in fields])
-
-
-REQUEST = _dtype(REQUEST_FIELDS)
-REPLY = _dtype(REPLY_FIELDS)
-
-_REQUEST = _struct(REQUEST_FIELDS)
-_REPLY = _struct(REPLY_FIELDS)
+REQUEST, _REQUEST = _layout(REQUEST_FIELDS)
+REPLY, _REPLY = _layout(REPLY_FIELDS)
 _OUTPUTS = sum(Output)
 _LARGEST = float(np.finfo(np.float32).max)
 # enumerations are slow to calculate with
@@ -213,9 +198,13 @@ _IN_RANGE = int(Flag.IN_RANGE)
 class FrameError(QueryError):
     """A message that is no frame, or asks for nonsense; `field` is the field at fault."""
 
+    code = "invalid_frame"
+
 
 class VersionError(FrameError):
     """A frame of another layout."""
+
+    code = "unknown_version"
 
 
 class Request(NamedTuple):
@@ -258,9 +247,9 @@ class Extras(NamedTuple):
     """What a reply holds on request; arrays are C-contiguous."""
 
     outputs: int = 0  # bits of `Output`: what is there
-    coordinates: NDArray[np.float32] | None = None  # (MODELS, r)
-    displacement: NDArray[Any] | None = None  # (n, 3), mm, float32 or float16
-    von_mises: NDArray[Any] | None = None  # (n,), kPa, float32 or float16
+    coordinates: Array | None = None  # (MODELS, r), float32
+    displacement: Array | None = None  # (n, 3), mm, float32 or float16
+    von_mises: Array | None = None  # (n,), kPa, float32 or float16
     max_von_mises: float = 0.0  # kPa
     p99_von_mises: float = 0.0  # kPa
 
@@ -287,14 +276,11 @@ def encode_reply(
     received: float = 0.0,
     sent: float = 0.0,
 ) -> bytes:
-    """Write a reply frame.
-
-    Outside the trained range estimated errors count as infinite; `received` and `sent` (s) are on
-    the server's clock.
-    """
+    """Write a reply frame; `received` and `sent` (s) are on the server's clock."""
     touch = answer.touch
-    patches = touch.parts
-    unknown = 0.0 if answer.flags & _IN_RANGE else math.inf
+    absent = MODELS - len(touch.parts)
+    fields = [field for field in extras[2:4] if field is not None]
+    largest = _LARGEST if answer.flags & _IN_RANGE else -1.0  # of an error that is known
     head = _REPLY.pack(
         VERSION,
         answer.flags,
@@ -312,16 +298,16 @@ def encode_reply(
         *touch.normal.tolist(),
         touch.depth,
         touch.penetration,
-        _estimate(touch.error_displacement + unknown),
-        _estimate(touch.error_von_mises + unknown),
-        _estimate(touch.error_force + unknown),
+        touch.error_displacement if touch.error_displacement <= largest else math.inf,
+        touch.error_von_mises if touch.error_von_mises <= largest else math.inf,
+        touch.error_force if touch.error_force <= largest else math.inf,
         touch.min_jacobian,
         extras.max_von_mises,
         extras.p99_von_mises,
-        *([patch[0] for patch in patches] + [-1] * (MODELS - len(patches))),
-        *([patch[1] for patch in patches] + [0.0] * (MODELS - len(patches))),
+        *([part[0] for part in touch.parts] + [-1] * absent),
+        *([part[1] for part in touch.parts] + [0.0] * absent),
         superseded,
-        _nodes(extras),
+        len(fields[0]) if fields else 0,
         touch.iterations,
         answer.steps,
         0 if extras.coordinates is None else extras.coordinates.shape[1],
@@ -331,20 +317,9 @@ def encode_reply(
     )
     if extras is NO_EXTRAS:
         return head
-    parts = (extras.coordinates, extras.displacement, extras.von_mises)
-    return b"".join((head, *(part.data for part in parts if part is not None)))
-
-
-def _estimate(error: float) -> float:
-    """Return an error that fits into a float32; infinity, which means unknown, if it does not."""
-    return error if error <= _LARGEST else math.inf
-
-
-def _nodes(extras: Extras) -> int:
-    for field in (extras.displacement, extras.von_mises):
-        if field is not None:
-            return len(field)
-    return 0
+    if extras.coordinates is not None:
+        fields.insert(0, extras.coordinates)
+    return b"".join((head, *(field.data for field in fields)))
 
 
 def decode_reply(frame: bytes) -> Reply:
@@ -352,24 +327,19 @@ def decode_reply(frame: bytes) -> Reply:
     _check_version(frame)
     if len(frame) < REPLY.itemsize:
         raise FrameError("frame", f"{len(frame)} bytes are too few for a reply")
-    record = np.frombuffer(frame, REPLY, 1)[0]
-    values = {name: record[name] for name in REPLY.names or ()}
-    head = {name: v.item() if v.ndim == 0 else v for name, v in values.items()}
-    outputs, nodes = head["outputs"], head["nodes"]
-    kind = np.dtype("<f2" if outputs & _HALF else "<f4")
-    offset = REPLY.itemsize
+    head = dict(zip(REPLY.names or (), np.frombuffer(frame, REPLY, 1)[0].item(), strict=True))
+    nodes, kind, end = head["nodes"], "<f2" if head["outputs"] & _HALF else "<f4", REPLY.itemsize
     for name, bit, dtype, shape in (
-        ("coordinates", _COORDINATES, np.dtype("<f4"), (MODELS, head["coordinates"])),
+        ("coordinates", _COORDINATES, "<f4", (MODELS, head["coordinates"])),
         ("displacement", _DISPLACEMENT, kind, (nodes, 3)),
         ("von_mises", _VON_MISES, kind, (nodes,)),
     ):
         head[name] = None
-        if outputs & bit:
-            size = math.prod(shape)
-            if offset + size * dtype.itemsize > len(frame):
+        if head["outputs"] & bit:
+            start, end = end, end + math.prod(shape) * np.dtype(dtype).itemsize
+            if end > len(frame):
                 raise FrameError("frame", f"{len(frame)} bytes end within {name}")
-            head[name] = np.frombuffer(frame, dtype, size, offset).reshape(shape)
-            offset += size * dtype.itemsize
-    if offset != len(frame):
-        raise FrameError("frame", f"{len(frame)} bytes where its fields say {offset}")
+            head[name] = np.frombuffer(frame[start:end], dtype).reshape(shape)
+    if end != len(frame):
+        raise FrameError("frame", f"{len(frame)} bytes where its fields say {end}")
     return Reply(**head)

@@ -49,7 +49,7 @@ class Command(NamedTuple):
     """A snapshot that was taken or restored."""
 
     replies: int  # number of those that had come before
-    restores: bool
+    restores: int  # 0 or 1
     number: int
 
 
@@ -64,7 +64,6 @@ class Recorder:
         self._requests: OrderedDict[int, Request] = OrderedDict()
         self._asked: list[tuple[Any, ...]] = []
         self._replies: list[bytes] = []
-        self._count = 0
         self._file = h5py.File(path, "w")
         self._file.attrs.update(
             format=FORMAT,
@@ -72,15 +71,10 @@ class Recorder:
             scene=greeting["scene"],
             greeting=json.dumps(greeting),
         )
-        for field in (*ASKED, *REPLY_FIELDS, COMMANDS):
-            dataset = self._file.create_dataset(
-                field.name,
-                shape=(0, *field.shape),
-                maxshape=(None, *field.shape),
-                chunks=(CHUNK, *field.shape),
-                dtype=field.type,
-            )
-            dataset.attrs.update(units=field.unit, description=field.meaning)
+        for name, kind, unit, meaning, shape in (*ASKED, *REPLY_FIELDS, COMMANDS):
+            size = {"shape": (0, *shape), "maxshape": (None, *shape), "chunks": (CHUNK, *shape)}
+            dataset = self._file.create_dataset(name, dtype=kind, **size)
+            dataset.attrs.update(units=unit, description=meaning)
 
     def sent(self, request: Request) -> None:
         """Note a request."""
@@ -95,7 +89,6 @@ class Recorder:
             return  # nobody knows what was asked
         while (request := self._requests.popitem(last=False)[1]).seq != seq:
             pass  # replies come in order: what was sent earlier was dropped or refused
-        self._count += 1
         self._asked.append((request.position, request.outputs, now))
         self._replies.append(reply[: REPLY.itemsize])
         if len(self._replies) >= CHUNK:
@@ -103,7 +96,8 @@ class Recorder:
 
     def obeyed(self, restores: bool, number: int) -> None:
         """Note that a snapshot was taken or gone back to, after the replies received so far."""
-        _append(self._file[COMMANDS.name], [(self._count, restores, number)])
+        replies = len(self._file["seq"]) + len(self._replies)
+        _append(self._file[COMMANDS.name], [(replies, restores, number)])
 
     def close(self) -> None:
         """Write what is left and close the file."""
@@ -114,8 +108,7 @@ class Recorder:
         if not self._replies:
             return
         asked = np.array(self._asked, [(f.name, f.type, f.shape) for f in ASKED])
-        replies = np.frombuffer(b"".join(self._replies), REPLY)
-        for table in (asked, replies):
+        for table in (asked, np.frombuffer(b"".join(self._replies), REPLY)):
             for name in table.dtype.names or ():
                 _append(self._file[name], table[name])
         self._file.flush()
@@ -144,25 +137,18 @@ def read_recording(path: Path) -> Recording:
         with h5py.File(path, "r") as file:
             if file.attrs.get("format") != FORMAT:
                 raise RecordingError(f"{path}: not a recording of a session")
-            version = file.attrs["format_version"]
-            if version != FORMAT_VERSION:
+            if (version := file.attrs["format_version"]) != FORMAT_VERSION:
                 raise RecordingError(
                     f"{path}: format version {version}; this program reads {FORMAT_VERSION}"
                 )
             replies = np.zeros(len(file["seq"]), REPLY)
             for name in REPLY.names or ():
                 replies[name] = file[name][:]
-            asked = zip(
-                replies["seq"].tolist(),
-                replies["client_time"].tolist(),
-                map(tuple, file["asked_position"][:].tolist()),
-                file["asked_outputs"][:].tolist(),
-                strict=True,
-            )
-            requests = [Request(*values) for values in asked]
-            commands = [Command(n, bool(back), k) for n, back, k in file["commands"][:].tolist()]
-            return Recording(
-                str(file.attrs["scene"]), requests, replies, file["received"][:], commands
-            )
+            columns = replies["seq"], replies["client_time"], file["asked_position"][:]
+            asked = (column.tolist() for column in (*columns, file["asked_outputs"][:]))
+            requests = [Request(*values) for values in zip(*asked, strict=True)]
+            commands = [Command(*values) for values in file["commands"][:].tolist()]
+            scene = str(file.attrs["scene"])
+            return Recording(scene, requests, replies, file["received"][:], commands)
     except (OSError, KeyError, ValueError) as error:
         raise RecordingError(f"{path}: cannot be read: {error}") from error

@@ -8,31 +8,21 @@ is read no faster than that.
 
 import asyncio
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from enum import Enum, auto
 from time import perf_counter
 
 import orjson
 from starlette.types import Message, Receive, Scope, Send
 
-from palpate.online.serve.errors import Refusal, check_json_size, error_body
+from palpate.online.serve.errors import Refusal, as_refusal, check_json_size
 from palpate.online.serve.metrics import Metrics
 from palpate.online.serve.settings import Settings
 from palpate.online.serve.store import ServedModel, Store
-from palpate.online.session import frames
-from palpate.online.session.frames import FrameError, Output, Request, VersionError
-from palpate.online.session.protocol import layout
-from palpate.online.session.realtime import BusyWait
-from palpate.online.session.text import (
-    MOST_SNAPSHOTS,
-    is_command,
-    read_command,
-    read_request,
-    write_reply,
-)
+from palpate.online.session import frames, protocol
+from palpate.online.session.frames import Output, Request
 from palpate.online.session.tracker import LONGEST, Snapshot, ToolTracker, recover
-from palpate.online.session.websocket import LINGER, MOST_FRAMES, PENDING, READ_AT, STOPPING
+from palpate.online.session.websocket import CONNECTION, LINGER, MOST_FRAMES, STOPPING
 
 logger = logging.getLogger(__name__)
 
@@ -51,28 +41,12 @@ PATIENCE = 5.0
 SPARE = 4
 """Sessions of each scene that can be opened at no cost to those under way."""
 
-GOING_AWAY, FAILED, IDLE, WRONG_VERSION = 1001, 1011, 4000, 4001
-"""Codes that a session is closed with."""
+GOING_AWAY, IDLE = 1001, 4000
+ENDING = {"internal": 1011, "unknown_version": 4001}
+"""Codes that a session is closed with; of refusals those that end it."""
 
-
-class State(Enum):
-    """What a session is doing."""
-
-    CONNECTING = auto()  # the handshake is not answered yet
-    WAITING = auto()  # for a message of the client
-    SENDING = auto()  # until the client has taken most of what was sent
-    CLOSING = auto()  # the service ends it and says why
-    CLOSED = auto()
-
-
-_NEXT = {
-    State.CONNECTING: {State.SENDING},
-    State.WAITING: {State.SENDING, State.CLOSING, State.CLOSED},
-    State.SENDING: {State.WAITING, State.CLOSED},
-    State.CLOSING: {State.CLOSED},
-    State.CLOSED: set(),
-}
-"""States that may follow each."""
+Ending = tuple[int, str] | None
+"""Code and reason that the service closes a session with; None if the client has gone."""
 
 
 class Sessions:
@@ -81,7 +55,6 @@ class Sessions:
     def __init__(self, store: Store, settings: Settings, metrics: Metrics) -> None:
         self.settings = settings
         self.metrics = metrics
-        self.busy_wait = BusyWait(settings.workers if settings.realtime else 0)
         self._store = store
         self._open = 0
         # a new tracker takes longer than most solves
@@ -112,10 +85,7 @@ class Sessions:
             spare.append(tracker)
 
     def prepare(self, served: ServedModel, path: Sequence[Sequence[float]]) -> None:
-        """Call everything that a session calls once, and make spare trackers.
-
-        The tip follows `path` (mm), which leads through all that the tissue's history may need.
-        """
+        """Call everything once and make spare trackers; the tip follows `path` (mm)."""
         x, y, z = served.tip
         request = Request(0, 0.0, (x, y, z), sum(Output))
         spare = self._spare[served.model.name] = []
@@ -126,16 +96,13 @@ class Sessions:
             tracker.restart()
             answer = tracker.follow(request.position, BUDGET)
             extras = recover(served.model, answer.touch, request.outputs)
-            write_reply(frames.encode_reply(request, answer, extras))
+            protocol.write_reply(frames.encode_reply(request, answer, extras))
             tracker.restart()
             spare.append(tracker)
 
 
 class Session:
-    """One client with one tool, whose tracker is new or restarted.
-
-    `scope`, `receive` and `send` are those of `session.websocket.SessionProtocol`.
-    """
+    """One client with one tool on a `session.websocket.SessionProtocol`."""
 
     def __init__(
         self,
@@ -149,13 +116,11 @@ class Session:
         self._sessions, self._tracker = sessions, tracker
         self._served, self._model = served, served.model
         self._receive, self._send = receive, send
-        self._pending: Callable[[], bool] = scope["extensions"][PENDING]
-        self._read_at: Callable[[], float] = scope["extensions"][READ_AT]
+        self._connection = scope["extensions"][CONNECTION]
         self._snapshots: dict[int, Snapshot] = {}
         self._received = self._full_at = 0.0
         self._superseded = 0
-        self._state, self._since = State.CONNECTING, perf_counter()
-        self._close_reason = 0, ""
+        self._sending, self._since = True, perf_counter()
 
     async def run(self) -> None:
         """Greet the client and answer it until either side ends the session."""
@@ -163,58 +128,46 @@ class Session:
         await self._send({"type": "websocket.accept"})
         watching = asyncio.create_task(self._watch())
         try:
-            with suppress(TimeoutError):
-                async with asyncio.timeout(None) as self._interruption:
-                    await self._deliver({"type": "websocket.send", "text": self._greeting()})
-                    await self._converse()
+            async with asyncio.timeout(None) as self._interruption:
+                await self._deliver({"type": "websocket.send", "text": self._greeting()})
+                ending = await self._converse()
+        except TimeoutError:
+            ending = await watching
         finally:
             watching.cancel()  # there is nothing to interrupt any more
-        if self._state is State.CLOSING:
-            code, reason = self._close_reason
-            # a client that does not listen is cut off when this returns
-            with suppress(TimeoutError):
-                async with asyncio.timeout(LINGER):
-                    await self._send({"type": "websocket.close", "code": code, "reason": reason})
-            self._enter(State.CLOSED)
+        if ending is None:
+            return
+        code, reason = ending
+        # a client that does not listen is cut off when this returns
+        with suppress(TimeoutError):
+            async with asyncio.timeout(LINGER):
+                await self._send({"type": "websocket.close", "code": code, "reason": reason})
 
-    def _enter(self, state: State) -> None:
-        """Go from one state to another one."""
-        if state not in _NEXT[self._state]:
-            raise RuntimeError(f"a session cannot go from {self._state} to {state}")
-        self._state, self._since = state, perf_counter()
-
-    def _close(self, code: int, reason: str) -> None:
-        """Let the session end with a reason."""
-        self._enter(State.CLOSING)
-        self._close_reason = code, reason
-
-    async def _watch(self) -> None:
-        """Interrupt a session whose client is silent, or does not read."""
+    async def _watch(self) -> Ending:
+        """Interrupt a session whose client is silent, or does not read; tell how it ends."""
         idle = self._sessions.settings.session_idle
-        while True:
+        passed = 0.0
+        while passed <= (PATIENCE if self._sending else idle):
             await asyncio.sleep(min(0.25, 0.25 * idle))
             passed = perf_counter() - self._since
-            if self._state is State.SENDING and passed > PATIENCE:
-                logger.warning("a session is cut off: its client leaves replies unread")
-                self._enter(State.CLOSED)
-                break
-            if self._state is State.WAITING and passed > idle:
-                self._close(IDLE, f"no frame for {idle:g} s")
-                break
         self._interruption.reschedule(asyncio.get_running_loop().time())
+        if not self._sending:
+            return IDLE, f"no frame for {idle:g} s"
+        logger.warning("a session is cut off: its client leaves replies unread")
+        return None
 
-    async def _converse(self) -> None:
-        """Answer the newest message, again and again."""
-        while self._state is State.WAITING:
+    async def _converse(self) -> Ending:
+        """Answer the newest message, again and again; tell how the session ends."""
+        while True:
             messages, last = await self._take()
             for message in messages:
-                await self._respond(message)
-            if last is not None and self._state is State.WAITING:
-                if last["code"] == STOPPING:
-                    self._close(GOING_AWAY, "the service is stopping")
-                else:
-                    self._enter(State.CLOSED)
-            self._sessions.busy_wait.keep()
+                reply, ending = self._reply(message)
+                await self._deliver(reply)
+                if ending is not None:
+                    return ending
+            if last is not None:
+                stopping = last["code"] == STOPPING
+                return (GOING_AWAY, "the service is stopping") if stopping else None
             # only now: a message that waits must not grow older because of those behind it
             if (excess := self._full_at - perf_counter() - BURST) > 0.0:
                 await asyncio.sleep(excess)
@@ -229,68 +182,50 @@ class Session:
             message = await self._receive()
             if message["type"] != "websocket.receive":
                 return messages, message
-            self._received = self._read_at()
+            self._received = self._connection.read_at
             self._full_at = max(self._full_at, perf_counter()) + 1.0 / MOST_FRAMES
-            if is_command(message.get("text")):
+            if protocol.is_command(message.get("text")):
                 return [*messages, message], None
             self._superseded += len(messages)
             messages = [message]
-            if not (more and self._pending()):
+            if not more or self._connection.queue.empty():
                 break
         return messages, None
 
-    async def _respond(self, message: Message) -> None:
-        """Answer a message or say what is wrong with it, unless the session is ending."""
-        if self._state is not State.WAITING:
-            return
-        ending = None
-        try:
-            reply = self._reply(message)
-        except Exception as error:
-            reply, ending = self._complaint(error)
-        await self._deliver(reply)
-        if ending is not None:
-            self._close(*ending)
-
     async def _deliver(self, message: Message) -> None:
         """Send a message; wait until the client has taken most of those before it."""
-        self._enter(State.SENDING)
+        self._sending, self._since = True, perf_counter()
         await self._send(message)
-        if self._state is State.SENDING:  # it was not cut off meanwhile
-            self._enter(State.WAITING)
+        self._sending, self._since = False, perf_counter()
 
-    def _complaint(self, error: Exception) -> tuple[Message, tuple[int, str] | None]:
-        """Say what is wrong with a message, and with what code and reason that ends the session."""
-        self._sessions.metrics.count_refused_frame()
-        ending = None
-        match error:
-            case Refusal():
-                body = error_body(error.code, error.field, error.message, error.allowed)
-            case VersionError():
-                body = error_body("unknown_version", error.field, error.message)
-                ending = WRONG_VERSION, str(error)
-            case FrameError():
-                body = error_body("invalid_frame", error.field, error.message)
-            case _:
+    def _reply(self, message: Message) -> tuple[Message, Ending]:
+        """Answer a message as it came, in binary or JSON, or say what is wrong with it."""
+        reply: Message = {"type": "websocket.send"}
+        ending: Ending = None
+        start, frame = perf_counter(), message.get("bytes")
+        try:
+            if frame is None:
+                reply["text"] = self._answer_text(message.get("text") or "", start)
+            else:
+                reply["bytes"] = self._answer(frames.decode_request(frame), start)
+        except Exception as error:
+            refusal = as_refusal(error)
+            if refusal.code == "internal":
                 logger.error("a session failed", exc_info=error)
-                body = error_body("internal", "", "The service failed; its log says why")
-                ending = FAILED, "the service failed; its log says why"
-        return {"type": "websocket.send", "text": body.decode()}, ending
+            self._sessions.metrics.count_refused_frame()
+            reply["text"] = refusal.body().decode()
+            if refusal.code in ENDING:
+                ending = ENDING[refusal.code], refusal.message
+        return reply, ending
 
-    def _reply(self, message: Message) -> Message:
-        """Obey a command, or answer a position as it came: in binary or in JSON."""
-        start, frame, text = perf_counter(), message.get("bytes"), message.get("text") or ""
-        if frame is not None:
-            reply = self._answer(frames.decode_request(frame), start)
-            return {"type": "websocket.send", "bytes": reply}
-        if is_command(text):
-            return {"type": "websocket.send", "text": self._obey(text)}
-        request = read_request(text)
-        outputs = Output(request.outputs)
-        per_node = 3 * (Output.DISPLACEMENT in outputs) + (Output.VON_MISES in outputs)
-        numbers = per_node * len(self._model.surface_nodes)
-        check_json_size(numbers, self._sessions.settings.max_json_numbers, "outputs")
-        return {"type": "websocket.send", "text": write_reply(self._answer(request, start))}
+    def _answer_text(self, text: str, start: float) -> str:
+        """Obey a command or answer a position."""
+        if protocol.is_command(text):
+            return self._obey(*protocol.read_command(text))
+        request = protocol.read_request(text)
+        outputs, nodes = protocol.names(Output(request.outputs)), len(self._model.surface_nodes)
+        check_json_size(outputs, nodes, self._sessions.settings.max_json_numbers, "outputs")
+        return protocol.write_reply(self._answer(request, start))
 
     def _answer(self, request: Request, start: float) -> bytes:
         """Answer a request whose decoding began at `start`."""
@@ -305,9 +240,8 @@ class Session:
         self._sessions.metrics.count_frame(start - received, borders, answer.flags, dropped)
         return frame
 
-    def _obey(self, text: str) -> str:
+    def _obey(self, command: str, number: int) -> str:
         """Keep the state of the tissue or go back to one that was kept; echo the command."""
-        command, number = read_command(text)
         if command == "snapshot":
             self._snapshots[number] = self._tracker.snapshot()
         elif number in self._snapshots:
@@ -328,8 +262,8 @@ class Session:
             "idle_timeout": self._sessions.settings.session_idle,
             "max_frames_per_second": MOST_FRAMES,
             "longest_step": LONGEST if model.scene.tissue.prony else None,
-            "snapshots": MOST_SNAPSHOTS,
+            "snapshots": protocol.MOST_SNAPSHOTS,
             "server_time": perf_counter(),
-            "layout": layout(),
+            "layout": protocol.layout(),
         }
         return orjson.dumps(document).decode()

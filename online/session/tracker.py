@@ -13,9 +13,9 @@ passes between two answers, and `STALLED` says that it was cut.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from time import perf_counter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,8 +38,7 @@ it was measured to be wrong by up to 5 % for 95 % of steps of this length in any
 """
 
 MOST_ITERATIONS = 8
-"""Largest number of iterations of one solve. A step that takes more is walked in shorter strides,
-within the time there is."""
+"""Largest number of iterations of one solve; a step that takes more is walked in strides."""
 
 PATIENCE = 6
 """Positions over which the search for an equilibrium goes on before it starts from rest."""
@@ -83,41 +82,26 @@ class ToolTracker:
         return Snapshot(self._past, self._good)
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Go back to a snapshot; the client's time goes on from its last frame.
-
-        The next search has nothing to start from but what the tissue itself remembers.
-        """
+        """Go back to a snapshot and search from there; the client's time goes on."""
         self._past, self._good = snapshot
         self._lost = 0
         self._warm.forget()
 
-    def follow(self, position: Sequence[float], budget: float, now: float = 0.0) -> ToolAnswer:
+    def follow(
+        self, position: Sequence[float], budget: float, now: float = 0.0, most: float = math.inf
+    ) -> ToolAnswer:
         """Answer a position at a client's time `now` (s).
 
-        No new solve is begun after `budget` seconds.
+        No new solve is begun after `budget` seconds or `most` solves. With the same model, number
+        of solves, positions and times before it, the answer is the same, bit for bit.
         """
-        end = perf_counter() + budget
-        return self._follow(position, lambda steps: perf_counter() < end, now)
-
-    def repeat(self, position: Sequence[float], steps: int, now: float = 0.0) -> ToolAnswer:
-        """Answer a position as a session did that solved `steps` positions on the way.
-
-        With the same model and the same positions and times before it, the answer is the same, bit
-        for bit.
-        """
-        return self._follow(position, lambda taken: taken < steps, now)
-
-    def _follow(
-        self, position: Sequence[float], may_go_on: Callable[[int], bool], now: float
-    ) -> ToolAnswer:
         start = perf_counter()
         target = np.array(position, np.float64)
         passed = 0.0 if self._clock is None else now - self._clock
-        self._span = min(max(passed, 0.0), LONGEST)
-        self._reached = 0.0
+        self._span, self._reached = min(max(passed, 0.0), LONGEST), 0.0
         reason, steps = self._solve(target, 1.0), 1
         if reason == _NO_EQUILIBRIUM:
-            steps = self._catch_up(target, may_go_on)
+            steps = self._catch_up(target, start + budget, most)
         # the time that has not passed yet is left for the next frame
         self._clock = now - (1.0 - self._reached) * self._span
         # before the first good answer, one without force and without any claim
@@ -131,41 +115,32 @@ class ToolTracker:
             flags |= _STALLED
         if self._reached == 1.0:
             reason = _SOLVED
-        return ToolAnswer(touch, flags, steps, _valid_radius(touch), perf_counter() - start, reason)
+        # without contact an answer holds on the way to it
+        valid = VALID * touch.depth if touch.contact else max(0.0, -touch.depth)
+        return ToolAnswer(touch, flags, steps, valid, perf_counter() - start, reason)
 
-    def _catch_up(self, target: Array, may_go_on: Callable[[int], bool]) -> int:
-        """Get nearer to a target that was missed; return the number of positions tried.
-
-        Where there is no way the tissue snaps: equilibria end, and the next one is far away.
-        """
-        steps = 1 if self._lost else self._walk(target, may_go_on)
-        if self._reached > 0.0:
-            return steps
-        self._lost += 1
-        if self._lost % PATIENCE == 0:
-            self._warm.forget()
-        else:
-            self._warm.resume()
-        return steps
-
-    def _walk(self, target: Array, may_go_on: Callable[[int], bool]) -> int:
-        """Go towards the target from the last good position; return the positions tried."""
-        stride, steps = 0.5, 1
-        if self._good is None:
-            return steps
-        start = self._good.position
-        while self._reached < 1.0 and stride >= SHORTEST and may_go_on(steps):
-            steps += 1
-            ahead = min(self._reached + stride, 1.0)
-            if self._solve((1.0 - ahead) * start + ahead * target, ahead) != _SOLVED:
-                stride *= 0.5
+    def _catch_up(self, target: Array, end: float, most: float) -> int:
+        """Get nearer to a target that was missed; return the number of positions tried."""
+        steps, stride = 1, 0.5
+        if self._good is not None and not self._lost:
+            last = self._good.position
+            while (
+                self._reached < 1.0 and stride >= SHORTEST and steps < most and perf_counter() < end
+            ):
+                steps += 1
+                ahead = min(self._reached + stride, 1.0)
+                if self._solve((1.0 - ahead) * last + ahead * target, ahead) != _SOLVED:
+                    stride *= 0.5
+        if self._reached == 0.0:
+            self._lost += 1
+            if self._lost % PATIENCE == 0:
+                self._warm.forget()
+            else:
+                self._warm.resume()
         return steps
 
     def _solve(self, position: Array, share: float) -> int:
-        """Solve a position at a share of the way; return the `Reason` why it has no answer.
-
-        An equilibrium that was found is the last good answer from then on.
-        """
+        """Solve a position at a share of the way; keep its answer or return why there is none."""
         dt = 0.0 if self._past is None else (share - self._reached) * self._span
         try:
             touch = self._model.touch(
@@ -185,14 +160,8 @@ def _is_finite(touch: Answer) -> bool:
     vectors = (touch.force, touch.tangent.ravel(), touch.contact_point, touch.normal)
     numbers = touch.energy + touch.depth + touch.penetration + touch.min_jacobian
     numbers += sum(sum(vector.tolist()) for vector in vectors)
-    # an estimate may be infinite: nothing is known of the error then
     estimates = touch.error_displacement + touch.error_von_mises + touch.error_force
     return math.isfinite(numbers) and not math.isnan(estimates)
-
-
-def _valid_radius(touch: Answer) -> float:
-    """How far force and tangent hold (mm); without contact, the way to it."""
-    return VALID * touch.depth if touch.contact else max(0.0, -touch.depth)
 
 
 def recover(model: ReducedModel, touch: Answer, outputs: int) -> Extras:
@@ -200,27 +169,22 @@ def recover(model: ReducedModel, touch: Answer, outputs: int) -> Extras:
     if not outputs & ~_HALF:
         return frames.NO_EXTRAS
     kind = np.float16 if outputs & _HALF else np.float32
-    coordinates = displacement = von_mises = None
-    largest = percentile = 0.0
+    extras: dict[str, Any] = {"outputs": outputs}
     if outputs & _COORDINATES:
-        coordinates = _coordinates(touch)
+        states = [state for _, _, state in touch.parts]
+        rows = np.zeros((frames.MODELS, max(map(len, states), default=0)), np.float32)
+        for row, state in zip(rows, states, strict=False):
+            row[:] = state
+        extras["coordinates"] = rows
     if outputs & (_DISPLACEMENT | _VON_MISES | _STRESS):
         everywhere = model.displacement(touch)
-        if outputs & _DISPLACEMENT:
-            displacement = everywhere[model.surface_nodes].astype(kind)
-        if outputs & (_VON_MISES | _STRESS):
-            stress = model.von_mises(touch, "all", everywhere)
-            if outputs & _VON_MISES:
-                von_mises = stress[model.surface_nodes].astype(kind)
-            if outputs & _STRESS:
-                largest, percentile = np.percentile(stress, (100.0, 99.0)).tolist()
-    return Extras(outputs, coordinates, displacement, von_mises, largest, percentile)
-
-
-def _coordinates(touch: Answer) -> NDArray[np.float32]:
-    """Reduced coordinates (MODELS, r), a row per local model."""
-    r = max((len(c) for _, _, c in touch.parts), default=0)
-    rows = np.zeros((frames.MODELS, r), np.float32)
-    for row, (_, _, c) in zip(rows, touch.parts, strict=False):
-        row[:] = c
-    return rows
+    if outputs & _DISPLACEMENT:
+        extras["displacement"] = everywhere[model.surface_nodes].astype(kind)
+    if outputs & (_VON_MISES | _STRESS):
+        stress = model.von_mises(touch, "all", everywhere)
+    if outputs & _VON_MISES:
+        extras["von_mises"] = stress[model.surface_nodes].astype(kind)
+    if outputs & _STRESS:
+        largest, percentile = np.percentile(stress, (100.0, 99.0)).tolist()
+        extras |= {"max_von_mises": largest, "p99_von_mises": percentile}
+    return Extras(**extras)

@@ -6,7 +6,7 @@ import socket
 from time import perf_counter
 from typing import Any
 
-from starlette.types import Receive, Scope, Send
+from starlette.websockets import WebSocket
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.frames import Frame
 from websockets.http11 import Request
@@ -16,24 +16,16 @@ from palpate.online.session.frames import REPLY
 logger = logging.getLogger(__name__)
 
 ECHO = "/echo"
-"""Path of the `Echo`, if the service has one."""
+"""Path of `echo`, if the service has it."""
 
 STOPPING = 1012
 """Code of the ``websocket.disconnect`` that asks an application to close the connection itself."""
 
-PENDING = "palpate.pending"
-"""Key of the ASGI scope's extensions: a function that tells whether a message can be received
-without waiting."""
-
-READ_AT = "palpate.read_at"
-"""Key of the ASGI scope's extensions: a function that tells when the newest message was read, s of
-`time.perf_counter`."""
+CONNECTION = "palpate.connection"
+"""Key of the ASGI scope's extensions: the `SessionProtocol`."""
 
 RECEIVE_BUFFER = 16 * 1024
-"""Bytes the system keeps for a client that sends faster than it is read.
-
-All of them are parsed in one go, some microseconds for every small frame, while others wait.
-"""
+"""Bytes the system keeps of a client that sends faster; they are parsed in one go."""
 
 SEND_BUFFER = 128 * 1024
 """Bytes the system keeps for a client that does not read: a few replies with fields."""
@@ -51,25 +43,24 @@ LINGER = 1.0
 class SessionProtocol(WebSocketsSansIOProtocol):
     """Uvicorn's, with limits.
 
-    An application can tell whether there is more to read, and when it was read; what waits in the
-    system's small buffers is recent. A service that stops lets its applications answer what they
-    have and close with a reason. Closing waits for no client that says nothing or reads nothing,
-    and one that floods the service with pings and parts of messages is cut off.
+    An application can tell whether there is more to read (`queue`), and when the newest message was
+    read (`read_at`, s of `time.perf_counter`); what waits in the system's small buffers is recent.
+    A service that stops lets its applications answer what they have and close with a reason.
+    Closing waits for no client that says nothing or reads nothing, and one that floods the service
+    with pings and parts of messages is cut off.
     """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self.close_timeout = LINGER
         self.read_at = 0.0
-        self.asides = 0
-        self.asides_since = 0.0
+        self.asides, self.asides_since = 0, 0.0
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Take over a connection."""
         super().connection_made(transport)
-        connection = transport.get_extra_info("socket")
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+        for option, size in (socket.SO_RCVBUF, RECEIVE_BUFFER), (socket.SO_SNDBUF, SEND_BUFFER):
+            transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, option, size)
 
     def data_received(self, data: bytes) -> None:
         """Take what the client sent."""
@@ -81,8 +72,7 @@ class SessionProtocol(WebSocketsSansIOProtocol):
         super().handle_connect(event)
         if self.response.status_code == 101:
             extensions: dict[str, Any] = self.scope["extensions"]
-            extensions[PENDING] = lambda: not self.queue.empty()
-            extensions[READ_AT] = lambda: self.read_at
+            extensions[CONNECTION] = self
 
     def handle_ping(self) -> None:
         """Answer a ping, unless the answers to those before pile up here."""
@@ -138,21 +128,13 @@ class SessionProtocol(WebSocketsSansIOProtocol):
         self.loop.call_later(LINGER, self.transport.abort)
 
 
-class Echo:
-    """The ASGI application that answers frames with empty replies of their number.
-
-    It has a session's sizes and none of its work: what a WebSocket costs by itself.
-    """
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer until the client goes."""
-        await receive()
-        await send({"type": "websocket.accept"})
-        await send({"type": "websocket.send", "text": "{}"})
-        rest = bytes(REPLY.itemsize - 8)
-        while (message := await receive())["type"] == "websocket.receive":
-            reply = bytes(4) + (message.get("bytes") or b"")[4:8] + rest
-            await send({"type": "websocket.send", "bytes": reply})
+async def echo(client: WebSocket) -> None:
+    """Answer frames with empty replies of their number: what a WebSocket costs by itself."""
+    await client.accept()
+    await client.send_text("{}")
+    rest = bytes(REPLY.itemsize - 8)
+    async for frame in client.iter_bytes():
+        await client.send_bytes(bytes(4) + frame[4:8] + rest)
 
 
 OPTIONS: dict[str, Any] = {

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -77,55 +78,39 @@ CLUSTER = 32
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _project(ground, p, squared, weights):
-    """Nearest triangle and barycentric ``weights`` (3,) there; returns (triangle, distance).
-
-    ``squared`` (c,) is scratch: squared distances of the balls' centres.
-    """
-    centres, radii = ground.centres, ground.radii
-    x, y, z = p[0], p[1], p[2]
-    for c in range(len(radii)):
-        dx, dy, dz = x - centres[0, c], y - centres[1, c], z - centres[2, c]
-        squared[c] = dx * dx + dy * dy + dz * dz
-    first, least = 0, np.inf
-    for c in range(len(radii)):
-        if squared[c] < least:
-            first, least = c, squared[c]
-    nearest, best = _nearest_in(ground, p, first, 0, np.inf, weights)
-    for c in range(len(radii)):
-        bound = best + radii[c]
-        if squared[c] < bound * bound and c != first:
-            nearest, best = _nearest_in(ground, p, c, nearest, best, weights)
-    return nearest, best
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _nearest_in(ground, p, cluster, nearest, best, weights):
-    """``nearest`` triangle and its distance ``best``, or those of a nearer one in the cluster."""
+def _nearest_in(ground, p, cluster, found):
+    """Number, distance and barycentric coordinates of the nearest triangle: ``found`` or nearer."""
+    nearest, best, u, v, w = found
     balls, triangles = ground.balls, ground.triangles
     for t in range(ground.first[cluster], ground.first[cluster + 1]):
         dx, dy, dz = p[0] - balls[t, 0], p[1] - balls[t, 1], p[2] - balls[t, 2]
         bound = best + balls[t, 3]
         if dx * dx + dy * dy + dz * dz < bound * bound:
             i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
-            distance, u, v, w = _closest_on_triangle(p, ground.vertices, i, j, k)
+            distance, a, b, c = _closest_on_triangle(p, ground.vertices, i, j, k)
             if distance < best:
-                nearest, best = t, distance
-                weights[0], weights[1], weights[2] = u, v, w
-    return nearest, best
+                nearest, best, u, v, w = t, distance, a, b, c
+    return nearest, best, u, v, w
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def locate(ground, p, scratch, x, normal, at):
+def locate(ground, p, squared, x, normal, at):
     """Write the projection of p, the normal and the values ``at`` it; return the distance.
 
-    ``scratch`` (clusters + 3,) holds one value for each ball of triangles and three more.
+    ``squared`` (clusters,) is scratch.
     """
-    count = len(ground.radii)
-    weights = scratch[count:]
-    t, distance = _project(ground, p, scratch, weights)
+    centres, radii = ground.centres, ground.radii
+    for c in range(len(radii)):
+        dx, dy, dz = p[0] - centres[0, c], p[1] - centres[1, c], p[2] - centres[2, c]
+        squared[c] = dx * dx + dy * dy + dz * dz
+    first = np.argmin(squared)
+    found = _nearest_in(ground, p, first, (0, np.inf, 0.0, 0.0, 0.0))
+    for c in range(len(radii)):
+        bound = found[1] + radii[c]
+        if squared[c] < bound * bound and c != first:
+            found = _nearest_in(ground, p, c, found)
+    t, distance, u, v, w = found
     a, b, c = ground.triangles[t, 0], ground.triangles[t, 1], ground.triangles[t, 2]
-    u, v, w = weights[0], weights[1], weights[2]
     vertices, normals, values = ground.vertices, ground.normals, ground.values
     for k in range(len(at)):
         at[k] = u * values[a, k] + v * values[b, k] + w * values[c, k]
@@ -156,32 +141,33 @@ class Surface:
     vertices: Array
     triangles: NDArray[np.int32]
     normals: Array
-    _ordered: NDArray[np.int32] = field(init=False, repr=False)
-    _balls: Array = field(init=False, repr=False)
-    _first: NDArray[np.int64] = field(init=False, repr=False)
-    _centres: Array = field(init=False, repr=False)
-    _radii: Array = field(init=False, repr=False)
 
-    def __post_init__(self) -> None:
+    @cached_property
+    def _index(self) -> SurfaceIndex:
+        """For compiled code, without fields."""
         clusters = _clusters(
             self.vertices[self.triangles].mean(axis=1), np.arange(len(self.triangles))
         )
         first = np.cumsum([0, *map(len, clusters)])
-        starts = first[:-1]
         ordered = np.ascontiguousarray(self.triangles[np.concatenate(clusters)])
         corners = self.vertices[ordered]
         low, high = corners.min(axis=1), corners.max(axis=1)
-        balls = np.column_stack([(low + high) / 2, np.zeros(len(ordered))])
-        balls[:, 3] = np.linalg.norm(corners - balls[:, None, :3], axis=2).max(axis=1)
-        low, high = np.minimum.reduceat(low, starts), np.maximum.reduceat(high, starts)
-        centres = (low + high) / 2
+        middles = (low + high) / 2
+        radii = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
+        low = np.minimum.reduceat(low, first[:-1])
+        centres = (low + np.maximum.reduceat(high, first[:-1])) / 2
         own = np.repeat(centres, np.diff(first), axis=0)
         reach = np.linalg.norm(corners - own[:, None], axis=2).max(axis=1)
-        object.__setattr__(self, "_ordered", ordered)
-        object.__setattr__(self, "_balls", balls)
-        object.__setattr__(self, "_first", first)
-        object.__setattr__(self, "_centres", np.ascontiguousarray(centres.T))
-        object.__setattr__(self, "_radii", np.maximum.reduceat(reach, starts))
+        return SurfaceIndex(
+            vertices=self.vertices,
+            triangles=ordered,
+            balls=np.column_stack([middles, radii]),
+            normals=self.normals,
+            first=first,
+            centres=np.ascontiguousarray(centres.T),
+            radii=np.maximum.reduceat(reach, first[:-1]),
+            values=np.empty((len(self.vertices), 0)),
+        )
 
     def project(self, position: Array) -> tuple[Array, Array, float]:
         """Nearest surface point (mm), its outward unit normal and the distance (mm)."""
@@ -190,27 +176,13 @@ class Surface:
     def locate(self, position: Array, values: Array) -> tuple[Array, Array, float, Array]:
         """As ``project``, and the values (k,) there of fields given at the vertices, (v, k)."""
         x, normal, at = np.empty(3), np.empty(3), np.empty(values.shape[1])
-        scratch = np.empty(len(self._radii) + 3)
-        distance = locate(self.ground(values), position, scratch, x, normal, at)
+        index = self.ground(values)
+        distance = locate(index, position, np.empty(len(index.radii)), x, normal, at)
         return x, normal, distance, at
-
-    @property
-    def clusters(self) -> int:
-        """Number of balls that triangles are searched in."""
-        return len(self._radii)
 
     def ground(self, values: Array) -> SurfaceIndex:
         """For compiled code, with fields (v, k) given at the vertices."""
-        return SurfaceIndex(
-            self.vertices,
-            self._ordered,
-            self._balls,
-            self.normals,
-            self._first,
-            self._centres,
-            self._radii,
-            np.ascontiguousarray(values),
-        )
+        return self._index._replace(values=np.ascontiguousarray(values))
 
     def rim(self) -> NDArray[np.int64]:
         """Vertices on the border of the surface: ends of edges that belong to one triangle."""

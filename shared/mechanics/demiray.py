@@ -20,6 +20,7 @@ from typing import Any, Literal, NamedTuple
 
 from pydantic import Field
 
+from palpate.shared.compiled import methods
 from palpate.shared.mechanics.tensors import (
     add,
     cofactor,
@@ -34,6 +35,7 @@ from palpate.shared.mechanics.tissue import Tissue
 from palpate.shared.part import Positive
 
 
+@methods(forceinline=True)
 class Demiray(NamedTuple):
     """Parameters and functions of the law; see ``mechanics.laws``."""
 

@@ -15,9 +15,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from palpate.shared.compiled import methods
+
 Array = NDArray[np.float64]
 
 
+@methods()
 class SurfaceQuadrature(NamedTuple):
     """Integration points of a surface, fine enough that the load is smooth in the contact point."""
 
@@ -26,6 +29,12 @@ class SurfaceQuadrature(NamedTuple):
     areas: Array  # (g,) mm^2
     nodes: NDArray[np.int32]  # (g, k) rows of the nodal vector that a point feeds
     shape: Array  # (g, k) shape functions
+
+    def between(self, a, b):
+        """Points a to b."""
+        return SurfaceQuadrature(
+            self.points[a:b], self.normals[a:b], self.areas[a:b], self.nodes[a:b], self.shape[a:b]
+        )
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -50,16 +59,12 @@ def footprint(surface, x, normal, radius, nodal):
     area = 0.0
     inverse = 1.0 / (radius * radius)
     for g in range(len(surface.areas)):
-        dx = surface.points[g, 0] - x[0]
-        dy = surface.points[g, 1] - x[1]
-        dz = surface.points[g, 2] - x[2]
-        rho2 = (dx * dx + dy * dy + dz * dz) * inverse
+        rho2 = facing = 0.0
+        for i in range(3):
+            rho2 += (surface.points[g, i] - x[i]) ** 2 * inverse
         if rho2 < 1.0:
-            facing = (
-                surface.normals[g, 0] * normal[0]
-                + surface.normals[g, 1] * normal[1]
-                + surface.normals[g, 2] * normal[2]
-            )
+            for i in range(3):
+                facing += surface.normals[g, i] * normal[i]
             if facing > 0.0:
                 profile = 1.0 - rho2 * rho2
                 weight = surface.areas[g] * facing * profile * profile

@@ -2,19 +2,17 @@
 
 A law is stored energy ``W(F)`` (kPa = mN mm / mm^3), the first Piola-Kirchhoff stress ``P = dW/dF``
 and its derivative ``A = dP/dF``; F is the deformation gradient, ``J = det F``.  Its file has a
-named tuple of its parameters, first the Lamé parameters at rest, whose methods are the functions
-below, in tensors of ``mechanics.tensors``; and its table in a scene, a kind of ``Tissue``.
+named tuple of its parameters, first the Lamé parameters at rest, with the methods of
+``mechanics.tissue.Law`` in tensors of ``mechanics.tensors``; and its table in a scene, a kind of
+``Tissue``.
 
 So every law is written once: the full model calls it point by point, the reduced one in loops over
-many points that become vector code.  The compiler takes the functions by the tuple's type.
+many points that become vector code.
 """
-
-from typing import Any, get_args
 
 import numpy as np
 from numba import njit
 
-from palpate.shared.compiled import by_type
 from palpate.shared.mechanics.demiray import DemirayTissue
 from palpate.shared.mechanics.mooney_rivlin import MooneyRivlinTissue
 from palpate.shared.mechanics.neo_hookean import NeoHookeanTissue
@@ -27,8 +25,6 @@ AnyTissue = (
     | DemirayTissue
 )  # fmt: skip
 
-LAWS: list[Any] = [tissue.parameters for tissue in get_args(AnyTissue)]
-
 
 def law_of(tissue: AnyTissue, count: int) -> Law:
     """Parameters of so many points of a tissue."""
@@ -39,50 +35,16 @@ def law_of(tissue: AnyTissue, count: int) -> Law:
     return law
 
 
-def at(law, i):
-    """Parameters at one point, or at those of a slice."""
-
-
-def first_piola(law, F):
-    """Stress at a deformation gradient.
-
-    Returns
-    -------
-    J : float
-        det F.
-    part : float
-        What ``energy`` needs besides J.
-    P : tuple of 9 floats, kPa
-        First Piola-Kirchhoff stress; without meaning where J <= 0.
-    """
-
-
-def energy(law, J, part):
-    """Energy density (kPa) at ``J > 0``; see ``first_piola``."""
-
-
-def linearise(law, F):
-    """What ``increment`` needs of a state: a tensor and nine moduli (kPa), first mu and lam."""
-
-
-def increment(law, state, H):
-    """``A : H`` (kPa), linear in the moduli of the state."""
-
-
-for piece in (at, first_piola, energy, linearise, increment):
-    by_type(piece, {law: getattr(law, piece.__name__) for law in LAWS}, forceinline=True)
-
-
 @njit(cache=True, error_model="numpy")
 def tangent(law, F, A):
     """Write ``A = dP/dF`` (9, 9) kPa, which is symmetric."""
-    state = linearise(law, F)
+    state = law.linearise(F)
     for k in range(9):
-        store(increment(law, state, unit(k)), A[k], 0, 1)
+        store(law.increment(state, unit(k)), A[k], 0, 1)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def von_mises(law, F):
     """Von Mises equivalent (kPa) of the Cauchy stress at a deformation gradient."""
-    J, _, P = first_piola(law, F)
+    J, _, P = law.first_piola(F)
     return equivalent(F, P, J)

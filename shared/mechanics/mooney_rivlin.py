@@ -24,6 +24,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from palpate.shared.compiled import methods
 from palpate.shared.mechanics.tensors import (
     add,
     cofactor,
@@ -39,6 +40,7 @@ from palpate.shared.mechanics.tissue import Tissue
 from palpate.shared.part import Positive
 
 
+@methods(forceinline=True)
 class MooneyRivlin(NamedTuple):
     """Parameters and functions of the law; see ``mechanics.laws``."""
 

@@ -16,8 +16,9 @@ from typing import Any, Literal, NamedTuple
 
 from pydantic import Field
 
+from palpate.shared.compiled import methods
 from palpate.shared.mechanics.tensors import (
-    add_dot,
+    add,
     add_identity,
     cofactor,
     combine,
@@ -32,6 +33,7 @@ from palpate.shared.mechanics.tissue import Tissue
 from palpate.shared.part import Positive
 
 
+@methods(forceinline=True)
 class NeoHookean(NamedTuple):
     """Parameters and functions of the law; see ``mechanics.laws``."""
 
@@ -68,7 +70,7 @@ class NeoHookean(NamedTuple):
         T, moduli = state
         X = dot(T, transposed(H))
         X = add_identity(scale(moduli[2], X), moduli[3] * trace(X))
-        return add_dot(scale(moduli[0], H), X, T)
+        return add(scale(moduli[0], H), dot(X, T))
 
 
 class NeoHookeanTissue(Tissue):

@@ -1,10 +1,11 @@
 """Static equilibrium by Newton's method with an energy line search, for any size of model.
 
-A model takes part through three functions: ``potential`` (total potential energy, its gradient the
-residual, and the smallest det F), ``factorise`` (tangent at a state, optionally shifted towards the
-rest stiffness) and ``correct`` (solve with the factorised tangent).  The full model gives them as
-methods; the reduced model as compiled overloads, so this one source runs as Python for the former
-and as machine code for the latter.
+A model takes part by three methods.  ``potential(u, residual)`` writes the residual (internal minus
+external force) at ``u`` and returns the total potential energy, whose gradient that is, and the
+smallest det F.  ``factorise(u, shift)`` factorises the tangent at ``u`` plus ``shift`` times the
+rest stiffness; False if it is not positive definite.  ``correct(residual, step)`` writes ``step = -
+(factorised tangent)^-1 residual``.  For the full model this source runs as Python, for the reduced
+one it is compiled.
 
 Equilibria are sought as minima: where the tangent is not positive definite it is shifted by a
 multiple of the rest stiffness until it is, and every step must lower the potential (Nocedal &
@@ -22,28 +23,13 @@ SMALLEST_STEP = 1e-6
 LARGEST_SHIFT = 1e4
 
 
-def potential(system, u, residual):
-    """Write the residual (internal minus external force) at ``u``; return (energy, min det F)."""
-    return system.potential(u, residual)
-
-
-def factorise(system, u, shift):
-    """Factorise tangent(u) + shift * rest stiffness; False if it is not positive definite."""
-    return system.factorise(u, shift)
-
-
-def correct(system, residual, step):
-    """Write ``step = -(factorised tangent)^-1 residual``."""
-    system.correct(residual, step)
-
-
 def newton(system, u, work, target, reuse, max_iterations, factorised, round_off=1e-9, noise=0.0):
     """Find the equilibrium of ``system`` near ``u``, in place.
 
     Parameters
     ----------
     system
-        What ``potential``, ``factorise`` and ``correct`` understand.
+        With the methods above.
     u : ndarray, shape (n,)
         Start on entry, equilibrium on return.
     work : ndarray, shape (4, n)
@@ -74,19 +60,8 @@ def newton(system, u, work, target, reuse, max_iterations, factorised, round_off
     smallest : float
         Smallest det F at ``u``.
     """
-    energy, smallest = potential(system, u, work[0])
-    return descend(
-        system, u, work, energy, smallest, target, reuse, max_iterations, factorised, round_off,
-        noise,
-    )  # fmt: skip
-
-
-def descend(
-    system, u, work, energy, smallest, target, reuse, max_iterations, factorised, round_off,
-    noise=0.0,
-):  # fmt: skip
-    """As ``newton`` from a ``u`` whose potential is known and whose residual is in ``work[0]``."""
     residual, step, trial, trial_residual = work[0], work[1], work[2], work[3]
+    energy, smallest = system.potential(u, residual)
     if not smallest > 0:  # beyond an inverted element there is neither residual nor tangent
         return STALLED, 0, energy, smallest
     norm = math.sqrt(np.dot(residual, residual))
@@ -97,17 +72,17 @@ def descend(
             return EXHAUSTED, iterations, energy, smallest
         if stale:
             shift = 0.0
-            while not factorise(system, u, shift):
+            while not system.factorise(u, shift):
                 shift = max(0.01, 4.0 * shift)
                 if shift > LARGEST_SHIFT:
                     return STALLED, iterations, energy, smallest
-        correct(system, residual, step)
+        system.correct(residual, step)
         slope = np.dot(residual, step)
         length = 1.0
         while True:
             np.multiply(step, length, trial)
             np.add(trial, u, trial)
-            trial_energy, trial_smallest = potential(system, trial, trial_residual)
+            trial_energy, trial_smallest = system.potential(trial, trial_residual)
             allowed = SUFFICIENT_DECREASE * length * slope + round_off * abs(energy) + noise
             if trial_energy - energy <= allowed:
                 break

@@ -27,12 +27,13 @@ feel it: it belongs to the far side of a thin wall.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from palpate.shared.compiled import room
 from palpate.shared.geometry.elements import quadrilateral, shape
 
 Array = NDArray[np.float64]
@@ -88,18 +89,18 @@ class TipSurface(NamedTuple):
 
 
 class Touching(NamedTuple):
-    """What the tip does to the faces that it touches; room for all of a surface's."""
+    """What the tip does to the faces that it touches; room for f of them."""
 
-    face: Ints  # (f,) places in the list of faces looked at
-    force: Array  # (f, k, 3) mN, on their nodes
-    stiffness: Array  # (f, 3, 3, k, k) mN/mm, second derivative in the places of the nodes
-    own: Array  # (3, 3) mN/mm, in the place of the tip
-    touched: NDArray[np.int64]  # (1,) number of faces
-    deepest: Array  # (1,) mm, largest penetration
-    at: Array  # (k, 3) scratch: nodes of a face from the tip's centre, mm
-    gap: Array  # (4, BLOCK) scratch: points of a block from there, mm, and squared distances
-    row: Array  # (k,) scratch: shape functions at a point
-    ends: Array  # (4, e) scratch: the same of the corners of blocks
+    face: Annotated[Ints, "f"]  # places in the list of faces looked at
+    force: Annotated[Array, "f, k, 3"]  # mN, on their nodes
+    stiffness: Annotated[Array, "f, 3, 3, k, k"]  # mN/mm, second derivative in the nodes' places
+    own: Annotated[Array, "3, 3"]  # mN/mm, in the place of the tip
+    touched: Annotated[NDArray[np.int64], "1"]  # number of faces
+    deepest: Annotated[Array, "1"]  # mm, largest penetration
+    around: Annotated[Array, "k, 3"]  # scratch: nodes of a face from the tip's centre, mm
+    gap: Annotated[Array, "4, block"]  # scratch: points of a block from there, squared distances
+    row: Annotated[Array, "k"]  # scratch: shape functions at a point
+    ends: Annotated[Array, "4, ends"]  # scratch: as ``gap``, of the corners of blocks
 
 
 def tip_of(radius: float, young: float) -> Tip:
@@ -135,7 +136,7 @@ def tip_surface(
     return TipSurface(
         nodes=nodes,
         faces=np.ascontiguousarray(touched, dtype=np.int32),
-        shape=_in_blocks(N),
+        shape=np.ascontiguousarray(N.reshape(-1, BLOCK, N.shape[1]).transpose(0, 2, 1)),
         corner_shape=np.ascontiguousarray(at_ends.T),
         corners=corners,
         reach=np.ascontiguousarray(radius**2 + SAG * (diagonals / 2) ** 2),
@@ -144,11 +145,6 @@ def tip_surface(
             np.moveaxis((normals / areas[:, None]).reshape(len(touched), 3, -1, BLOCK), 1, 2)
         ),
     )
-
-
-def _in_blocks(N: Array) -> Array:
-    """Shape functions (q, k) at points as (q / BLOCK, k, BLOCK)."""
-    return np.ascontiguousarray(N.reshape(-1, BLOCK, N.shape[1]).transpose(0, 2, 1))
 
 
 def _grid(nodes: Array, spacing: float) -> tuple[Array, Array, Ints]:
@@ -184,40 +180,26 @@ def _with_smooth_neighbours(
     tangents = np.einsum("fai,qaj->fqij", nodes[faces], dN)
     normals = np.cross(tangents[..., 0], tangents[..., 1])
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)  # (f, 4, 3) at the corners
-    at_corner = {
-        (int(face), int(node)): normals[face, corner]
-        for face in range(len(faces))
-        for corner, node in enumerate(faces[face, :4])
-    }
-    of_edge: dict[tuple[int, int], list[int]] = {}
-    for face, corners in enumerate(faces[:, :4].tolist()):
-        for a, b in zip(corners, corners[1:] + corners[:1], strict=True):
-            of_edge.setdefault((min(a, b), max(a, b)), []).append(face)
+    corners = faces[:, :4]
+    edges = np.stack([corners, np.roll(corners, -1, axis=1)], axis=-1).reshape(-1, 2)
+    ends = np.stack([normals, np.roll(normals, -1, axis=1)], axis=2).reshape(-1, 2, 3)
+    ends[edges[:, 0] > edges[:, 1]] = ends[edges[:, 0] > edges[:, 1], ::-1]
+    _, number, count = np.unique(
+        np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    order = np.argsort(number.ravel(), kind="stable")
+    pairs = order[count[number.ravel()[order]] == 2].reshape(-1, 2)
+    smooth = (np.sum(ends[pairs[:, 0]] * ends[pairs[:, 1]], axis=-1) > SMOOTH).all(axis=1)
+    joined = pairs[smooth] // 4
     kept = accessible.copy()
-    for edge, pair in of_edge.items():
-        if len(pair) == 2 and accessible[pair].any():
-            smooth = all(
-                at_corner[pair[0], node] @ at_corner[pair[1], node] > SMOOTH for node in edge
-            )
-            kept[pair] |= smooth
+    kept[joined[accessible[joined].any(axis=1)]] = True
     return np.flatnonzero(kept)
 
 
 def room_for(surface: TipSurface, f: int) -> Touching:
     """Memory for what touches f faces of a surface."""
-    k = surface.faces.shape[1]
-    return Touching(
-        face=np.zeros(f, np.int32),
-        force=np.zeros((f, k, 3)),
-        stiffness=np.zeros((f, 3, 3, k, k)),
-        own=np.zeros((3, 3)),
-        touched=np.zeros(1, np.int64),
-        deepest=np.zeros(1),
-        at=np.zeros((k, 3)),
-        gap=np.zeros((4, BLOCK)),
-        row=np.zeros(k),
-        ends=np.zeros((4, surface.corner_shape.shape[1])),
-    )
+    k, ends = surface.corner_shape.shape
+    return room(Touching, f=f, k=k, block=BLOCK, ends=ends)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -300,7 +282,7 @@ def touch(tip, surface, near, x, moved, touching, wanted):
         Largest penetration.
     """
     count, energy, deepest = 0, 0.0, 0.0
-    at, ends, corner = touching.at, touching.ends, touching.ends[3]
+    at, ends, corner = touching.around, touching.ends, touching.ends[3]
     corners, reach = surface.corners, surface.reach
     touching.own[:] = 0.0
     for place in range(len(near)):
@@ -332,7 +314,8 @@ def _touch_block(tip, surface, face, block, touching, place, new, wanted):
 
     ``new`` faces have nothing at their place yet.
     """
-    radius, gap, areas, normals = tip.radius, touching.gap, surface.areas, surface.normals
+    radius, gap, row, areas = tip.radius, touching.gap, touching.row, surface.areas
+    normals = surface.normals
     energy = deepest = 0.0
     for q in range(BLOCK):
         if gap[3, q] >= radius * radius:
@@ -350,59 +333,28 @@ def _touch_block(tip, surface, face, block, touching, place, new, wanted):
         density, pressure, slope = penalty(tip, radius - distance)
         energy += area * density
         deepest = max(deepest, radius - distance)
-        n0, n1, n2 = y0 / distance, y1 / distance, y2 / distance
-        _press(surface.shape, block, q, area * pressure, n0, n1, n2, touching.force, place)
+        n = y0 / distance, y1 / distance, y2 / distance
+        for k in range(len(row)):
+            row[k] = surface.shape[block, k, q]
+            for i in range(3):
+                touching.force[place, k, i] += row[k] * area * pressure * n[i]
         if wanted > FORCE:
             across = -area * pressure / distance if wanted == STIFFNESS else 0.0
-            _stiffen(surface.shape, block, q, area * slope, across, n0, n1, n2, touching, place)
+            _stiffen(touching, place, n, area * slope, across)
     return energy, deepest
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _press(shape, block, q, push, n0, n1, n2, force, place):
-    """Share a point's force among the nodes of its face."""
-    for k in range(shape.shape[1]):
-        share = shape[block, k, q] * push
-        force[place, k, 0] += share * n0
-        force[place, k, 1] += share * n1
-        force[place, k, 2] += share * n2
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _stiffen(shape, block, q, along, across, n0, n1, n2, touching, place):
+def _stiffen(touching, place, n, along, across):
     """Add a point's second derivative to the upper blocks of its face's, and to the tip's own."""
-    K, own, steep = touching.stiffness, touching.own, along - across
-    h00, h01, h02 = steep * n0 * n0 + across, steep * n0 * n1, steep * n0 * n2
-    h11, h12, h22 = steep * n1 * n1 + across, steep * n1 * n2, steep * n2 * n2 + across
-    own[0, 0] += h00
-    own[1, 1] += h11
-    own[2, 2] += h22
-    own[0, 1] += h01
-    own[1, 0] += h01
-    own[0, 2] += h02
-    own[2, 0] += h02
-    own[1, 2] += h12
-    own[2, 1] += h12
     row = touching.row
-    for k in range(len(row)):
-        row[k] = shape[block, k, q]
-    for a in range(len(row)):
-        N = row[a]
-        for b in range(len(row)):
-            value = N * row[b]
-            K[place, 0, 0, a, b] += h00 * value
-            K[place, 0, 1, a, b] += h01 * value
-            K[place, 0, 2, a, b] += h02 * value
-            K[place, 1, 1, a, b] += h11 * value
-            K[place, 1, 2, a, b] += h12 * value
-            K[place, 2, 2, a, b] += h22 * value
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def reaction(touching, count, force):
-    """Write the tissue's force on the tool (3,) mN."""
-    force[:] = 0.0
-    for c in range(count):
-        for k in range(touching.force.shape[1]):
-            for i in range(3):
-                force[i] -= touching.force[c, k, i]
+    for i in range(3):
+        for j in range(3):
+            h = (along - across) * n[i] * n[j] + (across if i == j else 0.0)
+            touching.own[i, j] += h
+            if i <= j:
+                K = touching.stiffness[place, i, j]
+                for a in range(len(row)):
+                    value = h * row[a]
+                    for b in range(len(row)):
+                        K[a, b] += value * row[b]

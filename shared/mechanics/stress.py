@@ -38,99 +38,57 @@ class StressRecovery(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def nodal_von_mises(mesh, u, out):
+def nodal_von_mises(mesh, u, B, out):
     """Write the von Mises stress (nodes,) kPa of the displacement ``u`` (nodes, 3) mm to ``out``.
 
+    ``B`` (e, 6, 8) is that of ``mechanics.viscosity``, point index last; None without a past.
     Displacement gradients are summed in the precision of ``mesh.gradients``, which ``u`` shares.
     Never negative: extrapolation may undershoot near steep gradients, which is cut at zero.
     """
-    connectivity = mesh.connectivity
-    nodes = connectivity.shape[1]
-    flat = mesh.gradients.reshape(len(connectivity), nodes * 24)
+    flat = mesh.gradients.reshape(len(mesh.connectivity), -1)
     H, at_points = np.empty(72, flat.dtype), np.empty(8)
-    extrapolation = mesh.extrapolation
     out[:] = 0.0
-    for e in range(len(connectivity)):
-        H[:] = 0.0
-        for a in range(nodes):
-            node = connectivity[e, a]
-            x, y, z = u[node, 0], u[node, 1], u[node, 2]
-            gradients = flat[e, 24 * a : 24 * a + 24]
-            for k in range(24):
-                H[k] += x * gradients[k]
-                H[24 + k] += y * gradients[k]
-                H[48 + k] += z * gradients[k]
-        law = laws.at(mesh.law, e)
-        for q in range(8):
-            at_points[q] = laws.von_mises(law, add_identity(load(H, q, 8), 1.0))
+    for e in range(len(mesh.connectivity)):
+        _gradients(mesh.connectivity[e], flat[e], u, H)
+        law = mesh.law.at(e)
+        if B is None:
+            for q in range(8):
+                at_points[q] = laws.von_mises(law, add_identity(load(H, q, 8), 1.0))
+        else:
+            b = B[e].reshape(-1)
+            for q in range(8):
+                past = unpacked(load_packed(b, q, 8))
+                at_points[q] = viscosity.von_mises(law, add_identity(load(H, q, 8), 1.0), past)
         for corner in range(8):
             value = 0.0
             for q in range(8):
-                value += extrapolation[corner, q] * at_points[q]
-            out[connectivity[e, corner]] += max(value, 0.0)
-    _average(mesh, out)
+                value += mesh.extrapolation[corner, q] * at_points[q]
+            out[mesh.connectivity[e, corner]] += max(value, 0.0)
+    for node in range(len(mesh.elements_at)):
+        if mesh.elements_at[node] > 0.0:
+            out[node] /= mesh.elements_at[node]
+    for k in range(len(mesh.midsides)):
+        out[mesh.midsides[k, 0]] = 0.5 * (out[mesh.midsides[k, 1]] + out[mesh.midsides[k, 2]])
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
 def remember(mesh, u, share, B):
     """Add to ``B`` (e, 6, 8) what a displacement ``u`` (nodes, 3) mm of the past drives it to.
 
-    See ``mechanics.viscosity``: ``share (m - I)`` at the points; point index last.
+    See ``mechanics.viscosity``: ``share (m - I)`` at the points, or, where ``share`` is None, the
+    linear part of a small displacement that stands for all shares; point index last.
     """
-    nodes = mesh.connectivity.shape[1]
-    flat = mesh.gradients.reshape(len(mesh.connectivity), nodes * 24)
-    H = np.empty(72)
-    for e in range(len(mesh.connectivity)):
-        _gradients(mesh.connectivity[e], flat[e], u, H)
-        b = B[e].reshape(-1)
-        for q in range(8):
-            m = viscosity.driven(add_identity(load(H, q, 8), 1.0))
-            add_to_packed(share, m, b, q, 8)
-
-
-@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def remember_linearly(mesh, u, B):
-    """The same of a small displacement (mm) that stands for all shares."""
-    nodes = mesh.connectivity.shape[1]
-    flat = mesh.gradients.reshape(len(mesh.connectivity), nodes * 24)
+    flat = mesh.gradients.reshape(len(mesh.connectivity), -1)
     H = np.empty(72)
     for e in range(len(mesh.connectivity)):
         _gradients(mesh.connectivity[e], flat[e], u, H)
         b = B[e].reshape(-1)
         for q in range(8):
             G = load(H, q, 8)
-            add_to_packed(-1.0, packed(twice_deviator(G, trace(G) / 3.0)), b, q, 8)
-
-
-@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def nodal_von_mises_after(mesh, u, B, out):
-    """As ``nodal_von_mises`` of tissue with a past: ``B`` (e, 6, 8), point index last."""
-    nodes = mesh.connectivity.shape[1]
-    flat = mesh.gradients.reshape(len(mesh.connectivity), nodes * 24)
-    H, at_points = np.empty(72), np.empty(8)
-    out[:] = 0.0
-    for e in range(len(mesh.connectivity)):
-        _gradients(mesh.connectivity[e], flat[e], u, H)
-        b, law = B[e].reshape(-1), laws.at(mesh.law, e)
-        for q in range(8):
-            F, past = add_identity(load(H, q, 8), 1.0), unpacked(load_packed(b, q, 8))
-            at_points[q] = viscosity.von_mises(law, F, past)
-        for corner in range(8):
-            value = 0.0
-            for q in range(8):
-                value += mesh.extrapolation[corner, q] * at_points[q]
-            out[mesh.connectivity[e, corner]] += max(value, 0.0)
-    _average(mesh, out)
-
-
-@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def _average(mesh, out):
-    """Turn sums over elements at nodes into means, and set nodes on edges between theirs."""
-    for node in range(len(mesh.elements_at)):
-        if mesh.elements_at[node] > 0.0:
-            out[node] /= mesh.elements_at[node]
-    for k in range(len(mesh.midsides)):
-        out[mesh.midsides[k, 0]] = 0.5 * (out[mesh.midsides[k, 1]] + out[mesh.midsides[k, 2]])
+            if share is None:
+                add_to_packed(-1.0, packed(twice_deviator(G, trace(G) / 3.0)), b, q, 8)
+            else:
+                add_to_packed(share, viscosity.driven(add_identity(G, 1.0)), b, q, 8)
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)

@@ -145,31 +145,18 @@ def transposed(A):
 def dot(A, B):
     """``A B``."""
     return (
-        A[0] * B[0] + A[1] * B[3] + A[2] * B[6],
-        A[0] * B[1] + A[1] * B[4] + A[2] * B[7],
-        A[0] * B[2] + A[1] * B[5] + A[2] * B[8],
-        A[3] * B[0] + A[4] * B[3] + A[5] * B[6],
-        A[3] * B[1] + A[4] * B[4] + A[5] * B[7],
-        A[3] * B[2] + A[4] * B[5] + A[5] * B[8],
-        A[6] * B[0] + A[7] * B[3] + A[8] * B[6],
-        A[6] * B[1] + A[7] * B[4] + A[8] * B[7],
-        A[6] * B[2] + A[7] * B[5] + A[8] * B[8],
+        *_row_times(A[0], A[1], A[2], B),
+        *_row_times(A[3], A[4], A[5], B),
+        *_row_times(A[6], A[7], A[8], B),
     )
 
 
 @inline
-def add_dot(S, A, B):
-    """``S + A B``, summed from left to right."""
+def _row_times(a, b, c, B):
     return (
-        S[0] + A[0] * B[0] + A[1] * B[3] + A[2] * B[6],
-        S[1] + A[0] * B[1] + A[1] * B[4] + A[2] * B[7],
-        S[2] + A[0] * B[2] + A[1] * B[5] + A[2] * B[8],
-        S[3] + A[3] * B[0] + A[4] * B[3] + A[5] * B[6],
-        S[4] + A[3] * B[1] + A[4] * B[4] + A[5] * B[7],
-        S[5] + A[3] * B[2] + A[4] * B[5] + A[5] * B[8],
-        S[6] + A[6] * B[0] + A[7] * B[3] + A[8] * B[6],
-        S[7] + A[6] * B[1] + A[7] * B[4] + A[8] * B[7],
-        S[8] + A[6] * B[2] + A[7] * B[5] + A[8] * B[8],
+        a * B[0] + b * B[3] + c * B[6],
+        a * B[1] + b * B[4] + c * B[7],
+        a * B[2] + b * B[5] + c * B[8],
     )
 
 
@@ -205,10 +192,15 @@ def trace(A):
 @inline
 def cofactor(A):
     """``det A A^-T``."""
+    return _minors(A, A)
+
+
+@inline
+def _minors(A, B):
     return (
-        A[4] * A[8] - A[5] * A[7], A[5] * A[6] - A[3] * A[8], A[3] * A[7] - A[4] * A[6],
-        A[2] * A[7] - A[1] * A[8], A[0] * A[8] - A[2] * A[6], A[1] * A[6] - A[0] * A[7],
-        A[1] * A[5] - A[2] * A[4], A[2] * A[3] - A[0] * A[5], A[0] * A[4] - A[1] * A[3],
+        A[4] * B[8] - A[5] * B[7], A[5] * B[6] - A[3] * B[8], A[3] * B[7] - A[4] * B[6],
+        A[7] * B[2] - A[8] * B[1], A[8] * B[0] - A[6] * B[2], A[6] * B[1] - A[7] * B[0],
+        A[1] * B[5] - A[2] * B[4], A[2] * B[3] - A[0] * B[5], A[0] * B[4] - A[1] * B[3],
     )  # fmt: skip
 
 
@@ -221,17 +213,7 @@ def det(A, cofactors):
 @inline
 def cross(A, B):
     """Tensor cross product ``A x B``: the derivative of ``cofactor`` at A along B."""
-    return (
-        A[4] * B[8] - A[5] * B[7] + A[8] * B[4] - A[7] * B[5],
-        A[5] * B[6] - A[3] * B[8] + A[6] * B[5] - A[8] * B[3],
-        A[3] * B[7] - A[4] * B[6] + A[7] * B[3] - A[6] * B[4],
-        A[2] * B[7] - A[1] * B[8] + A[7] * B[2] - A[8] * B[1],
-        A[0] * B[8] - A[2] * B[6] + A[8] * B[0] - A[6] * B[2],
-        A[1] * B[6] - A[0] * B[7] + A[6] * B[1] - A[7] * B[0],
-        A[1] * B[5] - A[2] * B[4] + A[5] * B[1] - A[4] * B[2],
-        A[2] * B[3] - A[0] * B[5] + A[3] * B[2] - A[5] * B[0],
-        A[0] * B[4] - A[1] * B[3] + A[4] * B[0] - A[3] * B[1],
-    )
+    return add(_minors(A, B), _minors(B, A))
 
 
 @inline

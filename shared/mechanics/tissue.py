@@ -21,7 +21,7 @@ INVERTED = math.inf
 
 
 class Law(Protocol):
-    """Parameters of a law, arrays of many points; see ``mechanics.laws``."""
+    """Parameters of a law, arrays of many points, and what it does at one point."""
 
     @property
     def mu(self) -> Array:
@@ -33,6 +33,18 @@ class Law(Protocol):
 
     def at(self, i: Any) -> Any:
         """Parameters at one point, or at those of an index that NumPy understands."""
+
+    def first_piola(self, F: Any) -> Any:
+        """``J``, what ``energy`` needs besides, and the stress P (kPa), meaningless if J <= 0."""
+
+    def energy(self, J: Any, part: Any) -> Any:
+        """Energy density (kPa) at ``J > 0``; see ``first_piola``."""
+
+    def linearise(self, F: Any) -> Any:
+        """What ``increment`` needs of a state: a tensor and nine moduli (kPa), mu and lam first."""
+
+    def increment(self, state: Any, H: Any) -> Any:
+        """``A : H`` (kPa), linear in the moduli of the state."""
 
 
 class Tissue(Part):

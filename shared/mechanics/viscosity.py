@@ -46,7 +46,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from palpate.shared.mechanics.laws import first_piola
 from palpate.shared.mechanics.tensors import (
     FAST,
     add,
@@ -212,6 +211,6 @@ def add_tangent(F, B, mu, A):
 @njit(cache=True, error_model="numpy", forceinline=True)
 def von_mises(law, F, B):
     """Von Mises equivalent (kPa) of the Cauchy stress with its past; see ``overstress``."""
-    J, _, P = first_piola(law, F)
+    J, _, P = law.first_piola(F)
     _, Q = overstress(F, B, J, law.mu * isochoric(abs(J)))
     return equivalent(F, add(P, Q), J)

@@ -8,7 +8,7 @@ of the place.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -23,20 +23,16 @@ MAX_ACTIVE = 4
 class Active(NamedTuple):
     """Local models that answer; the slot of a model is that in which a caller remembers it."""
 
-    number: NDArray[np.int64]  # (MAX_ACTIVE,), -1 for a slot not in use
-    weight: Array  # (MAX_ACTIVE,)
-    gradient: Array  # (MAX_ACTIVE, 3) 1/mm, of the weights in the place
-    distance: Array  # (p,) mm^2, squared, of all centres
+    number: Annotated[NDArray[np.int64], "slots"]  # -1 for a slot not in use
+    weight: Annotated[Array, "slots"]
+    gradient: Annotated[Array, "slots, 3"]  # 1/mm, of the weights in the place
+    distance: Annotated[Array, "p"]  # mm^2, squared, of all centres
 
 
-def new_active(count: int) -> Active:
-    """Of so many local models."""
-    return Active(
-        np.full(MAX_ACTIVE, -1, np.int64),
-        np.zeros(MAX_ACTIVE),
-        np.zeros((MAX_ACTIVE, 3)),
-        np.zeros(count),
-    )
+@njit(cache=True, error_model="numpy", nogil=True)
+def _fading(excess):
+    """Weight of a model so many widths of blending farther away than the nearest."""
+    return (1.0 - excess) ** 2 * (1.0 + 2.0 * excess)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -64,18 +60,18 @@ def activate(centres, blend, x, held, active):
         number[slot] = k if k >= 0 and distance[k] < reach else -1
     for k in range(len(distance)):
         if distance[k] < reach:
-            free, known = -1, False
+            free = -1
             for slot in range(MAX_ACTIVE):
                 if number[slot] == k:
-                    known = True
-                elif number[slot] < 0 and free < 0:
+                    free = -1
+                    break
+                if number[slot] < 0 and free < 0:
                     free = slot
-            if not known and free >= 0:
+            if free >= 0:
                 number[free] = k
     for slot in range(MAX_ACTIVE):
         if number[slot] >= 0:
-            excess = (math.sqrt(distance[number[slot]]) - nearest) / blend
-            weight[slot] = (1.0 - excess) ** 2 * (1.0 + 2.0 * excess)
+            weight[slot] = _fading((math.sqrt(distance[number[slot]]) - nearest) / blend)
     weight /= weight.sum()
 
 
@@ -92,7 +88,7 @@ def weight_gradients(centres, blend, x, active):
         if k >= 0:
             own = math.sqrt(distance[k])
             excess = (own - least) / blend
-            whole += (1.0 - excess) ** 2 * (1.0 + 2.0 * excess)
+            whole += _fading(excess)
             for i in range(3):
                 away = (x[i] - centres[i, k]) / max(own, 1e-12)
                 away -= (x[i] - centres[i, nearest]) / max(least, 1e-12)

@@ -11,7 +11,7 @@ from numba import njit
 
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.sphere import HARDNESS
-from palpate.shared.reduced.problem import descend
+from palpate.shared.reduced.problem import newton_method
 
 TOLERANCE = 0.001
 """Residual before the last correction relative to the response, both in the energy norm of the
@@ -47,14 +47,12 @@ def solve_contact(problem, q, work, depth, tolerance, most):
     The tolerance is relative to the response, which is not known before; the depth says what it may
     be.
     """
-    tip = problem.load.tip
-    energy, smallest = newton.potential(problem, q, work[0])
-    status, iterations = newton.CONVERGED, 0
+    tip, iterations = problem.load.tip, 0
     least = _response(tip, SLIGHT * tip.radius)
     size = max(math.sqrt(np.dot(q, q)), _response(tip, depth), least)
     while True:
-        status, more, energy, smallest = descend(
-            problem, q, work, energy, smallest, tolerance * size, 0.0, most, False, ROUND_OFF
+        status, more, energy, smallest = newton_method(
+            problem, q, work, tolerance * size, 0.0, most, False, ROUND_OFF
         )
         iterations += more
         found = math.sqrt(np.dot(q, q))
@@ -71,7 +69,7 @@ def to_minimum(problem, q, work, depth, tolerance, most):
     """
     status, iterations, energy, smallest = solve_contact(problem, q, work, depth, tolerance, most)
     saddles = 0
-    while status == newton.CONVERGED and not newton.factorise(problem, q, 0.0):
+    while status == newton.CONVERGED and not problem.factorise(q, 0.0):
         saddles += 1
         if saddles > MOST_SADDLES or iterations >= most:
             return newton.STALLED, iterations, energy, smallest
@@ -84,12 +82,11 @@ def to_minimum(problem, q, work, depth, tolerance, most):
 @njit(cache=True, error_model="numpy", nogil=True)
 def _leave_saddle(problem, q, work):
     """Move q, a saddle, along the eigenvector of the least eigenvalue of the tangent."""
-    tangent = problem.correction.whole
-    K = np.tril(tangent)
-    K += np.tril(tangent, -1).T
+    tangent = problem.correction.work.whole
+    K = np.tril(tangent) + np.tril(tangent, -1).T
     down = NUDGE * math.sqrt(np.dot(q, q)) * np.linalg.eigh(K)[1][:, 0]
-    ahead, _ = newton.potential(problem, q + down, work[3])
-    back, _ = newton.potential(problem, q - down, work[3])
+    ahead, _ = problem.potential(q + down, work[3])
+    back, _ = problem.potential(q - down, work[3])
     q += down if ahead < back else -down
 
 

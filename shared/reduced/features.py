@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit
 
 CHANGING = 12
@@ -12,6 +13,22 @@ CHANGING = 12
 LOAD_FEATURES = (6 + 10) * 6
 TANGENT_FEATURES = 1 + (3 + 6) * 3
 CHANGES = CHANGING * (CHANGING + 1) // 2
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _along(frame, v):
+    """Components of a vector along the rows of a frame: the normal and two tangents."""
+    a = frame[0, 0] * v[0] + frame[0, 1] * v[1] + frame[0, 2] * v[2]
+    b = frame[1, 0] * v[0] + frame[1, 1] * v[1] + frame[1, 2] * v[2]
+    c = frame[2, 0] * v[0] + frame[2, 1] * v[1] + frame[2, 2] * v[2]
+    return a, b, c
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _from_centre(frame, centre, x):
+    """Position along the surface, mm from the centre."""
+    _, s, t = _along(frame, (x[0] - centre[0], x[1] - centre[1], x[2] - centre[2]))
+    return s, t
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -30,13 +47,7 @@ def load_features(frame, centre, x, load, out, of_tangent):
     of_tangent : ndarray, shape (TANGENT_FEATURES,), out
         1, and degree 1 and 2 in the load times degree 0 and 1 in the position.
     """
-    s = t = 0.0
-    for i in range(3):
-        s += frame[1, i] * (x[i] - centre[i])
-        t += frame[2, i] * (x[i] - centre[i])
-    a = frame[0, 0] * load[0] + frame[0, 1] * load[1] + frame[0, 2] * load[2]
-    b = frame[1, 0] * load[0] + frame[1, 1] * load[1] + frame[1, 2] * load[2]
-    c = frame[2, 0] * load[0] + frame[2, 1] * load[1] + frame[2, 2] * load[2]
+    (s, t), (a, b, c) = _from_centre(frame, centre, x), _along(frame, load)
     of_tangent[0] = 1.0
     k, n = 0, 1
     for degree in range(1, 4):
@@ -72,17 +83,33 @@ def residual_features(frame, centre, x, direction, share, out):
     tangential components of the unit direction, and the load's share of the largest trained
     pressure, as it is and its log.
     """
-    s = t = b = c = 0.0
-    for i in range(3):
-        s += frame[1, i] * (x[i] - centre[i])
-        t += frame[2, i] * (x[i] - centre[i])
-        b += frame[1, i] * direction[i]
-        c += frame[2, i] * direction[i]
+    (s, t), (_, b, c) = _from_centre(frame, centre, x), _along(frame, direction)
     share = min(max(share, LEAST_LOAD), 1.0)
     log = math.log(share)
     out[0], out[1], out[2], out[3], out[4], out[5] = 1.0, s, t, s * s, s * t, t * t
     out[6], out[7], out[8], out[9], out[10] = b, c, b * b, b * c, c * c
     out[11], out[12], out[13], out[14], out[15] = share, share**2, log, log * b, log * c
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def log_residual(solver, x, direction, share):
+    """Log of the residual in the full model that such answers leave, as trained."""
+    models, active, features = solver.models, solver.active, solver.scratch.residual_features
+    log = 0.0
+    for slot in range(len(active.number)):
+        k = active.number[slot]
+        if k >= 0:
+            centre = models.centres[:, k]
+            residual_features(models.frames[k], centre, x, direction, share, features)
+            log += active.weight[slot] * np.dot(models.residuals[k], features)
+    return log
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def estimate_errors(coefficients, features, errors):
+    """Estimated errors: ``log error = c . features``."""
+    for i in range(len(coefficients)):
+        errors[i] = math.exp(np.dot(coefficients[i], features))
 
 
 TIP_DEGREE = 3
@@ -94,10 +121,7 @@ TIP_FEATURES = 6 * TIP_DEGREE
 @njit(cache=True, error_model="numpy", nogil=True)
 def tip_features(frame, centre, x, depth, out):
     """Polynomials in the depth (degree 1-3) and the place along the surface (0-2), mm."""
-    s = t = 0.0
-    for i in range(3):
-        s += frame[1, i] * (x[i] - centre[i])
-        t += frame[2, i] * (x[i] - centre[i])
+    s, t = _from_centre(frame, centre, x)
     power = 1.0
     for degree in range(TIP_DEGREE):
         power *= depth

@@ -1,4 +1,4 @@
-"""What a compiled query writes: one array, so that an answer is kept by one copy."""
+"""What a compiled query reads and writes; its outcome is one array, kept by one copy."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.shared.geometry.surface import SurfaceIndex
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS
+from palpate.shared.reduced.blend import Active
 
 Array = NDArray[np.float64]
 Number = Any
@@ -62,3 +64,16 @@ def new_outcome() -> tuple[Array, Outcome]:
     numbers = [record[i : i + 1] for i in range(NUMBERS)]
     views = Outcome(*numbers, *(record[place] for place in ARRAYS))
     return record, views._replace(tangent=views.tangent.reshape(3, 3))
+
+
+class Solver(NamedTuple):
+    """All that a query reads, and all that it writes; made by ``reduced.workspace``."""
+
+    models: Any  # PressModels or TouchModels
+    surface: SurfaceIndex  # values at its vertices: the load range
+    coefficients: Array  # (2 or 3, features) of the error estimate: displacement, von Mises, force
+    past: Any  # Elastic or Remembering
+    active: Active
+    warm: Any  # PressWarm or TouchWarm
+    scratch: Any  # PressScratch or TouchScratch
+    outcome: Outcome

@@ -14,13 +14,14 @@ drive them to, with the linear part corrected to the exact means.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from palpate.shared.compiled import by_type
+from palpate.shared.compiled import methods, room
 from palpate.shared.mechanics import viscosity
 from palpate.shared.mechanics.viscosity import Weights
 from palpate.shared.reduced.blend import MAX_ACTIVE
@@ -29,12 +30,14 @@ from palpate.shared.reduced.points import (
     LANES,
     PAST_STATE,
     SYMMETRIC,
+    add_past_increments,
+    add_past_stress,
+    contract,
     drive_points,
-    multiply,
+    increments,
     predict_points,
     superpose,
 )
-from palpate.shared.reduced.terms import Elastic, Viscous, distance
 
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
@@ -52,21 +55,6 @@ class Memory(NamedTuple):
     share: Array  # (KNOTS, terms) weight of a knot in each mean; sums to 1
     points: Field  # (terms + 1, 6 c) histories of the cubature points, in tiles
     linear: Field  # (terms + 1, 6 c) minus their linear part: of 2 dev sym H
-
-
-class Remembering(NamedTuple):
-    """The past of all local models that answer, and working memory of a step."""
-
-    deviatoric: Field  # (p, r, r) D
-    records: Array  # (MAX_ACTIVE, n) of the models in their slots; advanced by a step
-    time: Weights  # of the step
-    mean: Array  # see ``terms.Viscous`` for these
-    exerted: Array
-    loss: Array
-    B: Field
-    S: Field
-    softer: Array
-    state: Field
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -92,6 +80,186 @@ def record_size(terms: int, modes: int, points: int) -> int:
     return modes * (1 + terms + KNOTS) + KNOTS * terms + (terms + 1) * SYMMETRIC * points
 
 
+@methods()
+class Elastic(NamedTuple):
+    """Tissue without a past, which does nothing; see ``Remembering``."""
+
+    in_time: bool = False
+
+    def begin_step(self, mu, k, slot):
+        """Nothing is known."""
+
+    def end_step(self, points, work, slot, q):
+        """Nothing is remembered."""
+
+    def last_answer(self, slot, q):
+        """The tissue itself is at rest."""
+        q[:] = 0.0
+
+    def recall(self, points, work):
+        """No stress, no energy."""
+        return 0.0
+
+    def soften(self, q, residual):
+        """No force, no energy."""
+        return 0.0
+
+    def soften_tangent(self, bulk, tangent):
+        """``tangent = bulk``."""
+        tangent[:] = bulk
+
+    def form_products(self, points, H, work):
+        """Write the change of the points' stress with every mode, see ``corrections.Tangent``."""
+        increments(points.law, work.state, points.gradients, work.products)
+
+    def has_moved(self, formed, size, lag):
+        """There is nothing to move."""
+        return False
+
+    def note(self, formed):
+        """There is nothing to note."""
+
+    def external_force(self, load, external, origin):
+        """Write the load (r,); return its size."""
+        external[:] = load
+        return math.sqrt(np.dot(load, load))
+
+    def follow(self, inverse, q, before, change, start):
+        """There is no force to follow."""
+
+    def note_force(self, before):
+        """There is no force to note."""
+
+
+class Step(NamedTuple):
+    """What the past does at the end of a time step, and working memory; see ``problem``."""
+
+    model: Annotated[NDArray[np.int64], "1"]  # that it is known of
+    mean: Annotated[Array, "r"]  # h
+    exerted: Annotated[Array, "r"]  # D h
+    loss: Annotated[Array, "1"]  # l
+    B: Annotated[Field, "6 c"]  # in tiles, what the past drives the points to
+    S: Annotated[Field, "6 c"]  # in tiles, kPa, the linear part of it
+    softer: Annotated[Array, "r"]  # D q of the last evaluation
+    state: Annotated[Field, "state"]  # see ``points.add_past_increments``
+
+
+@methods()
+class Remembering(NamedTuple):
+    """The past of all local models that answer, as a term of the potential of one at a time."""
+
+    deviatoric: Field  # (p, r, r) D
+    records: Array  # (MAX_ACTIVE, n) of the models in their slots; advanced by a step
+    time: Weights  # of the step
+    step: Step
+    in_time: bool = True
+
+    def begin_step(self, mu, k, slot):
+        """Find what is known of a step of model k before it is solved."""
+        memory, time, step = memory_of(self, slot), self.time, self.step
+        step.mean[:] = 0.0
+        for a in range(len(time.share)):
+            kept, old = time.share[a] * time.decay[a], time.share[a] * time.old[a]
+            for i in range(len(step.mean)):
+                step.mean[i] += kept * memory.mean[a, i] + old * memory.q[i]
+        step.loss[0] = predict_points(memory.points, memory.linear, time, mu, step.B, step.S)
+        superpose(self.deviatoric[k], step.mean, step.exerted)
+        step.model[0] = k
+
+    def end_step(self, points, work, slot, q):
+        """Take the memory of a slot to the end of a step that ``q`` is the answer of."""
+        memory, time, driven, linear = memory_of(self, slot), self.time, self.step.B, self.step.S
+        if not np.array_equal(q, work.latest):  # the last evaluation was of another state
+            points.strain(q, work.stepped, work.H)
+        drive_points(work.H, driven, linear)
+        viscosity.advance(driven, time, memory.points)
+        viscosity.advance(linear, time, memory.linear)
+        for a in range(len(time.share)):
+            mean = memory.mean[a]
+            for i in range(len(q)):
+                mean[i] = time.decay[a] * mean[i] + time.old[a] * memory.q[i] + time.new[a] * q[i]
+        memory.q[:] = q
+        _add_knot(memory, time)
+
+    def last_answer(self, slot, q):
+        """Write the last answer that the tissue itself remembers."""
+        q[:] = self.records[slot, : len(q)]
+
+    def recall(self, points, work):
+        """Add what is beyond linear visco-elasticity to the stress; return its energy."""
+        # the parts of the elastic energy have served; their room is that of the past's
+        add_past_stress(
+            work.H, points.weights, points.law.mu, work.J, self.step.B, self.step.S,
+            self.step.loss[0], work.part, work.P,
+        )  # fmt: skip
+        return np.dot(points.weights, work.part)
+
+    def soften(self, q, residual):
+        """Add linear visco-elasticity to the residual; return its energy."""
+        step, energy = self.step, 0.0
+        superpose(self.deviatoric[step.model[0]], q, step.softer)
+        for i in range(len(q)):
+            lost = step.loss[0] * step.softer[i]
+            residual[i] -= lost + step.exerted[i]
+            energy -= (0.5 * lost + step.exerted[i]) * q[i]
+        return energy
+
+    def soften_tangent(self, bulk, tangent):
+        """``tangent = bulk - l D``."""
+        _subtract(bulk, self.step.loss[0], self.deviatoric[self.step.model[0]], tangent)
+
+    def form_products(self, points, H, work):
+        """Write the change of the points' stress with every mode, see ``corrections.Tangent``.
+
+        In training a tangent may have fewer points than the residual, of which no past is known.
+        """
+        if len(self.step.B) * 9 != len(H) * 6:
+            increments(points.law, work.state, points.gradients, work.products)
+            return
+        # there are more modes than components of a gradient, so the moduli of the points come first
+        increments(points.law, work.state, work.units, work.moduli)
+        add_past_increments(
+            H, self.step.B, points.weights, points.law.mu, self.step.loss[0], work.units,
+            self.step.state, work.moduli,
+        )  # fmt: skip
+        contract(work.moduli, points.gradients, work.products)
+
+    def has_moved(self, formed, size, lag):
+        """Whether the past differs by more than ``lag`` from ``formed`` (2, r)."""
+        moved, mean = 0.0, self.step.mean
+        for j in range(len(mean)):
+            moved += (mean[j] - formed[0, j]) ** 2
+        return not (moved <= lag**2 * size and abs(self.step.loss[0] - formed[1, 0]) <= lag)
+
+    def note(self, formed):
+        """Write the past at which a tangent is formed (2, r)."""
+        formed[0], formed[1, 0] = self.step.mean, self.step.loss[0]
+
+    def external_force(self, load, external, origin):
+        """Write load and past (r,); return their size.  Secants of another past are of no use."""
+        size, exerted = 0.0, self.step.exerted
+        for i in range(len(load)):
+            external[i] = load[i] + exerted[i]
+            size += max(load[i] ** 2, exerted[i] ** 2)
+        origin[:] = np.nan
+        return math.sqrt(size)
+
+    def follow(self, inverse, q, before, change, start):
+        """Move a start by what the force of the past on linear tissue has changed since."""
+        step = self.step
+        superpose(self.deviatoric[step.model[0]], q, step.softer)
+        for i in range(len(q)):
+            change[i] = step.exerted[i] + step.loss[0] * step.softer[i] - before[i]
+        superpose(inverse, change, step.softer)
+        for i in range(len(q)):
+            start[i] += step.softer[i]
+
+    def note_force(self, before):
+        """Write the force of the past on linear tissue in the state of the last evaluation."""
+        for i in range(len(before)):
+            before[i] = self.step.exerted[i] + self.step.loss[0] * self.step.softer[i]
+
+
 def remembering(deviatoric: Field, terms: int, points: int) -> Remembering:
     """Of local models with so many points each, for a Prony series of so many terms."""
     modes = deviatoric.shape[1]
@@ -99,87 +267,24 @@ def remembering(deviatoric: Field, terms: int, points: int) -> Remembering:
         deviatoric=deviatoric,
         records=np.zeros((MAX_ACTIVE, record_size(terms, modes, points))),
         time=Weights(*np.zeros((4, terms))),
-        mean=np.zeros(modes),
-        exerted=np.zeros(modes),
-        loss=np.zeros(1),
-        B=np.zeros(SYMMETRIC * points, np.float32),
-        S=np.zeros(SYMMETRIC * points, np.float32),
-        softer=np.zeros(modes),
-        state=np.zeros(PAST_STATE * LANES, np.float32),
+        step=room(Step, r=modes, c=points, state=PAST_STATE * LANES),
     )
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _memory(past, slot):
-    terms, modes, points = len(past.time.share), len(past.mean), len(past.B) // SYMMETRIC
-    return opened(past.records[slot], terms, modes, points)
+def memory_of(past, slot):
+    """What is remembered in a slot."""
+    terms, modes = len(past.time.share), len(past.step.mean)
+    return opened(past.records[slot], terms, modes, len(past.step.B) // SYMMETRIC)
 
 
-# --- a time step ---------------------------------------------------------------------------------
-
-
-def begin_step(past, mu, k, slot):
-    """Term of the potential at the end of a step: what is known before it is solved."""
-
-
-def _begin_elastic(past, mu, k, slot):
-    return past
-
-
-def _begin_step(past, mu, k, slot):
-    memory, time, mean = _memory(past, slot), past.time, past.mean
-    mean[:] = 0.0
-    for a in range(len(time.share)):
-        kept, old = time.share[a] * time.decay[a], time.share[a] * time.old[a]
-        for i in range(len(mean)):
-            mean[i] += kept * memory.mean[a, i] + old * memory.q[i]
-    past.loss[0] = predict_points(memory.points, memory.linear, time, mu, past.B, past.S)
-    multiply(past.deviatoric[k], mean, past.exerted)
-    return Viscous(
-        past.deviatoric[k], mean, past.exerted, past.loss, past.B, past.S, past.softer, past.state
-    )
-
-
-def end_step(past, points, work, slot, q):
-    """Take the memory of a slot to the end of a step that ``q`` is the answer of."""
-
-
-def _end_elastic(past, points, work, slot, q):
-    pass
-
-
-def _end_step(past, points, work, slot, q):
-    memory, time = _memory(past, slot), past.time
-    if distance(q, work.latest) > 0.0:  # the last evaluation was of another state
-        for i in range(len(q)):
-            work.stepped[i] = q[i] * points.steps[i]
-        superpose(points.gradients, work.stepped, work.H)
-    drive_points(work.H, past.B, past.S)
-    viscosity.advance(past.B, time, memory.points)
-    viscosity.advance(past.S, time, memory.linear)
-    for a in range(len(time.share)):
-        mean = memory.mean[a]
-        for i in range(len(q)):
-            mean[i] = time.decay[a] * mean[i] + time.old[a] * memory.q[i] + time.new[a] * q[i]
-    memory.q[:] = q
-    _add_knot(memory, time)
-
-
-def last_answer(past, slot, q):
-    """Write the last answer that the tissue itself remembers; zero for one without a past."""
-
-
-def _no_last_answer(past, slot, q):
-    q[:] = 0.0
-
-
-def _last_answer(past, slot, q):
-    q[:] = past.records[slot, : len(q)]
-
-
-by_type(begin_step, {Elastic: _begin_elastic, Remembering: _begin_step})
-by_type(end_step, {Elastic: _end_elastic, Remembering: _end_step})
-by_type(last_answer, {Elastic: _no_last_answer, Remembering: _last_answer})
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def _subtract(A, factor, D, out):
+    """``out = A - factor D``: A, out (r, r) float64, D (r, r) float32."""
+    for i in range(len(A)):
+        a, d, o = A[i], D[i], out[i]
+        for j in range(len(a)):
+            o[j] = a[j] - factor * d[j]
 
 
 # --- the path of answers -------------------------------------------------------------------------
@@ -189,62 +294,51 @@ by_type(last_answer, {Elastic: _no_last_answer, Remembering: _last_answer})
 def _add_knot(memory, time):
     """Append the last answer to the knots; two of the others become one."""
     knots, share = memory.knots, memory.share
-    last = len(knots) - 1
-    for a in range(share.shape[1]):
-        for j in range(last + 1):
+    last, terms = KNOTS - 1, share.shape[1]
+    for a in range(terms):
+        for j in range(KNOTS):
             share[j, a] *= time.decay[a]
         share[last, a] += time.old[a]
     best, least, ratio = 0, np.inf, 1.0
     for j in range(last):
-        x, y = 0.0, 0.0
-        for a in range(share.shape[1]):
+        x = y = distance = 0.0
+        for a in range(terms):
             x += time.share[a] * share[j, a]
             y += time.share[a] * share[j + 1, a]
-        apart = 0.0
         for i in range(knots.shape[1]):
-            apart += (knots[j, i] - knots[j + 1, i]) ** 2
-        cost = x * y / (x + y) * apart if x * y > 0.0 else 0.0
+            distance += (knots[j, i] - knots[j + 1, i]) ** 2
+        cost = x * y / (x + y) * distance if x * y > 0.0 else 0.0
         if cost < least:
             best, least, ratio = j, cost, (y / (x + y) if x + y > 0.0 else 1.0)
     for i in range(knots.shape[1]):
         knots[best, i] += ratio * (knots[best + 1, i] - knots[best, i])
-    for a in range(share.shape[1]):
+    for a in range(terms):
         share[best, a] += share[best + 1, a]
     for j in range(best + 1, last):
         knots[j] = knots[j + 1]
         share[j] = share[j + 1]
     knots[last] = memory.q
-    for a in range(share.shape[1]):
+    for a in range(terms):
         share[last, a] = time.new[a]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def recall_points(points, work, past, slot):
     """Give the points of the model in a slot the history that its knots and means tell."""
-    memory = _memory(past, slot)
-    histories, linear, mean = memory.points, memory.linear, memory.mean
-    knots, share = memory.knots, memory.share
-    driven, straight = past.B, past.S
-    terms = len(mean)
+    memory, driven, straight = memory_of(past, slot), past.step.B, past.step.S
+    histories, linear, share = memory.points, memory.linear, memory.share
+    terms = len(memory.mean)
     histories[:] = np.float32(0.0)
     linear[:] = np.float32(0.0)
-    for j in range(len(knots)):
-        _drive(points, work, knots[j], driven, straight)
+    for j in range(KNOTS):
+        points.strain(memory.knots[j], work.stepped, work.H)
+        drive_points(work.H, driven, straight)
         for a in range(terms):
             histories[a] += np.float32(share[j, a]) * driven
             linear[a] += np.float32(share[j, a]) * straight
-    histories[terms] = driven
-    linear[terms] = straight
+    histories[terms], linear[terms] = driven, straight
     for a in range(terms):
-        _drive(points, work, mean[a], driven, straight)
+        points.strain(memory.mean[a], work.stepped, work.H)
+        drive_points(work.H, driven, straight)
         histories[a] -= straight - linear[a]
         linear[a] = straight
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _drive(points, work, q, driven, straight):
-    """What a state (r,) drives the points to."""
-    for i in range(len(q)):
-        work.stepped[i] = q[i] * points.steps[i]
-    superpose(points.gradients, work.stepped, work.H)
-    drive_points(work.H, driven, straight)

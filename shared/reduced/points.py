@@ -13,7 +13,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from palpate.shared.mechanics import laws, tissue, viscosity
+from palpate.shared.compiled import methods
+from palpate.shared.mechanics import tissue, viscosity
 from palpate.shared.mechanics.tensors import (
     FAST,
     SYMMETRIC,
@@ -21,7 +22,9 @@ from palpate.shared.mechanics.tensors import (
     add_identity,
     cofactor,
     combine,
+    constant,
     det,
+    inline,
     isochoric,
     load,
     load_packed,
@@ -45,34 +48,39 @@ LANES = 16
 TILE = 9 * LANES
 
 STATE = 18
-"""Numbers that describe the tangent at a point: see ``laws.linearise``."""
+"""Numbers that describe the tangent at a point: see ``mechanics.tissue.Law``."""
 
 PAST_STATE = 26
 """Numbers that describe the tangent of the past at a point."""
 
 
+@methods()
 class Points(NamedTuple):
-    """Cubature points of a local model; points of no weight fill up the last tile."""
+    """Cubature points of a local model, or of p of them, which comes first in all shapes.
+
+    Points of no weight fill up the last tile.
+    """
 
     gradients: Any  # (r, 9 c) in tiles, float32 or int16, in units of the steps
     steps: Field  # (r,) 1/mm
     weights: Array  # (c,) mm^3
     law: Law  # (c,)
 
+    def of(self, k):
+        """Points of local model k."""
+        return Points(self.gradients[k], self.steps[k], self.weights[k], self.law.at(k))
 
-class PointTables(NamedTuple):
-    """Cubature points of all local models; see ``points.Points``."""
-
-    gradients: Any  # (p, r, 9 c)
-    steps: Field  # (p, r)
-    weights: Array  # (p, c)
-    law: Law  # (p, c)
+    def strain(self, q, stepped, H):
+        """Write the displacement gradient (9 c,) in the state q (r,); ``stepped`` is scratch."""
+        for i in range(len(q)):
+            stepped[i] = q[i] * self.steps[i]
+        superpose(self.gradients, stepped, H)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def points_of(tables, k):
-    """Points of local model k."""
-    return Points(tables.gradients[k], tables.steps[k], tables.weights[k], laws.at(tables.law, k))
+@inline
+def _tile(values, tile, components):
+    """A tile of points with so many components each."""
+    return values[components * LANES * tile : components * LANES * (tile + 1)]
 
 
 # --- vector code ---------------------------------------------------------------------------------
@@ -81,17 +89,17 @@ def points_of(tables, k):
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
 def superpose(rows, coefficients, out):
-    """``out = coefficients @ rows``: rows (4 k, n) int16 or float32, out (n,) float32."""
+    """``out = coefficients @ rows`` in the precision of out (n,): rows (4 k, n) of any type."""
     for i in range(len(out)):
-        out[i] = np.float32(0.0)
+        out[i] = constant(0.0, out[i])
     for j in range(0, len(rows), 4):
-        a, b = np.float32(coefficients[j]), np.float32(coefficients[j + 1])
-        c, d = np.float32(coefficients[j + 2]), np.float32(coefficients[j + 3])
+        a, b = constant(coefficients[j], out[0]), constant(coefficients[j + 1], out[0])
+        c, d = constant(coefficients[j + 2], out[0]), constant(coefficients[j + 3], out[0])
         p, q, r, s = rows[j], rows[j + 1], rows[j + 2], rows[j + 3]
         for i in range(len(out)):
             out[i] += (
-                a * np.float32(p[i]) + b * np.float32(q[i])
-                + c * np.float32(r[i]) + d * np.float32(s[i])
+                a * constant(p[i], out[i]) + b * constant(q[i], out[i])
+                + c * constant(r[i], out[i]) + d * constant(s[i], out[i])
             )  # fmt: skip
 
 
@@ -111,32 +119,20 @@ def project(rows, vector, out):
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def multiply(A, x, out):
-    """``out = A x``: A (4 k, 4 k), symmetric; x, out (4 k,)."""
-    for i in range(len(out)):
-        out[i] = 0.0
-    for j in range(0, len(A), 4):
-        a, b, c, d = x[j], x[j + 1], x[j + 2], x[j + 3]
-        p, q, r, s = A[j], A[j + 1], A[j + 2], A[j + 3]
-        for i in range(len(out)):
-            out[i] += a * p[i] + b * q[i] + c * r[i] + d * s[i]
-
-
-@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
 def nonlinear_stress(H, weights, law, J, part, linear, P):
     """What the stress adds to that of linear elasticity, times weight, at all points in tiles.
 
-    ``H`` (9 c,) is the displacement gradient.  Also what ``laws.energy`` needs, and the energy
+    ``H`` (9 c,) is the displacement gradient.  Also what ``Law.energy`` needs, and the energy
     density of linear elasticity, point by point.
     """
     for tile in range(len(weights) // LANES):
-        h, p = H[TILE * tile : TILE * (tile + 1)], P[TILE * tile : TILE * (tile + 1)]
-        own = slice(LANES * tile, LANES * (tile + 1))
-        w, tissues, j, t, e = weights[own], laws.at(law, own), J[own], part[own], linear[own]
+        h, p, w = _tile(H, tile, 9), _tile(P, tile, 9), _tile(weights, tile, 1)
+        j, t, e = _tile(J, tile, 1), _tile(part, tile, 1), _tile(linear, tile, 1)
+        tissues = law.at(slice(LANES * tile, LANES * (tile + 1)))
         for c in range(LANES):
-            G, point = load(h, c, LANES), laws.at(tissues, c)
+            G, point = load(h, c, LANES), tissues.at(c)
             e[c], L = tissue.rest_stress(G, point.mu, point.lam)
-            j[c], t[c], S = laws.first_piola(point, add_identity(G, 1.0))
+            j[c], t[c], S = point.first_piola(add_identity(G, 1.0))
             store(scale(w[c], subtract(S, L)), p, c, LANES)
 
 
@@ -144,13 +140,10 @@ def nonlinear_stress(H, weights, law, J, part, linear, P):
 def linearise(H, weights, law, state):
     """What ``increments`` needs, in tiles of ``STATE`` components; moduli times weight."""
     for tile in range(len(weights) // LANES):
-        h = H[TILE * tile : TILE * (tile + 1)]
-        s = state[STATE * LANES * tile : STATE * LANES * (tile + 1)]
-        own = slice(LANES * tile, LANES * (tile + 1))
-        w, tissues = weights[own], laws.at(law, own)
+        h, s, w = _tile(H, tile, 9), _tile(state, tile, STATE), _tile(weights, tile, 1)
+        tissues = law.at(slice(LANES * tile, LANES * (tile + 1)))
         for c in range(LANES):
-            F = add_identity(load(h, c, LANES), 1.0)
-            tensor, moduli = laws.linearise(laws.at(tissues, c), F)
+            tensor, moduli = tissues.at(c).linearise(add_identity(load(h, c, LANES), 1.0))
             store(tensor, s, c, LANES)
             store(scale(w[c], moduli), s, 9 * LANES + c, LANES)
 
@@ -159,13 +152,12 @@ def linearise(H, weights, law, state):
 def increments(law, state, gradients, out):
     """Tangent less that at rest, times the gradient of every mode: (m, 9 c) in tiles."""
     for tile in range(gradients.shape[1] // TILE):
-        s = state[STATE * LANES * tile : STATE * LANES * (tile + 1)]
+        s = _tile(state, tile, STATE)
         for mode in range(len(gradients)):
-            h = gradients[mode, TILE * tile : TILE * (tile + 1)]
-            d = out[mode, TILE * tile : TILE * (tile + 1)]
+            h, d = _tile(gradients[mode], tile, 9), _tile(out[mode], tile, 9)
             for c in range(LANES):
                 G, moduli = load(h, c, LANES), load(s, 9 * LANES + c, LANES)
-                D = laws.increment(law, (load(s, c, LANES), moduli), G)
+                D = law.increment((load(s, c, LANES), moduli), G)
                 store(subtract(D, tissue.rest_stress(G, moduli[0], moduli[1])[1]), d, c, LANES)
 
 
@@ -220,13 +212,23 @@ def added_energy(weights, law, J, part, linear):
     """Energy that the tissue law adds to linear elasticity's, after ``nonlinear_stress``."""
     energy = 0.0
     for c in range(len(weights)):
-        energy += weights[c] * (laws.energy(laws.at(law, c), J[c], part[c]) - linear[c])
+        energy += weights[c] * (law.at(c).energy(J[c], part[c]) - linear[c])
     return energy
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def distance(q, other):
+    """Squared distance of a state from another, relative to its size."""
+    size = total = 0.0
+    for j in range(len(q)):
+        size += q[j] * q[j]
+        total += (q[j] - other[j]) ** 2
+    return total / max(size, 1e-12)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def back_substitute(L, x):
-    """Solve ``L L^T x = x`` in place."""
+    """Solve ``L L^T x = x`` in place: x (m,), or (m, n) for n right-hand sides."""
     m = len(x)
     for i in range(m):
         total = x[i]
@@ -314,9 +316,7 @@ def predict_points(history, linear, weights, mu, B, S):
     loss = viscosity.predict(history, weights, B)
     viscosity.predict(linear, weights, S)
     for tile in range(len(mu) // LANES):
-        b = B[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
-        s = S[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
-        m = mu[LANES * tile : LANES * (tile + 1)]
+        b, s, m = _tile(B, tile, SYMMETRIC), _tile(S, tile, SYMMETRIC), _tile(mu, tile, 1)
         for c in range(3 * LANES):
             b[c] -= np.float32(loss)
         for i in range(SYMMETRIC):
@@ -332,12 +332,9 @@ def add_past_stress(H, weights, mu, J, B, S, loss, energy, P):
     ``energy`` (c,) is overwritten with its energy density (kPa), but for a constant.
     """
     for tile in range(len(weights) // LANES):
-        h, p = H[TILE * tile : TILE * (tile + 1)], P[TILE * tile : TILE * (tile + 1)]
-        b = B[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
-        s = S[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
-        at = LANES * tile
-        w, m, j = weights[at : at + LANES], mu[at : at + LANES], J[at : at + LANES]
-        e = energy[at : at + LANES]
+        h, p, w = _tile(H, tile, 9), _tile(P, tile, 9), _tile(weights, tile, 1)
+        b, s, m = _tile(B, tile, SYMMETRIC), _tile(S, tile, SYMMETRIC), _tile(mu, tile, 1)
+        j, e = _tile(J, tile, 1), _tile(energy, tile, 1)
         for c in range(LANES):
             G = load(h, c, LANES)
             past = unpacked(load_packed(b, c, LANES))
@@ -363,9 +360,7 @@ def drive_points(H, m, linear):
     ``linear`` (6 c,) is ``2 dev sym H``, minus its linear part.
     """
     for tile in range(len(H) // TILE):
-        h = H[TILE * tile : TILE * (tile + 1)]
-        d = m[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
-        e = linear[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)]
+        h, d, e = _tile(H, tile, 9), _tile(m, tile, SYMMETRIC), _tile(linear, tile, SYMMETRIC)
         for c in range(LANES):
             G = load(h, c, LANES)
             store_packed(viscosity.driven(add_identity(G, 1.0)), d, c, LANES)
@@ -377,48 +372,29 @@ def add_past_increments(H, B, weights, mu, loss, gradients, state, out):
     """Add the tangent of ``add_past_stress`` times the gradient of every mode: (m, 9 c) in tiles.
 
     That is ``viscosity.increment``, and ``2 mu loss dev sym h`` less of the linear part.
+    ``state`` (PAST_STATE * LANES,) is scratch.
     """
     for tile in range(len(weights) // LANES):
-        _past_state(
-            H[TILE * tile : TILE * (tile + 1)],
-            B[SYMMETRIC * LANES * tile : SYMMETRIC * LANES * (tile + 1)],
-            weights[LANES * tile : LANES * (tile + 1)],
-            mu[LANES * tile : LANES * (tile + 1)],
-            loss,
-            state,
-        )
+        h, b = _tile(H, tile, 9), _tile(B, tile, SYMMETRIC)
+        w, m = _tile(weights, tile, 1), _tile(mu, tile, 1)
+        for c in range(LANES):
+            F = add_identity(load(h, c, LANES), 1.0)
+            modulus = m[c] * isochoric(det(F, cofactor(F)))
+            past = unpacked(load_packed(b, c, LANES))
+            G, FB, past, third = viscosity.linearise(F, past, w[c] * modulus)
+            store(G, state, c, LANES)
+            store(FB, state, 9 * LANES + c, LANES)
+            store_packed(packed(past), state, 18 * LANES + c, LANES)
+            state[24 * LANES + c], state[25 * LANES + c] = third, loss * w[c] * m[c]
         for mode in range(len(gradients)):
-            g = gradients[mode, TILE * tile : TILE * (tile + 1)]
-            d = out[mode, TILE * tile : TILE * (tile + 1)]
+            g, d = _tile(gradients[mode], tile, 9), _tile(out[mode], tile, 9)
             for c in range(LANES):
-                G = load(g, c, LANES)
-                D = viscosity.increment(
-                    load(state, c, LANES),
-                    load(state, 9 * LANES + c, LANES),
-                    unpacked(load_packed(state, 18 * LANES + c, LANES)),
-                    state[24 * LANES + c],
-                    G,
-                )
-                linear = twice_deviator(G, trace(G) / np.float32(3.0))
-                D = add(scale(state[25 * LANES + c], linear), D)
-                store(add(load(d, c, LANES), D), d, c, LANES)
-
-
-@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def _past_state(h, b, w, m, loss, s):
-    """What ``_add_past_increments`` needs of a tile: ``viscosity.linearise`` and ``loss mu``.
-
-    ``w`` and ``m`` are weights and shear moduli of its points.
-    """
-    for c in range(LANES):
-        F = add_identity(load(h, c, LANES), 1.0)
-        modulus = m[c] * isochoric(det(F, cofactor(F)))
-        past = unpacked(load_packed(b, c, LANES))
-        G, FB, past, third = viscosity.linearise(F, past, w[c] * modulus)
-        store(G, s, c, LANES)
-        store(FB, s, 9 * LANES + c, LANES)
-        store_packed(packed(past), s, 18 * LANES + c, LANES)
-        s[24 * LANES + c], s[25 * LANES + c] = third, loss * w[c] * m[c]
+                G, FB = load(g, c, LANES), load(state, 9 * LANES + c, LANES)
+                past = unpacked(load_packed(state, 18 * LANES + c, LANES))
+                third, lost = state[24 * LANES + c], state[25 * LANES + c]
+                D = viscosity.increment(load(state, c, LANES), FB, past, third, G)
+                linear = scale(lost, twice_deviator(G, trace(G) / np.float32(3.0)))
+                store(add(load(d, c, LANES), add(linear, D)), d, c, LANES)
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc"})

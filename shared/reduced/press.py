@@ -21,31 +21,22 @@ array of mesh size is touched to solve a query.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from palpate.shared.compiled import bind_compiled, by_type
-from palpate.shared.geometry.surface import SurfaceIndex, locate
+from palpate.shared.compiled import bind_compiled
+from palpate.shared.geometry.surface import locate
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import SurfaceQuadrature, footprint, pressure_limit
-from palpate.shared.reduced.blend import MAX_ACTIVE, Active, activate
+from palpate.shared.reduced.blend import MAX_ACTIVE, activate
 from palpate.shared.reduced.corrections import Secants, forget_secants
-from palpate.shared.reduced.features import load_features, residual_features
-from palpate.shared.reduced.outcome import Outcome
-from palpate.shared.reduced.past import Remembering, begin_step, end_step, last_answer
-from palpate.shared.reduced.points import (
-    FAST,
-    PointTables,
-    cholesky,
-    multiply,
-    points_of,
-    superpose,
-)
-from palpate.shared.reduced.problem import Problem, Work, descend
-from palpate.shared.reduced.terms import Dead, Elastic, Viscous
+from palpate.shared.reduced.features import estimate_errors, load_features, log_residual
+from palpate.shared.reduced.points import FAST, Points, back_substitute, cholesky, superpose
+from palpate.shared.reduced.problem import Problem, Work, newton_method
+from palpate.shared.reduced.terms import Dead
 
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
@@ -74,15 +65,11 @@ class PressModels(NamedTuple):
     centres: Array  # (3, p) mm
     frames: Array  # (p, 3, 3) rows: outward normal and two tangents at the centre
     pressures: Array  # (p,) kPa, scale of the load there
-    points: PointTables
+    points: Points
     node_from: Ints  # (p + 1,)
     modes: Field  # (s, 3 r) modes, axis by axis, at the nodes that a footprint can load
     face_from: Ints  # (p + 1,)
-    face_points: Array  # (g, 3)
-    face_normals: Array  # (g, 3)
-    face_areas: Array  # (g,)
-    face_nodes: NDArray[np.int32]  # (g, k), counted from the model's first node
-    face_shape: Array  # (g, k)
+    faces: SurfaceQuadrature  # nodes counted from the model's first
     defect: Field  # (p, LOAD_FEATURES, r) mN, force that the points miss
     guess: Field  # (p, LOAD_FEATURES, r) equilibrium less the linear response
     directions: Field  # (p, CHANGING, r) orthonormal, in which the tangent changes
@@ -90,55 +77,42 @@ class PressModels(NamedTuple):
     residuals: Array  # (p, RESIDUAL_FEATURES) log of the residual, by ``residual_features``
     blend: float  # mm, excess distance over the nearest centre at which a model fades out
     tolerance_factor: float  # times the solver's tolerance
+    max_tilt: float  # degrees, largest of training
 
 
 class PressWarm(NamedTuple):
     """Last answers of the local models in use, to start the next from."""
 
-    number: Ints  # (MAX_ACTIVE,), -1 for an empty slot
-    q: Array  # (MAX_ACTIVE, r)
-    guess: Array  # (MAX_ACTIVE, r) its first guess
-    past: Array  # (MAX_ACTIVE, r) force of the past in it, on linear tissue
-    inverse: Array  # (MAX_ACTIVE, r, r) see ``corrections.Secants``
-    origin: Array  # (MAX_ACTIVE, 2, r)
+    number: Annotated[Ints, "slots"]  # -1 for an empty slot
+    q: Annotated[Array, "slots, r"]
+    guess: Annotated[Array, "slots, r"]  # its first guess
+    past: Annotated[Array, "slots, r"]  # force of the past in it, on linear tissue
+    inverse: Annotated[Array, "slots, r, r"]  # see ``corrections.Secants``
+    origin: Annotated[Array, "slots, 2, r"]
 
 
 class PressScratch(NamedTuple):
     """Working memory of a query."""
 
     work: Work
-    newton: Array  # (4, r)
-    start: Array  # (r,)
-    load: Array  # (r,)
-    guess: Array  # (r,)
-    external: Array  # (r,)
-    change: Array  # (r,)
-    unit_loads: Field  # (3 r,) of a unit pressure along each axis
-    fitted: Field  # (r,)
-    scaled_load: Array  # (3,)
-    features: Array  # (LOAD_FEATURES,)
-    tangent_features: Array  # (TANGENT_FEATURES,)
-    fitted_change: Field  # (CHANGES,)
-    tangent: Array  # (CHANGING, CHANGING)
-    factor: Array  # (CHANGING, CHANGING)
-    turned: Field  # (CHANGING, r)
-    residual_features: Array  # (RESIDUAL_FEATURES,)
-    nodal: Array  # (most nodes of a model,)
-    surface: Array  # (clusters of triangles + 3,)
-
-
-class PressSolver(NamedTuple):
-    """All that a query reads, and all that it writes."""
-
-    models: PressModels
-    surface: SurfaceIndex  # values at its vertices: the load range
-    max_tilt: float  # degrees
-    coefficients: Array  # (2, PRESS_FEATURES) of the error estimate: displacement, von Mises
-    past: Any  # Elastic or past.Remembering
-    active: Active
-    warm: PressWarm
-    scratch: PressScratch
-    outcome: Outcome
+    newton: Annotated[Array, "4, r"]
+    start: Annotated[Array, "r"]
+    load: Annotated[Array, "r"]
+    guess: Annotated[Array, "r"]
+    external: Annotated[Array, "r"]
+    change: Annotated[Array, "r"]
+    unit_loads: Annotated[Field, "3 r"]  # of a unit pressure along each axis
+    fitted: Annotated[Field, "r"]
+    scaled_load: Annotated[Array, "3"]
+    features: Annotated[Array, "features"]  # of the load
+    tangent_features: Annotated[Array, "tangent_features"]
+    fitted_change: Annotated[Field, "changes"]
+    tangent: Annotated[Array, "changing, changing"]
+    factor: Annotated[Array, "changing, changing"]
+    turned: Annotated[Field, "changing, r"]
+    residual_features: Annotated[Array, "residual_features"]
+    nodal: Annotated[Array, "nodes"]  # most of a model
+    surface: Annotated[Array, "clusters"]  # see ``geometry.surface.locate``
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -169,7 +143,7 @@ def press(solver, pressure, radius):
 
     Parameters
     ----------
-    solver : Bound of PressSolver
+    solver : Bound of Solver
         Its memory is the starting point on entry and holds the answers on return; its past goes to
         the end of the step.  The numbers of the outcome are the worst of the active models.
     pressure, radius : float
@@ -205,14 +179,7 @@ def _load(models, k, outcome, pressure, radius, scratch):
     first, last = models.node_from[k], models.node_from[k + 1]
     a, b = models.face_from[k], models.face_from[k + 1]
     nodal = scratch.nodal[: last - first]
-    surface = SurfaceQuadrature(
-        models.face_points[a:b],
-        models.face_normals[a:b],
-        models.face_areas[a:b],
-        models.face_nodes[a:b],
-        models.face_shape[a:b],
-    )
-    area = footprint(surface, outcome.foot, outcome.upward, radius, nodal)
+    area = footprint(models.faces.between(a, b), outcome.foot, outcome.upward, radius, nodal)
     unit, load, direction = scratch.unit_loads, scratch.load, outcome.direction
     unit[:] = np.float32(0.0)
     for node in range(last - first):
@@ -243,8 +210,9 @@ def _anticipate(solver, k, pressure):
     load_features(
         frame, centre, outcome.foot, scratch.scaled_load, features, scratch.tangent_features
     )
-    superpose(models.defect[k], features, fitted)
-    subtract_defect(solver.past, fitted, load)
+    if not solver.past.in_time:  # the defect is known of equilibria at once only
+        superpose(models.defect[k], features, fitted)
+        load -= fitted
     superpose(models.guess[k], features, fitted)
     for i in range(len(load)):
         guess[i] = load[i] + fitted[i]
@@ -254,14 +222,14 @@ def _anticipate(solver, k, pressure):
 def local_problem(solver, k, slot):
     """Local model k under ``scratch.load``, by reference."""
     models, warm, scratch = solver.models, solver.warm, solver.scratch
+    solver.past.begin_step(models.points.law.mu[k], k, slot)
+    secants = Secants(warm.inverse[slot], warm.origin[slot], scratch.external, scratch.change)
     return bind_compiled(
         Problem(
-            bind_compiled(points_of(models.points, k)),
-            bind_compiled(begin_step(solver.past, models.points.law.mu[k], k, slot)),
+            bind_compiled(models.points.of(k)),
+            solver.past,
             bind_compiled(Dead(scratch.load)),
-            bind_compiled(
-                Secants(warm.inverse[slot], warm.origin[slot], scratch.external, scratch.change)
-            ),
+            bind_compiled(secants),
             scratch.work,
         )
     )
@@ -273,31 +241,29 @@ def _solve(solver, k, slot):
     models, warm, scratch, outcome = solver.models, solver.warm, solver.scratch, solver.outcome
     q, load, guess, start = warm.q[slot], scratch.load, scratch.guess, scratch.start
     inverse, origin = warm.inverse[slot], warm.origin[slot]
-    problem = local_problem(solver, k, slot)
-    size = external_force(problem.past, load, scratch.external, origin)
-    target = models.tolerance_factor * tolerance_of(solver.past) * size
-    target = max(target, SMALLEST_TARGET)
+    problem, past = local_problem(solver, k, slot), solver.past
+    size = past.external_force(load, scratch.external, origin)
+    tolerance = TOLERANCE_IN_TIME if past.in_time else TOLERANCE
+    target = max(models.tolerance_factor * tolerance * size, SMALLEST_TARGET)
     known = warm.number[slot] == k
     status, iterations, smallest = newton.STALLED, 0, 0.0
     for attempt in range(0 if known else 1, 3):
         if attempt == 0:
             for i in range(len(q)):
                 start[i] = guess[i] + q[i] - warm.guess[slot, i]
-            follow_past(problem.past, inverse, q, warm.past[slot], scratch.change, start)
+            past.follow(inverse, q, warm.past[slot], scratch.change, start)
         elif attempt == 1:
             start[:] = guess
             forget_secants(inverse, origin)
             _first_tangent(models.directions[k], models.change[k], scratch, inverse)
             warm.past[slot] = 0.0
-            follow_past(problem.past, inverse, guess, warm.past[slot], scratch.change, start)
+            past.follow(inverse, guess, warm.past[slot], scratch.change, start)
         else:
-            last_answer(solver.past, slot, start)
+            past.last_answer(slot, start)
             forget_secants(inverse, origin)
-        energy, smallest = newton.potential(problem, start, scratch.newton[0])
-        status, more, energy, smallest = descend(
-            problem, start, scratch.newton, energy, smallest, target, np.inf,
-            MAX_ITERATIONS[attempt], True, ROUND_OFF,
-        )  # fmt: skip
+        status, more, _, smallest = newton_method(
+            problem, start, scratch.newton, target, np.inf, MAX_ITERATIONS[attempt], True, ROUND_OFF
+        )
         iterations += more
         if status == newton.CONVERGED:
             break
@@ -305,9 +271,9 @@ def _solve(solver, k, slot):
     q[:] = start
     warm.guess[slot] = guess
     warm.number[slot] = k if found else -1
-    note_past_force(problem.past, warm.past[slot])
+    past.note_force(warm.past[slot])
     if found:
-        end_step(solver.past, problem.points, scratch.work, slot, q)
+        past.end_step(problem.points, scratch.work, slot, q)
     length = departure = 0.0
     for i in range(len(q)):
         length += q[i] ** 2
@@ -341,142 +307,31 @@ def _first_tangent(directions, table, scratch, inverse):
         if shift > newton.LARGEST_SHIFT:
             return
     turned[:] = directions
-    for i in range(len(K)):
-        for j in range(i):
-            turned[i] -= L[i, j] * turned[j]
-        turned[i] /= L[i, i]
-    for i in range(len(K) - 1, -1, -1):
-        turned[i] /= L[i, i]
-        for j in range(i):
-            turned[j] -= L[i, j] * turned[i]
+    back_substitute(L, turned)
     turned -= directions
-    for k in range(0, len(K), 4):
-        p, q, r, s = turned[k], turned[k + 1], turned[k + 2], turned[k + 3]
-        for i in range(len(inverse)):
-            a, b = directions[k, i], directions[k + 1, i]
-            c, d = directions[k + 2, i], directions[k + 3, i]
-            row = inverse[i]
-            for j in range(len(row)):
-                row[j] += a * p[j] + b * q[j] + c * r[j] + d * s[j]
-
-
-# --- what the past does to a search --------------------------------------------------------------
-
-
-def tolerance_of(past):
-    """Residual at equilibrium relative to load and past, for tissue with such a past."""
-
-
-def _tolerance_at_once(past):
-    return TOLERANCE
-
-
-def _tolerance_in_time(past):
-    return TOLERANCE_IN_TIME
-
-
-def subtract_defect(past, defect, load):
-    """Take the cubature's defect off a load; it is known of equilibria at once only."""
-
-
-def _subtract_defect(past, defect, load):
-    for i in range(len(load)):
-        load[i] -= defect[i]
-
-
-def _subtract_nothing(past, defect, load):
-    pass
-
-
-def external_force(past, load, external, origin):
-    """Write load and past (r,); return their size.  Secants of another past are of no use."""
-
-
-def _external_elastic(past, load, external, origin):
-    external[:] = load
-    return math.sqrt(np.dot(load, load))
-
-
-def _external_with_past(past, load, external, origin):
-    size, exerted = 0.0, past.exerted
-    for i in range(len(load)):
-        external[i] = load[i] + exerted[i]
-        size += max(load[i] ** 2, exerted[i] ** 2)
-    origin[:] = np.nan
-    return math.sqrt(size)
-
-
-def follow_past(past, inverse, q, before, change, start):
-    """Move a start by what the force of the past on linear tissue has changed since ``before``."""
-
-
-def _follow_nothing(past, inverse, q, before, change, start):
-    pass
-
-
-def _follow_past(past, inverse, q, before, change, start):
-    multiply(past.deviatoric, q, past.softer)
-    for i in range(len(q)):
-        change[i] = past.exerted[i] + past.loss[0] * past.softer[i] - before[i]
-    multiply(inverse, change, past.softer)
-    for i in range(len(q)):
-        start[i] += past.softer[i]
-
-
-def note_past_force(past, before):
-    """Write the force of the past on linear tissue in the state of the last evaluation."""
-
-
-def _note_nothing(past, before):
-    pass
-
-
-def _note_past_force(past, before):
-    for i in range(len(before)):
-        before[i] = past.exerted[i] + past.loss[0] * past.softer[i]
-
-
-by_type(tolerance_of, {Elastic: _tolerance_at_once, Remembering: _tolerance_in_time})
-by_type(subtract_defect, {Elastic: _subtract_defect, Remembering: _subtract_nothing})
-by_type(external_force, {Elastic: _external_elastic, Viscous: _external_with_past})
-by_type(follow_past, {Elastic: _follow_nothing, Viscous: _follow_past})
-by_type(note_past_force, {Elastic: _note_nothing, Viscous: _note_past_force})
-
-
-# --- trust ---------------------------------------------------------------------------------------
+    inverse += np.dot(directions.T, turned)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def estimate(solver, pressure):
-    """Estimated errors of an answer at once: ``log error = c . features``.
+    """Estimated errors of an answer at once.
 
     The features: 1, tilt over the largest, smallest det F, the normal (where on the body), and the
     logs of the pressure over its limit, of the departure from the linear response, of the residual
     that such answers leave in the full model, of the contact's displacement over pressure (mm/kPa)
     and of the displacement in the energy norm.
     """
-    models, outcome, features = solver.models, solver.outcome, solver.outcome.features
-    looked_at, load = solver.scratch.residual_features, pressure / outcome.limit[0]
-    moved = residual = 0.0
-    for i in range(3):
-        moved += outcome.displacement[i] ** 2
-    for slot in range(MAX_ACTIVE):
-        k = solver.active.number[slot]
-        if k >= 0:
-            residual_features(
-                models.frames[k], models.centres[:, k], outcome.foot, outcome.direction, load,
-                looked_at,
-            )  # fmt: skip
-            residual += solver.active.weight[slot] * np.dot(models.residuals[k], looked_at)
-    compliance = math.sqrt(moved) / max(pressure, 1e-6)
+    outcome, features = solver.outcome, solver.outcome.features
+    load = pressure / outcome.limit[0]
+    residual = log_residual(solver, outcome.foot, outcome.direction, load)
+    compliance = math.sqrt(np.dot(outcome.displacement, outcome.displacement)) / max(pressure, 1e-6)
     outcome.residual[0] = math.exp(residual)
     features[0] = 1.0
-    features[1] = outcome.tilt[0] / max(solver.max_tilt, 1.0)
+    features[1] = outcome.tilt[0] / max(solver.models.max_tilt, 1.0)
     features[2] = outcome.min_jacobian[0]
     features[3:6] = outcome.upward
     features[6] = math.log(max(load, 1e-6))
     features[7] = math.log(max(outcome.departure[0], 1e-6))
     features[8], features[9] = residual, math.log(max(compliance, 1e-6))
     features[10] = math.log(max(outcome.energy[0], 1e-6))
-    for i in range(len(solver.coefficients)):
-        outcome.errors[i] = math.exp(np.dot(solver.coefficients[i], features))
+    estimate_errors(solver.coefficients, features, outcome.errors)

@@ -17,32 +17,22 @@ At the end of a time step the equilibrium minimises
 ``f``  dead load; ``Phi`` contact potential of the rigid tip at ``x``
 
 Each line of it is one member of a ``Problem``, and each member has a type for every case: tissue
-without a past (``Elastic``) or with one (``Viscous``), a ``Dead`` load or ``Contact``, and a
-correction by the inverse tangent that ``Secants`` make up or by a factorised ``Tangent``.  The
-compiler chooses the pieces by these types, so that a term that is absent costs nothing.  A further
-past, load or correction is a named tuple and its functions in the table of the piece.
+without a past (``Elastic``) or with one (``Remembering``), a ``Dead`` load or ``Contact``, and a
+correction by the inverse tangent that ``Secants`` make up or by a factorised ``Tangent``.  A
+further past, load or correction is a named tuple with the same methods.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numba import njit
-from numba.extending import overload
 from numpy.typing import NDArray
 
-from palpate.shared.compiled import kind_of
+from palpate.shared.compiled import methods
 from palpate.shared.mechanics import newton, tissue
-from palpate.shared.reduced.corrections import correct, factorise
-from palpate.shared.reduced.points import (
-    Points,
-    added_energy,
-    nonlinear_stress,
-    project,
-    superpose,
-)
-from palpate.shared.reduced.terms import push, recall, soften
+from palpate.shared.reduced.points import Points, added_energy, nonlinear_stress, project
 
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
@@ -51,65 +41,50 @@ Field = NDArray[np.float32]
 class Work(NamedTuple):
     """Working memory of one evaluation."""
 
-    H: Field  # (9 c,) displacement gradient in tiles
-    P: Field  # (9 c,) stress times weight, in tiles
-    J: Array  # (c,) det F
-    part: Array  # (c,) of the energy, see ``laws.first_piola``
-    linear: Array  # (c,) kPa, energy density of linear elasticity
-    stepped: Field  # (r,) state times steps
-    latest: Array  # (r,) state of the last evaluation
+    H: Annotated[Field, "9 c"]  # displacement gradient in tiles
+    P: Annotated[Field, "9 c"]  # stress times weight, in tiles
+    J: Annotated[Array, "c"]  # det F
+    part: Annotated[Array, "c"]  # of the energy, see ``tissue.Law.first_piola``
+    linear: Annotated[Array, "c"]  # kPa, energy density of linear elasticity
+    stepped: Annotated[Field, "r"]  # state times steps
+    latest: Annotated[Array, "r"]  # state of the last evaluation
 
 
+@methods()
 class Problem(NamedTuple):
-    """A local model under a load, for ``mechanics.newton.descend``."""
+    """A local model under a load, for ``mechanics.newton``."""
 
     points: Points
-    past: Any  # Elastic or Viscous
+    past: Any  # past.Elastic or past.Remembering
     load: Any  # Dead or Contact
     correction: Any  # Secants or Tangent
     work: Work
 
-
-@overload(newton.potential, jit_options={"error_model": "numpy"})
-def _potential(system, u, residual):
-    if kind_of(system) is not Problem:
-        return None
-
-    def potential(system, u, residual):
-        points, past, work = system.points, system.past, system.work
-        steps, stepped, latest = points.steps, work.stepped, work.latest
-        for i in range(len(u)):
-            stepped[i] = u[i] * steps[i]
-            latest[i] = u[i]
-        superpose(points.gradients, stepped, work.H)
+    def potential(self, u, residual):
+        """See ``mechanics.newton``."""
+        points, work = self.points, self.work
+        work.latest[:] = u
+        points.strain(u, work.stepped, work.H)
         nonlinear_stress(work.H, points.weights, points.law, work.J, work.part, work.linear, work.P)
         smallest = work.J.min()
         if not smallest > 0.0:
             return tissue.INVERTED, smallest
         energy = added_energy(points.weights, points.law, work.J, work.part, work.linear)
-        energy += recall(past, points, work)
+        energy += self.past.recall(points, work)
         project(points.gradients, work.P, residual)
         for i in range(len(u)):
-            residual[i] = residual[i] * steps[i] + u[i]
+            residual[i] = residual[i] * points.steps[i] + u[i]
             energy += 0.5 * u[i] * u[i]
-        energy += soften(past, u, residual)
-        return energy + push(system.load, u, residual), smallest
+        energy += self.past.soften(u, residual)
+        return energy + self.load.push(u, residual), smallest
 
-    return potential
+    def factorise(self, u, shift):
+        """See ``mechanics.newton``."""
+        return self.correction.prepare(self, u, shift)
 
-
-@overload(newton.factorise, jit_options={"error_model": "numpy"})
-def _factorise(system, u, shift):
-    if kind_of(system) is not Problem:
-        return None
-    return lambda system, u, shift: factorise(system.correction, system, u, shift)
-
-
-@overload(newton.correct, jit_options={"error_model": "numpy"})
-def _correct(system, residual, step):
-    if kind_of(system) is not Problem:
-        return None
-    return lambda system, residual, step: correct(system.correction, system, residual, step)
+    def correct(self, residual, step):
+        """See ``mechanics.newton``."""
+        self.correction.step(self, residual, step)
 
 
-descend = njit(newton.descend, error_model="numpy", nogil=True, cache=True)
+newton_method = njit(newton.newton, error_model="numpy", nogil=True, cache=True)

@@ -17,31 +17,34 @@ blended; the tangent has the derivatives of the weights, too.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from palpate.shared.compiled import bind_compiled, by_type
-from palpate.shared.geometry.surface import UPRIGHT, SurfaceIndex, locate
+from palpate.shared.compiled import bind_compiled
+from palpate.shared.geometry.surface import UPRIGHT, locate
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import TIP_DEPTH
-from palpate.shared.mechanics.sphere import Tip, TipSurface, Touching
-from palpate.shared.reduced.blend import MAX_ACTIVE, Active, activate, weight_gradients
+from palpate.shared.mechanics.sphere import Tip, TipSurface
+from palpate.shared.reduced.blend import MAX_ACTIVE, activate, weight_gradients
 from palpate.shared.reduced.contact_search import (
     MAX_ITERATIONS,
     TOLERANCE,
     along_the_way_in,
     to_minimum,
 )
-from palpate.shared.reduced.corrections import Tangent
-from palpate.shared.reduced.features import TIP_FEATURES, residual_features, tip_features
-from palpate.shared.reduced.outcome import Outcome
-from palpate.shared.reduced.past import Remembering, begin_step, end_step
-from palpate.shared.reduced.points import PointTables, back_substitute, points_of
+from palpate.shared.reduced.corrections import Tangent, TangentWork
+from palpate.shared.reduced.features import (
+    TIP_FEATURES,
+    estimate_errors,
+    log_residual,
+    tip_features,
+)
+from palpate.shared.reduced.points import Points, back_substitute, project
 from palpate.shared.reduced.problem import Problem, Work
-from palpate.shared.reduced.terms import Contact, Elastic, reaction
+from palpate.shared.reduced.terms import Contact, ContactWork, reaction
 
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
@@ -67,8 +70,8 @@ class TouchModels(NamedTuple):
     centres: Array  # (3, p) mm, of a tip at the middle of the model, half as deep as may be
     frames: Array  # (p, 3, 3) rows: outward normal and two tangents
     blend: float  # mm
-    points: PointTables
-    tangent_points: PointTables  # the same, or fewer for a tangent that need not be exact
+    points: Points
+    tangent_points: Points  # the same, or fewer for a tangent that need not be exact
     guess: Field  # (p, TIP_FEATURES, r) of the answer
     tip: Tip
     surface: TipSurface
@@ -87,70 +90,32 @@ class TouchModels(NamedTuple):
 class TouchWarm(NamedTuple):
     """The models of the last equilibrium, to start the next from."""
 
-    number: Ints  # (MAX_ACTIVE,), -1 for an empty slot
-    q: Array  # (MAX_ACTIVE, r)
-    factor: Array  # (MAX_ACTIVE, r, r) of the tangent there
-    coupling: Array  # (MAX_ACTIVE, 3, r) B there
-    position: Array  # (3,) mm
-    bulk: Array  # (MAX_ACTIVE, r, r) see ``corrections.Tangent``
-    formed: Array  # (MAX_ACTIVE, 2 r + 1)
+    number: Annotated[Ints, "slots"]  # -1 for an empty slot
+    q: Annotated[Array, "slots, r"]
+    factor: Annotated[Array, "slots, r, r"]  # of the tangent there
+    coupling: Annotated[Array, "slots, 3, r"]  # B there
+    position: Annotated[Array, "3"]  # mm
+    bulk: Annotated[Array, "slots, r, r"]  # see ``corrections.Tangent``
+    formed: Annotated[Array, "slots, 3, r"]
 
 
 class TouchScratch(NamedTuple):
     """Working memory of a query."""
 
     work: Work
-    newton: Array  # (4, r)
-    x: Array  # (3,) mm
-    q: Array  # (MAX_ACTIVE, r) answers, or where searches have ended
-    factor: Array  # (MAX_ACTIVE, r, r)
-    coupling: Array  # (MAX_ACTIVE, 3, r)
-    forces: Array  # (MAX_ACTIVE, 3) mN, of the models
-    tangents: Array  # (MAX_ACTIVE, 3, 3) mN/mm
-    state: Field  # see ``corrections.Tangent``
-    units: Field
-    moduli: Field
-    products: Field
-    whole: Array  # (r, r)
-    moved: Array  # see ``terms.Contact``
-    own: Array
-    folded: Array
-    square: Array
-    product: Array
-    touching: Touching
-    latest: Array  # (r,)
-    features: Array  # (TIP_FEATURES,)
-    residual_features: Array  # (RESIDUAL_FEATURES,)
-    inward: Array  # (3,)
-    surface: Array  # (clusters of triangles + 3,)
-
-
-class TouchSolver(NamedTuple):
-    """All that a query reads of the models, and all that it writes."""
-
-    models: TouchModels
-    surface: SurfaceIndex  # values at its vertices: the load range
-    coefficients: Array  # (3, TOUCH_FEATURES) of the error estimate
-    past: Any  # Elastic or past.Remembering
-    active: Active
-    warm: TouchWarm
-    scratch: TouchScratch
-    outcome: Outcome
-
-
-def lag_of(past):
-    """``corrections.Tangent.lag`` for tissue with such a past."""
-
-
-def _lag_at_once(past):
-    return LAG_AT_ONCE
-
-
-def _lag_in_time(past):
-    return LAG_IN_TIME
-
-
-by_type(lag_of, {Elastic: _lag_at_once, Remembering: _lag_in_time})
+    newton: Annotated[Array, "4, r"]
+    x: Annotated[Array, "3"]  # mm
+    q: Annotated[Array, "slots, r"]  # answers, or where searches have ended
+    factor: Annotated[Array, "slots, r, r"]
+    coupling: Annotated[Array, "slots, 3, r"]
+    forces: Annotated[Array, "slots, 3"]  # mN, of the models
+    tangents: Annotated[Array, "slots, 3, 3"]  # mN/mm
+    tangent: TangentWork
+    contact: ContactWork
+    features: Annotated[Array, "features"]  # of the position
+    residual_features: Annotated[Array, "residual_features"]
+    inward: Annotated[Array, "3"]
+    surface: Annotated[Array, "clusters"]  # see ``geometry.surface.locate``
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -183,7 +148,7 @@ def touch(solver, x, most):
 
     Parameters
     ----------
-    solver : Bound of TouchSolver
+    solver : Bound of Solver
         Its memory is the starting point on entry and holds the answers on return if all models have
         one.  Its past then is at the end of the step.
     x : ndarray, shape (3,), mm
@@ -222,7 +187,7 @@ def _solve(solver, k, slot, x, most):
     q, depth = scratch.q[slot], outcome.depth[0]
     _start(solver, k, slot, x, q)
     scratch.x[:] = x
-    scratch.latest[:] = np.inf
+    scratch.contact.latest[:] = np.inf
     problem = local_problem(solver, k, slot)
     tolerance = TOLERANCE / max(solver.active.weight[slot], LEAST_SHARE)
     status, iterations, energy, smallest = to_minimum(
@@ -241,12 +206,12 @@ def _solve(solver, k, slot, x, most):
     coupling, force = scratch.coupling[slot], scratch.forces[slot]
     residual, step = scratch.newton[0], scratch.newton[1]
     reaction(problem.load, problem.correction.factor, coupling, step, force, scratch.tangents[slot])
-    newton.correct(problem, residual, step)
+    problem.correct(residual, step)
     energy += 0.5 * np.dot(residual, step)
     q += step
     for i in range(3):
         force[i] += np.dot(coupling[i], step)
-    touching = scratch.touching
+    touching = scratch.contact.touching
     outcome.energy[0] += solver.active.weight[slot] * energy
     outcome.penetration[0] = max(outcome.penetration[0], touching.deepest[0])
     outcome.touched[0] += touching.touched[0]
@@ -258,29 +223,25 @@ def local_problem(solver, k, slot):
     models, warm, scratch = solver.models, solver.warm, solver.scratch
     nodes = slice(models.node_from[k], models.node_from[k + 1])
     faces = slice(models.face_from[k], models.face_from[k + 1])
+    solver.past.begin_step(models.points.law.mu[k], k, slot)
+    contact = Contact(
+        models.tip, models.surface, scratch.x, models.nodes[nodes], models.modes[nodes],
+        models.faces[faces], models.corners[faces], scratch.contact,
+    )  # fmt: skip
+    lag = LAG_IN_TIME if solver.past.in_time else LAG_AT_ONCE
+    tangent = Tangent(
+        bind_compiled(models.tangent_points.of(k)), warm.bulk[slot], warm.formed[slot], lag,
+        scratch.factor[slot], scratch.tangent,
+    )  # fmt: skip
     return bind_compiled(
         Problem(
-            bind_compiled(points_of(models.points, k)),
-            bind_compiled(begin_step(solver.past, models.points.law.mu[k], k, slot)),
-            bind_compiled(
-                Contact(
-                    models.tip, models.surface, scratch.x, models.nodes[nodes],
-                    models.modes[nodes], models.faces[faces], models.corners[faces],
-                    scratch.moved, scratch.own, scratch.folded, scratch.square, scratch.product,
-                    scratch.touching, scratch.latest,
-                )
-            ),
-            bind_compiled(
-                Tangent(
-                    bind_compiled(points_of(models.tangent_points, k)), scratch.state,
-                    scratch.units, scratch.moduli,
-                    scratch.products, warm.bulk[slot], warm.formed[slot], lag_of(solver.past),
-                    scratch.whole, scratch.factor[slot],
-                )
-            ),
+            bind_compiled(models.points.of(k)),
+            solver.past,
+            bind_compiled(contact),
+            bind_compiled(tangent),
             scratch.work,
         )
-    )  # fmt: skip
+    )
 
 
 # --- where a search starts -----------------------------------------------------------------------
@@ -294,7 +255,10 @@ def _start(solver, k, slot, x, q):
         _follow(warm, slot, x, q)
         return
     warm.formed[slot] = np.inf
-    if not _from_neighbour(solver, k, x, q) and not remembered(solver.past, slot, q):
+    if _from_neighbour(solver, k, x, q):
+        return
+    solver.past.last_answer(slot, q)
+    if not np.any(q):
         first_guess(solver.models, k, x, depth, solver.scratch.features, q)
 
 
@@ -320,30 +284,11 @@ def _from_neighbour(solver, k, x, q):
                 source, at, least = slot, i, distance[n]
     if source < 0:
         return False
-    followed = solver.scratch.newton[0]
-    _follow(warm, source, x, followed)
-    for i in range(len(q)):
-        row, total = models.transfer[at, i], 0.0
-        for j in range(len(q)):
-            total += row[j] * followed[j]
-        q[i] = total
+    followed = solver.scratch.work.stepped
+    _follow(warm, source, x, q)
+    followed[:] = q
+    project(models.transfer[at], followed, q)
     return True
-
-
-def remembered(past, slot, q):
-    """Write the last answer that the tissue remembers; False at rest and for elastic tissue."""
-
-
-def _nothing_remembered(past, slot, q):
-    return False
-
-
-def _remembered(past, slot, q):
-    q[:] = past.records[slot, : len(q)]
-    return np.any(q != 0.0)
-
-
-by_type(remembered, {Elastic: _nothing_remembered, Remembering: _remembered})
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -372,8 +317,8 @@ def _remember(solver, x):
                 warm.q[slot] = scratch.q[slot]
                 warm.factor[slot] = scratch.factor[slot]
                 warm.coupling[slot] = scratch.coupling[slot]
-                points = points_of(solver.models.points, k)
-                end_step(solver.past, points, scratch.work, slot, scratch.q[slot])
+                points = solver.models.points.of(k)
+                solver.past.end_step(points, scratch.work, slot, scratch.q[slot])
             elif k != warm.number[slot]:
                 warm.formed[slot] = np.inf  # of another model, or far off
     if found:
@@ -396,39 +341,22 @@ def _act(solver, x):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def estimate(solver, x):
-    """Estimated errors of an answer at once: ``log error = c . features``.
+    """Estimated errors of an answer at once.
 
     The features: 1, the depth over its limit and its log, smallest det F, the normal (where on the
     body), and the logs of force over depth (mN/mm), of the energy over that of a linear spring, and
     of the residual that such answers leave in the full model.
     """
-    outcome, features = solver.outcome, solver.outcome.features
+    outcome, features, inward = solver.outcome, solver.outcome.features, solver.scratch.inward
     pushed = math.sqrt(np.dot(outcome.force, outcome.force))
     depth = max(outcome.depth[0], 1e-6)
     share = depth / max(outcome.limit[0], 1e-6)
+    inward[:] = -outcome.upward
     features[0], features[1], features[2] = 1.0, share, math.log(share)
     features[3] = outcome.min_jacobian[0]
     features[4:7] = outcome.upward
     features[7] = math.log(max(pushed / depth, 1e-6))
     features[8] = math.log(max(2.0 * outcome.energy[0] / max(pushed * depth, 1e-9), 1e-3))
-    features[9] = _residual(solver, x, share)
-    for i in range(len(solver.coefficients)):
-        total = 0.0
-        for j in range(solver.coefficients.shape[1]):
-            total += solver.coefficients[i, j] * features[j]
-        outcome.errors[i] = math.exp(total)
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _residual(solver, x, share):
-    """Log of the residual in the full model at a share of the largest depth, as trained."""
-    models, scratch, active = solver.models, solver.scratch, solver.active
-    log, inward, features = 0.0, scratch.inward, scratch.residual_features
-    for i in range(3):
-        inward[i] = -solver.outcome.upward[i]
-    for slot in range(MAX_ACTIVE):
-        k = active.number[slot]
-        if k >= 0:
-            residual_features(models.frames[k], models.centres[:, k], x, inward, share, features)
-            log += active.weight[slot] * np.dot(models.residuals[k], features)
-    return log
+    features[9] = log_residual(solver, x, inward, share)
+    count = solver.coefficients.shape[1]
+    estimate_errors(solver.coefficients, features[:count], outcome.errors)

@@ -10,15 +10,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from palpate.shared.reduced.features import estimate_errors
 from palpate.shared.reduced.outcome import HISTORY_FEATURES
 from palpate.shared.reduced.past import Memory, Remembering, opened, recall_points
-from palpate.shared.reduced.points import points_of
 
 if TYPE_CHECKING:
     from palpate.shared.reduced.workspace import Workspace
@@ -97,7 +97,7 @@ REST = Past()
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def estimate_history(coefficients, normal, share, response, travel, smallest):
-    """Features of a history and its estimated errors, ``log error = c . features``.
+    """Features of a history and its estimated errors.
 
     The features: 1; the largest share of the limit so far and its log; smallest det F so far; the
     normal (where on the body); the way over the surface; the log of the largest response over the
@@ -108,18 +108,13 @@ def estimate_history(coefficients, normal, share, response, travel, smallest):
     features[0], features[1], features[2], features[3] = 1.0, share, math.log(share), smallest
     features[4:7] = normal
     features[7], features[8] = math.log1p(travel), math.log(max(response / share, 1e-6))
-    for i in range(len(errors)):
-        logarithm = 0.0
-        for j in range(HISTORY_FEATURES):
-            logarithm += coefficients[i, j] * features[j]
-        errors[i] = math.exp(logarithm)
+    estimate_errors(coefficients, features, errors)
     return features, errors
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _recall(solver, k, slot):
-    points = points_of(solver.models.points, k)
-    recall_points(points, solver.scratch.work, solver.past, slot)
+    recall_points(solver.models.points.of(k), solver.scratch.work, solver.past, slot)
 
 
 class Transfer:
@@ -146,10 +141,12 @@ class Transfer:
         prony: Sequence[tuple[float, float]],
         points: int,
     ) -> None:
-        self._deviatoric, self._matrices = deviatoric, matrices
+        self._deviatoric = deviatoric
         self._share, self._tau = np.array(prony, dtype=float).T
         self.modes, self._points = deviatoric.shape[1], points
-        self._pair = {(int(k), int(n)): i for i, (k, n) in enumerate(pairs)}
+        self._between = {}
+        for (k, n), matrix in zip(pairs.tolist(), matrices, strict=True):
+            self._between[k, n], self._between[n, k] = matrix, matrix.T
         # the slowest that anything recovers
         self._slowest = self._tau.max() / (1.0 - self._share.sum())
         # of D: Q, and of the terms that each of its eigenvalues couples
@@ -221,17 +218,11 @@ class Transfer:
 
         None where one of its parts, which nearly cancel, does not meet these modes.
         """
-        if len(left) > MOST_PARTS:
-            return None
-        matrices = {}
-        for n in left:
-            T = self._matrix(k, n)
-            if T is None:
-                return None
-            matrices[n] = T
         mean, moved = np.zeros((len(self._tau), self.modes)), np.zeros(self.modes)
-        for n, T in matrices.items():
-            own = self._recover(n, left[n], time)
+        if len(left) > MOST_PARTS or any(self._matrix(k, n) is None for n in left):
+            return None
+        for n, part in left.items():
+            T, own = self._matrix(k, n), self._recover(n, part, time)
             mean += own @ T.T
             moved += T @ (self._deviatoric[n] @ (self._share @ own))
         return mean, moved
@@ -263,15 +254,9 @@ class Transfer:
             for n, left in move.items()
         ]
 
-    def _matrix(self, k: int, n: int) -> Field | None:
-        """``B_k^T K_0 B_n`` if the two meet."""
-        if k == n:
-            return np.eye(self.modes, dtype=np.float32)
-        index = self._pair.get((min(k, n), max(k, n)))
-        if index is None:
-            return None
-        matrix = self._matrices[index]
-        return matrix if k < n else matrix.T
+    def _matrix(self, k: int, n: int) -> Any:
+        """``B_k^T K_0 B_n`` (r, r) if the two meet, else None."""
+        return np.eye(self.modes, dtype=np.float32) if k == n else self._between.get((k, n))
 
     def _add(self, move: dict[int, LeftBehind], k: int, mean: Array, time: float) -> None:
         """Add a mean (terms, r) to what is left behind in model k."""

@@ -5,40 +5,36 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from palpate.offline.pictures import _across, _tip_centre
-from palpate.shared.cli import main
-from palpate.shared.model import ReducedModel
+
+from .conftest import drawn
 
 CONTACT = ["--at", "4", "5.5", "8", "--pressure", "1.5"]
-PNG = b"\x89PNG\r\n\x1a\n"
-
-
-def draw(artifact, out, *options):
-    return CliRunner().invoke(
-        main, ["picture", str(artifact), *CONTACT, *options, "--out", str(out)]
-    )
 
 
 @pytest.mark.parametrize("direction", [[], ["--direction", "0.3", "0", "-1"]])
-def test_picture(artifact, tmp_path, direction):
+def test_picture(run, artifact, tmp_path, direction):
     pytest.importorskip("pyvista")
     out = tmp_path / "new" / "pressed.png"
-    result = draw(artifact, out, *direction)
+    result = run("picture", artifact, *CONTACT, *direction, "--out", out)
     assert result.exit_code == 0, result.output
-    assert out.read_bytes().startswith(PNG)
+    assert drawn(out)
 
 
-def test_missing_pyvista_is_named(artifact, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "command", [["picture", "A", *CONTACT, "--out", "x.png"], ["study", "turbinate"]]
+)
+def test_missing_pyvista_is_named_before_any_work(run, artifact, tmp_path, monkeypatch, command):
     monkeypatch.setitem(sys.modules, "pyvista", None)
-    result = draw(artifact, tmp_path / "pressed.png")
+    monkeypatch.chdir(tmp_path)
+    result = run(*(artifact if word == "A" else word for word in command))
     assert result.exit_code == 2
     assert ".[pictures]" in result.output
+    assert not list(tmp_path.iterdir())
 
 
-def test_the_tip_touches_the_surface_and_no_more(artifact):
-    atlas = ReducedModel.load(artifact)
+def test_the_tip_touches_the_surface_and_no_more(atlas):
     solution = atlas.press([4, 5.5, 8], 1.5, [0.3, 0, -1])
     surface = (atlas.nodes + atlas.displacement(solution))[atlas.surface_nodes]
     distance = np.linalg.norm(surface - _tip_centre(surface, solution), axis=1)

@@ -42,13 +42,24 @@ def fake_store(tmp_path):
 
 
 @pytest.fixture
-def serve(fake_store, tmp_path):
-    """Return a context manager that serves fake models to an in-process client, once warm."""
+def make_app(fake_store, tmp_path):
+    """Return a function that makes a service of models, the toy unless told, and its store."""
+
+    def make(models, settings):
+        models = models or [FakeModel()]
+        store = fake_store(**{getattr(model, "name", "broken"): model for model in models})
+        return create_app(Settings(tmp_path, **settings), store), store
+
+    return make
+
+
+@pytest.fixture
+def serve(make_app):
+    """Return a context manager that serves models to an in-process client, once warm."""
 
     @contextmanager
-    def serving(settings=None, **models):
-        store = fake_store(**models)
-        app = create_app(settings or Settings(tmp_path), store)
+    def serving(*models, **settings):
+        app, store = make_app(models, settings)
         with TestClient(app, raise_server_exceptions=False) as client:
             _wait_for(store)
             yield client
@@ -59,18 +70,17 @@ def serve(fake_store, tmp_path):
 @pytest.fixture
 def client(serve):
     """Return an in-process client of a service with one toy scene and one refused file."""
-    with serve(toy=FakeModel(), broken=PalpateError("broken.h5: truncated")) as client:
+    with serve(FakeModel(), PalpateError("broken.h5: truncated")) as client:
         yield client
 
 
 @pytest.fixture
-def serving(fake_store, tmp_path):
-    """Return a context manager that serves fake models on a real socket and gives the address."""
+def serving(make_app):
+    """Return a context manager that serves models on a real socket and gives the address."""
 
     @contextmanager
-    def serving(settings=None, **models):
-        store = fake_store(**models)
-        app = create_app(settings or Settings(tmp_path), store)
+    def serving(*models, **settings):
+        app, store = make_app(models, settings)
         config = uvicorn.Config(
             app, http=HttpProtocol, access_log=False, log_level="warning", **OPTIONS
         )
@@ -89,9 +99,21 @@ def serving(fake_store, tmp_path):
 
 
 @pytest.fixture
+def opening(serving):
+    """Return a context manager that opens a session of the toy, served like this."""
+
+    @contextmanager
+    def opening(*models, record=None, **settings):
+        with serving(*models, **settings) as url, Session(url, "toy", record=record) as session:
+            yield session
+
+    return opening
+
+
+@pytest.fixture
 def url(serving):
     """Return the address of a toy service on a real socket."""
-    with serving(toy=FakeModel()) as url:
+    with serving() as url:
         yield url
 
 
@@ -103,6 +125,18 @@ def place_comes_free(url):
         except ServiceError:
             time.sleep(0.01)
     raise AssertionError("no place came free")
+
+
+def error_of(response, status):
+    """Return the error of a refusal, which has the form of all refusals."""
+    assert response.status_code == status, response.text
+    assert response.headers["content-type"] == "application/json"
+    assert "NaN" not in response.text
+    assert "Traceback" not in response.text
+    error = response.json()["error"]
+    assert set(error) == {"code", "field", "message", "allowed"}
+    assert error["message"]
+    return error
 
 
 def _wait_for(store):

@@ -22,12 +22,11 @@ DEEPEST_TRAINED = 1.0
 class Memory:
     """Where the tip was, and how often a search has gone on."""
 
-    def __init__(self) -> None:
-        self.forget()
+    last: np.ndarray | None = None
+    gone_on = 0
 
     def forget(self) -> None:
-        self.last: np.ndarray | None = None
-        self.gone_on = 0
+        vars(self).clear()
 
     def resume(self) -> None:
         self.gone_on += 1
@@ -54,7 +53,10 @@ class FakeModel:
     has_tip = True
     models = SimpleNamespace(viscous=None)
 
-    def __init__(self, name: str = "toy", divisions: int = 10, in_time: bool = False) -> None:
+    def __init__(
+        self, name: str = "toy", divisions: int = 10, in_time: bool = False, **changes: Any
+    ) -> None:
+        vars(self).update(changes)
         scene = load_scene(QUICK)
         tissue = scene.tissue.model_copy(update={"prony": ((0.5, 0.1),) if in_time else ()})
         self.name = name
@@ -128,7 +130,7 @@ class FakeModel:
             raise QueryError("position", "no tip")
         if past is not None:
             self.steps.append(dt)
-        state = self.new_warm() if warm is None else warm
+        state = warm or Memory()
         position = np.array(position, float)
         radius = self.scene.endoscope.radius
         depth = float(5.0 + radius - position[2])
@@ -139,8 +141,7 @@ class FakeModel:
         converged = (depth <= self.deepest or snapped) and not leap
         if converged:
             state.last = position
-        contact = depth > 0.0
-        pressed = max(depth, 0.0)
+        contact, pressed = depth > 0.0, max(depth, 0.0)
         time = 0.0 if past is None else past.time + dt
         after = None if past is None else past._replace(time=time, position=position)
         return Answer(
@@ -167,18 +168,18 @@ class FakeModel:
             past=after if converged else past,
         )
 
-    def _shape(self, answer: Answer, region: str) -> np.ndarray:
+    def _field(self, value: Any, answer: Answer, region: str) -> np.ndarray:
+        """Fade a value at the contact point away with the distance and towards the bottom."""
         nodes = self.nodes[self.surface_nodes] if region == "surface" else self.nodes
         squared = ((nodes - answer.contact_point) ** 2).sum(axis=1)
-        return nodes[:, 2] / 5 * np.exp(-squared / (2 * self.scene.endoscope.radius**2))
+        shape = nodes[:, 2] / 5 * np.exp(-squared / (2 * self.scene.endoscope.radius**2))
+        return np.multiply.outer(shape, value).astype(np.float32)
 
     def displacement(self, answer: Answer, region: str = "all") -> np.ndarray:
-        touched = answer.tip
-        moved = -max(answer.depth, 0.0) * UP if touched else answer.contact_displacement
-        return np.outer(self._shape(answer, region), moved).astype(np.float32)
+        moved = -max(answer.depth, 0.0) * UP if answer.tip else answer.contact_displacement
+        return self._field(moved, answer, region)
 
     def von_mises(
         self, answer: Answer, region: str = "all", displacement: Any = None
     ) -> np.ndarray:
-        pressure = np.linalg.norm(answer.force)
-        return (pressure * self._shape(answer, region)).astype(np.float32)
+        return self._field(np.linalg.norm(answer.force), answer, region)

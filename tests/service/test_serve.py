@@ -3,18 +3,22 @@
 import json
 import os
 import shlex
+import shutil
 import signal
 import socket
 import subprocess
 import time
 import urllib.request
+from dataclasses import replace
 from urllib.parse import urlsplit
 
+import numpy as np
 import pytest
 
 from palpate.online.client.http import Client
+from palpate.online.loadtest.run import Plan, run
 
-from .conftest import PALPATE
+from ..conftest import PALPATE
 
 pytestmark = pytest.mark.service
 
@@ -33,12 +37,19 @@ def test_the_printed_request_can_be_pasted(server):
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_it_ends_cleanly_on_a_signal(serve, artifact, number):
+def test_it_ends_cleanly_on_a_signal_and_logs_no_requests_nor_clients_that_hang_up(
+    serve, artifact, number
+):
+    head = b"POST /scenes/quick/solve HTTP/1.1\r\nhost: localhost\r\ncontent-length: 100\r\n\r\n{"
     with serve(artifact.parent) as server:
+        parts = urlsplit(server.url)
+        with socket.create_connection((parts.hostname, parts.port)) as connection:
+            connection.sendall(head)
         with Client(server.url) as client:
             client.scenes()
             assert server.stop(number) == 0
-        assert "Traceback" not in server.log
+    assert "Traceback" not in server.log
+    assert "/scenes" not in server.log
 
 
 def test_it_ends_while_kernels_are_compiled(artifact, tmp_path):
@@ -60,56 +71,85 @@ def test_it_ends_while_kernels_are_compiled(artifact, tmp_path):
     assert "Traceback" not in log
 
 
-def test_a_client_that_hangs_up_leaves_no_trace(serve, artifact):
-    with serve(artifact.parent) as server:
-        parts = urlsplit(server.url)
-        head = (
-            b"POST /scenes/quick/solve HTTP/1.1\r\nhost: localhost\r\n"
-            b"content-type: application/json\r\n"
-        )
-        with socket.create_connection((parts.hostname, parts.port)) as connection:
-            connection.sendall(head + b"content-length: 100\r\n\r\n{")
-        with Client(server.url) as client:
-            client.scenes()
-        assert server.stop() == 0
-        assert "Traceback" not in server.log
-
-
-def test_on_loopback_only_names_of_this_machine_are_served(server):
-    request = urllib.request.Request(f"{server.url}/scenes", headers={"host": "evil.example"})
-    with pytest.raises(urllib.error.HTTPError, match="421"):
-        urllib.request.urlopen(request)
-
-
-def test_a_connection_survives_refusals(server):
+def test_a_connection_survives_refusals_also_of_other_names_of_this_machine(server):
+    head = {"content-type": "application/json"}
     with Client(server.url) as client:
         connection = client._connection
-        for body, status in ((b"[" * 10**6, 413), (b"{", 422), (b"", 422)):
-            connection.request(
-                "POST", "/scenes/quick/solve", body, {"content-type": "application/json"}
-            )
+        for body, status, field, more in (
+            (b"[" * 10**6, 413, "body", {}), (b"{", 422, "body", {}), (b"", 422, "body", {}),
+            (b"{}", 421, "host", {"host": "evil.example"}),
+        ):  # fmt: skip
+            connection.request("POST", "/scenes/quick/solve", body, head | more)
             response = connection.getresponse()
             assert response.status == status
-            assert json.loads(response.read())["error"]["field"] == "body"
+            assert json.loads(response.read())["error"]["field"] == field
         assert client.scenes()["scenes"]
 
 
-def test_without_artifacts_it_says_how_to_make_one(tmp_path):
-    result = subprocess.run(
-        [*PALPATE, "serve", "--artifacts", tmp_path], capture_output=True, text=True
-    )
-    assert result.returncode == 2
-    assert "palpate train turbinate" in result.stderr
-    assert "Traceback" not in result.stderr
+def test_damaged_artifacts_are_refused_and_named_and_the_others_are_served(
+    serve, artifact, tmp_path
+):
+    shutil.copy(artifact, tmp_path / "good.h5")
+    (tmp_path / "text.h5").write_text("not HDF5 at all\n")
+    (tmp_path / "half.h5").write_bytes(artifact.read_bytes()[: artifact.stat().st_size // 2])
+    (tmp_path / "directory.h5").mkdir()
+    with serve(tmp_path) as server:
+        with Client(server.url) as client:
+            found = client.scenes()
+            example = client.scene("quick")["example"]["contacts"][0]
+            assert client.solve("quick", **example).trust["converged"]
+        assert server.stop() == 0
+    assert [scene["name"] for scene in found["scenes"]] == ["quick"]
+    reasons = {entry["file"]: entry["reason"] for entry in found["refused"]}
+    assert reasons.keys() == {"text.h5", "half.h5", "directory.h5"}
+    for file, reason in reasons.items():
+        assert file in reason
+        assert reason in server.greeting
+        assert file in server.log
+    assert "Traceback" not in server.log
 
 
-def test_a_port_in_use_is_told(server, artifact):
-    port = str(urlsplit(server.url).port)
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--artifacts", "EMPTY"], ["palpate train turbinate"]),
+        (["--port", "USED"], ["in use"]),
+        (["--host", "0.0.0.0"], ["PALPATE_TOKEN", "--public"]),
+        (["--host", "::"], ["PALPATE_TOKEN", "--public"]),
+        (["--host", "0.0.0.0", "--token", ""], ["PALPATE_TOKEN", "--public"]),
+    ],
+)
+def test_what_cannot_be_served_is_told(server, artifact, tmp_path, arguments, words):
+    """Without artifacts, at a port in use, and to other machines without a token."""
+    known = {"EMPTY": tmp_path, "USED": str(urlsplit(server.url).port)}
     result = subprocess.run(
-        [*PALPATE, "serve", "--artifacts", artifact.parent, "--port", port],
-        capture_output=True,
-        text=True,
-    )
+        [*PALPATE, "serve", "--artifacts", artifact.parent, *(known.get(a, a) for a in arguments)],
+        capture_output=True, text=True,
+        env={name: value for name, value in os.environ.items() if name != "PALPATE_TOKEN"},
+    )  # fmt: skip
     assert result.returncode != 0
-    assert "in use" in result.stderr
+    assert all(word in result.stderr for word in words)
     assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize("region", ["surface", "all"])
+def test_the_wire_adds_and_takes_nothing(server, atlas, region):
+    with Client(server.url) as client:
+        scene = client.scene("quick")
+        contact = scene["example"]["contacts"][0]
+        answer = client.solve("quick", **contact, region=region)
+        nodes = client.mesh("quick", region).nodes
+    json.dumps(scene, allow_nan=False)
+    solution = atlas.press(**contact)
+    displacement = atlas.displacement(solution, region)
+    np.testing.assert_allclose(answer.force, solution.force, rtol=1e-12)
+    np.testing.assert_allclose(answer.displacement, displacement, atol=1e-6)
+    np.testing.assert_allclose(answer.von_mises, atlas.von_mises(solution, region), atol=1e-5)
+    assert len(nodes) == len(displacement)
+    assert np.abs(answer.displacement).max() > 0.1
+
+
+def test_the_service_adds_little_to_a_solve(server):
+    plan = Plan(server.url, "quick", sessions=0, queries=100.0, duration=3.0, echo=True)
+    for region, most in (("none", 1.4), ("all", 2.0)):
+        assert run(replace(plan, region=region)).summary["added"]["queries"]["ratio"] <= most

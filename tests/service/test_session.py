@@ -8,12 +8,13 @@ import time
 
 import numpy as np
 import pytest
-from tests.service.conftest import PALPATE
 
 from palpate.online.client.connection import SessionClosed
 from palpate.online.client.http import Client
 from palpate.online.client.session import Session
 from palpate.online.session.frames import Output
+
+from ..conftest import PALPATE
 
 pytestmark = pytest.mark.service
 

@@ -29,65 +29,63 @@ def test_help_lists_every_command_and_an_example(run):
     assert "palpate solve quick --at" in result.output
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_each_command_explains_itself(run, command):
-    result = run(command, "--help")
-    assert result.exit_code == 0
-    assert result.output.startswith(f"Usage: palpate {command}")
+@pytest.mark.parametrize(
+    ("arguments", "exit_code", "said"),
+    [
+        *(([command, "--help"], 0, f"Usage: palpate {command}") for command in COMMANDS),
+        (["--version"], 0, "palpate, version 0."),
+        (["knead"], 2, "No such command 'knead'"),
+    ],
+)
+def test_commands_explain_themselves_and_others_are_refused(run, arguments, exit_code, said):
+    result = run(*arguments)
+    assert result.exit_code == exit_code
+    assert said in result.output
 
 
-def test_version(run):
-    assert run("--version").output.startswith("palpate, version 0.")
-
-
-def test_unknown_command_is_refused(run):
-    result = run("knead")
-    assert result.exit_code == 2
-    assert "No such command 'knead'" in result.output
-
-
-@pytest.fixture
-def failing_command(monkeypatch):
+def test_our_errors_are_one_line_and_show_their_origin_when_asked(run, monkeypatch):
     def fail():
         raise QueryError("pressure", "must be 0 to 9 kPa, not -1")
 
     entry = SimpleNamespace(load=lambda: click.Command("fail", callback=fail))
     monkeypatch.setattr(cli, "entry_points", lambda **_: [entry])
-
-
-@pytest.mark.usefixtures("failing_command")
-def test_our_errors_are_one_line(run, monkeypatch):
     monkeypatch.delenv("PALPATE_DEBUG", raising=False)
     result = run("fail")
     assert result.exit_code == 2
     assert result.output == "Error: pressure: must be 0 to 9 kPa, not -1\n"
-
-
-@pytest.mark.usefixtures("failing_command")
-def test_our_errors_show_their_origin_when_asked(run, monkeypatch):
     monkeypatch.setenv("PALPATE_DEBUG", "1")
     assert isinstance(run("fail").exception, PalpateError)
 
 
-def test_whatever_imports_the_software_runs_on_one_blas_thread():
-    script = (
-        "import os, shared\n"
-        "print(*(os.environ[f'{name}_NUM_THREADS'] for name in ('OPENBLAS', 'MKL')))"
-    )
-    environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
-    output = subprocess.run(
+def printed(script, **environment):
+    """What a script prints, in words."""
+    run = subprocess.run(
         [sys.executable, "-c", script],
-        env=environment | {"MKL_NUM_THREADS": "2"}, capture_output=True, check=True,
+        env={k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")} | environment,
+        capture_output=True, check=True,
     )  # fmt: skip
-    assert output.stdout.decode().split() == ["1", "2"]
+    return run.stdout.decode().split()
 
 
-def test_help_is_quick():
-    """Nothing that computes is imported just to print a help text."""
-    script = (
-        "import sys; from click.testing import CliRunner; from palpate.shared.cli import main\n"
-        "CliRunner().invoke(main, ['--help'])\n"
-        "print(*{'numpy', 'numba', 'fastapi', 'h5py'} & sys.modules.keys())"
-    )
-    output = subprocess.run([sys.executable, "-c", script], capture_output=True, check=True)
-    assert output.stdout.decode().split() == []
+def test_whatever_imports_the_software_runs_on_one_blas_thread():
+    threads = "(os.environ[f'{name}_NUM_THREADS'] for name in ('OPENBLAS', 'MKL'))"
+    assert printed(f"import os, shared; print(*{threads})", MKL_NUM_THREADS="2") == ["1", "2"]
+
+
+@pytest.mark.parametrize(
+    ("script", "heavy"),
+    [
+        (
+            "from click.testing import CliRunner; from palpate.shared.cli import main\n"
+            "CliRunner().invoke(main, ['--help'])",
+            ["numpy", "numba", "fastapi", "h5py"],
+        ),
+        (
+            "import palpate.online.serve.app",
+            ["felupe", "matplotlib", "palpate.offline", "pyvista", "scipy.sparse.linalg", "tqdm"],
+        ),
+    ],
+    ids=["help", "server"],
+)
+def test_nothing_is_imported_that_is_not_needed(script, heavy):
+    assert printed(f"{script}\nimport sys; print(*set({heavy}) & sys.modules.keys())") == []

@@ -7,15 +7,10 @@ import pytest
 
 from palpate.shared.answer import describe
 from palpate.shared.errors import QueryError
-from palpate.shared.model import ReducedModel
 from palpate.shared.query import ABSURD
+from palpate.shared.reduced.transfer import REST
 
 UP = np.array([0.0, 0.0, 1.0])
-
-
-@pytest.fixture(scope="module")
-def atlas(artifact):
-    return ReducedModel.load(artifact)
 
 
 @pytest.fixture(scope="module")
@@ -97,27 +92,26 @@ def test_pressures_are_refused_from_ten_times_the_largest_on(atlas, contact):
         atlas.press(contact[0], 1.001 * ABSURD * atlas.pressure_max)
 
 
+def test_no_pressure_moves_nothing_and_the_length_of_a_direction_means_nothing(atlas, contact):
+    solution = atlas.press(contact[0], 0.0)
+    assert solution.converged
+    assert np.abs(atlas.displacement(solution)).max() <= 1e-9
+    assert np.abs(atlas.von_mises(solution)).max() <= 1e-6
+    short, long = (atlas.press(*contact, scale * np.array([0.2, 0.1, -1.0])) for scale in (1e-3, 7))
+    assert np.linalg.norm(long.direction) == pytest.approx(1)
+    np.testing.assert_allclose(short.force, long.force, rtol=1e-12)
+
+
+NONSENSE = {
+    "pressure": (math.nan, math.inf, -1e-9),
+    "position": ([math.nan, 0, 0], [0, math.inf, 0], [1.0, 2.0], "here", [5.0, 5.0, 500.0]),
+    "direction": ([0, 0, 0], [0, math.nan, -1], [0.0, -1.0], [0, 0, 1], [1.0, 0.0, 0.0]),
+    "radius": (0.0, -1.0, 2.001, math.nan),
+}
+
+
 @pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("pressure", math.nan),
-        ("pressure", math.inf),
-        ("pressure", -1e-9),
-        ("position", [math.nan, 0.0, 0.0]),
-        ("position", [0.0, math.inf, 0.0]),
-        ("position", [1.0, 2.0]),
-        ("position", "here"),
-        ("position", [5.0, 5.0, 500.0]),
-        ("direction", [0.0, 0.0, 0.0]),
-        ("direction", [0.0, math.nan, -1.0]),
-        ("direction", [0.0, -1.0]),
-        ("direction", [0.0, 0.0, 1.0]),
-        ("direction", [1.0, 0.0, 0.0]),
-        ("radius", 0.0),
-        ("radius", -1.0),
-        ("radius", 2.001),
-        ("radius", math.nan),
-    ],
+    ("field", "value"), [(field, value) for field in NONSENSE for value in NONSENSE[field]]
 )
 def test_what_makes_no_sense_is_refused_by_name(atlas, contact, field, value):
     query = {"position": contact[0], "pressure": contact[1], field: value}
@@ -135,19 +129,6 @@ def test_a_position_off_the_surface_is_moved_to_it_within_reach(atlas, contact):
     np.testing.assert_allclose(solution.contact_point, x, atol=1e-9)
     with pytest.raises(QueryError, match=f"at most {reach} mm"):
         atlas.press(x + 1.01 * reach * UP, pressure)
-
-
-def test_the_length_of_a_direction_means_nothing(atlas, contact):
-    short, long = (atlas.press(*contact, scale * np.array([0.2, 0.1, -1.0])) for scale in (1e-3, 7))
-    assert np.linalg.norm(long.direction) == pytest.approx(1)
-    np.testing.assert_allclose(short.force, long.force, rtol=1e-12)
-
-
-def test_no_pressure_moves_nothing(atlas, contact):
-    solution = atlas.press(contact[0], 0.0)
-    assert solution.converged
-    assert np.abs(atlas.displacement(solution)).max() <= 1e-9
-    assert np.abs(atlas.von_mises(solution)).max() <= 1e-6
 
 
 def test_the_surface_is_part_of_the_whole(atlas, contact):
@@ -170,3 +151,9 @@ def test_a_refused_query_leaves_the_last_answers_as_they_were(atlas, contact):
         atlas.press(x, pressure, [0.0, 0.0, 1.0], warm=touched)
     answers = [atlas.press(x, 0.9 * pressure, warm=warm) for warm in (touched, untouched)]
     np.testing.assert_array_equal(*[atlas.displacement(answer) for answer in answers])
+
+
+def test_elastic_tissue_has_no_time(atlas):
+    for ask, query in ((atlas.press, (None, 0.0)), (atlas.touch, ([5.0, 5.0, 12.0],))):
+        with pytest.raises(QueryError, match="is elastic"):
+            ask(*query, past=REST, dt=0.1)

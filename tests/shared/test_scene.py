@@ -3,7 +3,6 @@
 import re
 
 import pytest
-from pydantic import ValidationError
 
 from palpate.shared.scene import (
     Block,
@@ -59,6 +58,11 @@ def test_a_scene_reads_back_from_its_own_text() -> None:
     assert scene.surface.x == (1.0, 9.0)
     assert scene.text == SLAB
     assert parse_scene(scene.text) == scene
+    assert scene.tissue.prony == ()
+    in_time = SLAB.replace("0.45", "0.45\nprony = [[0.3, 0.1], [0.2, 1.0]]")
+    in_time = parse_scene(in_time.replace("reach", "tip = true\nreach"))
+    assert in_time.tissue.prony == ((0.3, 0.1), (0.2, 1.0))
+    assert in_time.endoscope.tip
 
 
 def test_a_section_is_not_needed_to_read_a_scene() -> None:
@@ -74,38 +78,9 @@ length = 40
     assert scene.folder is None
 
 
-def test_tissue_is_elastic_unless_it_says_otherwise() -> None:
-    assert parse_scene(SLAB).tissue.prony == ()
-    visco = SLAB.replace("0.45", "0.45\nprony = [[0.3, 0.1], [0.2, 1.0]]")
-    assert parse_scene(visco).tissue.prony == ((0.3, 0.1), (0.2, 1.0))
-
-
-def test_the_tip_presses_tissue_that_knows_time() -> None:
-    text = SLAB.replace("0.45", "0.45\nprony = [[0.3, 0.1]]").replace("reach", "tip = true\nreach")
-    assert parse_scene(text).endoscope.tip
-
-
-def test_a_scene_is_immutable() -> None:
-    scene = parse_scene(SLAB)
-    with pytest.raises(ValidationError):
-        scene.tissue.young = 1.0  # type: ignore[misc]
-
-
-@pytest.mark.parametrize(
-    ("displacement", "von_mises", "looseness"),
-    [(0.01, 0.02, 1.0), (0.05, 0.1, 5.0), (0.05, 0.02, 1.0), (0.005, 0.2, 1.0)],
-)
-def test_a_tolerance_is_as_loose_as_the_stricter_of_its_parts(
-    displacement, von_mises, looseness
-) -> None:
-    tolerance = Tolerance(displacement=displacement, von_mises=von_mises)
-    assert tolerance.looseness == pytest.approx(looseness)
-
-
-def test_load_scene_knows_its_folder(tmp_path) -> None:
-    path = tmp_path / "slab.toml"
-    path.write_text(SLAB, encoding="utf-8")
-    assert load_scene(path).folder == tmp_path
+def test_a_tolerance_is_as_loose_as_the_stricter_of_its_parts() -> None:
+    for u, s, expected in ((0.01, 0.02, 1), (0.05, 0.1, 5), (0.05, 0.02, 1), (0.005, 0.2, 1)):
+        assert Tolerance(displacement=u, von_mises=s).looseness == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(
@@ -121,23 +96,17 @@ def test_load_scene_knows_its_folder(tmp_path) -> None:
         ("0.45", "0.5", r"tissue.poisson = 0.5: .*less than 0.5"),
         ("0.45", "-0.1", r"tissue.poisson = -0.1: .*greater than or equal to 0"),
         ("young = 15.0", "young = nan", r"tissue.young = nan: .*finite"),
-        ("young = 15.0", "young = inf", r"tissue.young = inf: .*finite"),
-        ("young = 15.0", 'young = "15"', r"tissue.young = '15': .*valid number"),
         (
             "0.45",
             "0.45\nprony = [[0.6, 0.1], [0.4, 1.0]]",
             r"tissue: .*prony must sum to less than 1",
         ),
-        ("0.45", "0.45\nprony = [[0.0, 0.1]]", r"tissue.prony.0.0 = 0.0: .*greater than 0"),
         ("0.45", "0.45\nprony = [[0.5, 0.0]]", r"tissue.prony.0.1 = 0.0: .*greater than 0"),
-        ("0.45", "0.45\nprony = [[0.5]]", r"tissue.prony.0.1 = .*required"),
         ("young = 15.0", "young = true", r"tissue.young = True: .*valid number"),
         ("neo-hookean", "hooke", r"tissue: .*'hooke'.*'neo-hookean', 'mooney-rivlin'"),
         ("neo-hookean", "mooney-rivlin", r"tissue.c10: missing \(factor of the first inv.*, kPa\)"),
         ("[10.0, 8, 5.0]", "[10.0, -8, 5.0]", r"geometry.size.1 = -8: .*greater than 0"),
-        ("[10.0, 8, 5.0]", "[10.0, 8]", r"geometry.size.2"),
         ("[4, 4, 2]", "[4, 0, 2]", r"geometry.divisions.1 = 0: .*greater than or equal to 1"),
-        ("[4, 4, 2]", "[4, 4.5, 2]", r"geometry.divisions.1 = 4.5: .*integer"),
         ("hex8", "tet4", r"geometry.element = 'tet4': .*'hex20'"),
         ("block", "sphere", r"geometry: .*'extrusion', 'block'"),
         ('"top"', '"lip"', r"surface: side is 'lip', but the sides .* are left, right"),
@@ -145,7 +114,6 @@ def test_load_scene_knows_its_folder(tmp_path) -> None:
         ('"slab"', '"../slab"', r"name = '../slab'"),
         ("max_tilt = 30.0", "max_tilt = 90.0", r"endoscope.max_tilt = 90.0: .*less than 90"),
         ("samples = 60", "samples = 6", r"training.samples = 6: .*greater than or equal to 60"),
-        ("radius = 2.0", "radius = -2.0", r"endoscope.radius = -2.0: .*greater than 0"),
     ],
 )
 def test_what_is_wrong_is_named(old: str, new: str, message: str) -> None:
@@ -190,7 +158,10 @@ def test_lengths_that_are_absent_are_multiples_of_the_radius() -> None:
     assert scene.training.blend == 0.2
 
 
-def test_an_unreadable_file_is_refused(tmp_path) -> None:
+def test_a_file_knows_its_folder_and_an_unreadable_one_is_refused(tmp_path) -> None:
+    path = tmp_path / "slab.toml"
+    path.write_text(SLAB, encoding="utf-8")
+    assert load_scene(path).folder == tmp_path
     missing = tmp_path / "missing.toml"
     with pytest.raises(SceneError, match=re.escape(str(missing))):
         load_scene(missing)

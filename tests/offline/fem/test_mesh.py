@@ -2,30 +2,35 @@
 
 from collections import Counter
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from palpate.offline.fem.mesh import Mesh, build_mesh, jacobians, local_thickness, mesh_quality
+from palpate.offline.fem.mesh import build_mesh, jacobians, local_thickness, mesh_quality
 from palpate.offline.fem.section import map_section, polygon_area, read_outline
 from palpate.offline.scenes import FOLDER, filled, find_scene, shipped_scenes
-from palpate.shared.scene import Scene, SceneError, parse_scene
+from palpate.shared.geometry.elements import HEX_EDGES
+from palpate.shared.scene import SceneError, parse_scene
 
 OUTLINE = FOLDER / "inferior_turbinate_section.csv"
 
 
 @cache
-def shipped_mesh(name: str) -> Mesh:
+def shipped_mesh(name):
     return build_mesh(find_scene(name))
 
 
-@pytest.fixture(params=shipped_scenes())
-def mesh(request) -> Mesh:
+BODIES = {(scene.geometry, scene.support, scene.surface): scene.name
+          for scene in map(find_scene, shipped_scenes())}  # fmt: skip
+"""A scene of every body that comes along."""
+
+
+@pytest.fixture(params=BODIES.values())
+def mesh(request):
     return shipped_mesh(request.param)
 
 
-def variant(name: str, *changes: tuple[str, str]) -> Scene:
+def variant(name, *changes):
     """A shipped scene with some of its text, all defaults included, replaced."""
     scene = find_scene(name)
     text = filled(scene)
@@ -35,24 +40,23 @@ def variant(name: str, *changes: tuple[str, str]) -> Scene:
     return parse_scene(text, scene.folder)
 
 
-@pytest.fixture(scope="module")
-def turbinate_hex8() -> Mesh:
+@cache
+def turbinate_hex8():
     divisions = ("[13, 2, 13]", "[23, 3, 20]")
     return build_mesh(variant("turbinate", ('"hex20"', '"hex8"'), divisions))
 
 
-def face_normals(mesh: Mesh) -> np.ndarray:
-    corner = mesh.nodes[mesh.faces[:, :4]]
-    normal = np.cross(corner[:, 2] - corner[:, 0], corner[:, 3] - corner[:, 1])
-    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
-
-
-def test_elements_are_not_inverted(mesh) -> None:
+def test_elements_are_not_inverted_every_node_is_used_and_the_surface_is_not_held(mesh):
     for points in (2, 3):
         assert jacobians(mesh, points)[0].min() > 0
+    assert np.array_equal(np.unique(mesh.elements), np.arange(len(mesh.nodes)))
+    assert mesh.elements.dtype == mesh.faces.dtype == np.int32
+    assert mesh.clamped.any()
+    assert mesh.accessible.any()
+    assert not mesh.clamped[mesh.faces[mesh.accessible]].any()
 
 
-def test_boundary_is_closed_and_outward(mesh) -> None:
+def test_boundary_is_closed_and_outward(mesh):
     edges = Counter()
     for face in mesh.faces[:, :4]:
         edges.update(zip(face.tolist(), np.roll(face, -1).tolist(), strict=True))
@@ -65,77 +69,30 @@ def test_boundary_is_closed_and_outward(mesh) -> None:
     assert volume == pytest.approx(mesh_quality(mesh)["volume_mm3"], rel=0.06)
 
 
-def test_every_node_is_used(mesh) -> None:
-    assert np.array_equal(np.unique(mesh.elements), np.arange(len(mesh.nodes)))
-    assert mesh.elements.dtype == mesh.faces.dtype == np.int32
-
-
-def test_midside_nodes_lie_near_the_middle_of_their_edge(mesh) -> None:
-    edges = [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4)]
-    edges += [(0, 4), (1, 5), (2, 6), (3, 7)]
-    for middle, (start, end) in enumerate(edges, start=8):
+def test_midside_nodes_lie_near_the_middle_of_their_edge(mesh):
+    for middle, (start, end) in enumerate(HEX_EDGES, start=8):
         a, b, m = (mesh.nodes[mesh.elements[:, i]] for i in (start, end, middle))
         length = np.linalg.norm(b - a, axis=1)
         assert (np.abs(np.sum((m - (a + b) / 2) * (b - a), axis=1)) < 0.25 * length**2).all()
 
 
-def test_support_and_surface_are_apart(mesh) -> None:
-    assert mesh.clamped.any()
-    assert mesh.accessible.any()
-    assert not mesh.clamped[mesh.faces[mesh.accessible]].any()
-
-
-@pytest.mark.parametrize(
-    ("name", "degrees_of_freedom", "within"),
-    [("turbinate", 6048, 0.03), ("turbinate-fine", 40_000, 0.03)],
-)
-def test_promised_size(name: str, degrees_of_freedom: int, within: float) -> None:
-    assert shipped_mesh(name).nodes.size == pytest.approx(degrees_of_freedom, rel=within)
-
-
-def test_hexahedra_of_eight_nodes_have_the_promised_size_too(turbinate_hex8) -> None:
-    assert turbinate_hex8.nodes.size == pytest.approx(6048, rel=0.03)
-
-
-def test_turbinate_keeps_the_volume_of_the_section() -> None:
+def test_turbinate_has_the_promised_size_and_the_volume_of_the_section():
+    assert turbinate_hex8().nodes.size == pytest.approx(6048, rel=0.03)
     expected = 40.0 * abs(polygon_area(read_outline(OUTLINE)))
-    for name, tolerance in (("turbinate", 4e-3), ("turbinate-fine", 1e-3)):
-        volume = mesh_quality(shipped_mesh(name))["volume_mm3"]
-        assert volume == pytest.approx(expected, rel=tolerance)
+    for name, dofs, tolerance in (("turbinate", 6048, 4e-3), ("turbinate-fine", 40_000, 1e-3)):
+        mesh = shipped_mesh(name)
+        assert mesh.nodes.size == pytest.approx(dofs, rel=0.03)
+        assert mesh_quality(mesh)["volume_mm3"] == pytest.approx(expected, rel=tolerance)
 
 
-def test_turbinate_elements_are_well_shaped() -> None:
+def test_elements_are_well_shaped_and_of_even_size_along_the_outer_side():
     quality = mesh_quality(shipped_mesh("turbinate"))
     assert quality["scaled_jacobian_min"] > 0.3
     assert quality["scaled_jacobian_median"] > 0.85
     assert quality["aspect_ratio_max"] < 10
-
-
-def test_turbinate_surface_is_the_medial_side_and_the_lower_edge_end_to_end() -> None:
-    mesh = shipped_mesh("turbinate")
-    touched = mesh.nodes[np.unique(mesh.faces[mesh.accessible])]
-    assert touched[:, 1].min() == 0.0
-    assert touched[:, 1].max() == pytest.approx(40.0)
-    assert touched[:, 0].min() == pytest.approx(1.2, abs=0.1)  # as far as the hook's tip
-    assert touched[:, 2].min() == pytest.approx(0.0, abs=0.05)  # round the lower edge
-    assert 15.0 < touched[:, 2].max() < 17.0
-    normals = face_normals(mesh)[mesh.accessible]
-    assert np.abs(normals[:, 1]).max() < 1e-12
-    assert normals[:, 0].max() > 0.99  # medial
-    assert normals[:, 2].min() < -0.99  # inferior
-    assert normals[:, 0].min() < -0.6  # lateral-inferior, towards the hook
-
-
-def test_turbinate_is_clamped_on_the_lip_only() -> None:
-    mesh = shipped_mesh("turbinate")
-    x, y, z = mesh.nodes[mesh.clamped].T
-    assert x.max() < 4.4
-    assert z.min() > 14.2
-    assert (y.min(), y.max()) == (0.0, pytest.approx(40.0))
-
-
-def test_outer_side_is_evenly_divided(turbinate_hex8) -> None:
-    mesh = turbinate_hex8
+    perfect = dict.fromkeys(quality, 1.0) | {"volume_mm3": 1000.0}
+    assert mesh_quality(shipped_mesh("cube")) == pytest.approx(perfect)
+    mesh = turbinate_hex8()
     face = mesh.faces[mesh.accessible]
     front = face[np.isclose(mesh.nodes[face, 1].min(axis=1), 0.0)]
     corner = mesh.nodes[front][..., [0, 2]]
@@ -143,7 +100,27 @@ def test_outer_side_is_evenly_divided(turbinate_hex8) -> None:
     assert length.max() < 1.1 * length.min()
 
 
-def test_section_map_follows_the_outline() -> None:
+def test_turbinate_is_touched_medially_and_below_end_to_end_and_clamped_on_the_lip_only():
+    mesh = shipped_mesh("turbinate")
+    touched = mesh.nodes[mesh.faces[mesh.accessible]]
+    (x0, y0, z0), (_, y1, z1) = touched.min(axis=(0, 1)), touched.max(axis=(0, 1))
+    assert (y0, y1) == (0.0, pytest.approx(40.0))
+    assert x0 == pytest.approx(1.2, abs=0.1)  # as far as the hook's tip
+    assert z0 == pytest.approx(0.0, abs=0.05)  # round the lower edge
+    assert 15.0 < z1 < 17.0
+    normals = np.cross(touched[:, 2] - touched[:, 0], touched[:, 3] - touched[:, 1])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    assert np.abs(normals[:, 1]).max() < 1e-12
+    assert normals[:, 0].max() > 0.99  # medial
+    assert normals[:, 2].min() < -0.99  # inferior
+    assert normals[:, 0].min() < -0.6  # lateral-inferior, towards the hook
+    x, y, z = mesh.nodes[mesh.clamped].T
+    assert x.max() < 4.4
+    assert z.min() > 14.2
+    assert (y.min(), y.max()) == (0.0, pytest.approx(40.0))
+
+
+def test_section_map_follows_the_outline():
     points = read_outline(OUTLINE)
     section = map_section(points, find_scene("turbinate").geometry.corners)
     along = np.linspace(0, 1, 400)
@@ -154,19 +131,7 @@ def test_section_map_follows_the_outline() -> None:
     assert gaps.min(axis=1).max() < 0.18
 
 
-def test_quality_of_a_perfect_mesh() -> None:
-    assert mesh_quality(shipped_mesh("cube")) == pytest.approx(
-        {
-            "scaled_jacobian_min": 1.0,
-            "scaled_jacobian_median": 1.0,
-            "jacobian_ratio_min": 1.0,
-            "aspect_ratio_max": 1.0,
-            "volume_mm3": 1000.0,
-        }
-    )
-
-
-def test_local_thickness_of_a_block() -> None:
+def test_local_thickness():
     mesh = shipped_mesh("quick")
     x, y, height = mesh.nodes.max(axis=0)
     points = np.array([[3.1, 4.2, height], [0.0, 0.0, height], [x / 2, y / 2, height]])
@@ -175,57 +140,52 @@ def test_local_thickness_of_a_block() -> None:
     # Tilted, the ball touches the left side first: x / 2 - 0.6 D / 2 = D / 2.
     tilted = np.array([[0.6, 0.0, 0.8]])
     assert local_thickness(mesh, points[2:], tilted) == pytest.approx(x / 1.6, rel=5e-3)
-
-
-def test_local_thickness_of_the_turbinates_wall() -> None:
-    mesh = shipped_mesh("turbinate")
-    point = np.array([[10.12, 20.0, 9.4]])
-    thickness = local_thickness(mesh, point, np.array([[1.0, 0.0, 0.0]]))
     # About straight across from the medial side to the deepest point of the inner one.
+    wall, medial = np.array([[10.12, 20.0, 9.4]]), np.array([[1.0, 0.0, 0.0]])
+    thickness = local_thickness(shipped_mesh("turbinate"), wall, medial)
     assert thickness == pytest.approx(10.12 - 5.58, abs=0.1)
 
 
 @pytest.mark.parametrize(
-    ("name", "changes", "message"),
+    ("name", "old", "new", "message"),
     [
-        ("quick", [('"bottom"', '"bottom"\nx = [20, 30]')], "support: no face"),
-        ("quick", [('"top"', '"top"\ny = [-2, -1]')], "surface: no face"),
-        ("turbinate", [("turbinate_section", "nothing")], "section: .* cannot be read"),
-        ("turbinate", [("[1.2, 2.9]", "[3.2, 7.0]")], "corners: must lie on the outline"),
-        (
-            "turbinate",
-            [("[[4.3, 17.7], [1.2, 2.9]", "[[1.2, 2.9], [4.3, 17.7]")],
-            "corners: .* clockwise",
-        ),
+        ("quick", '"bottom"', '"bottom"\nx = [20, 30]', "support: no face"),
+        ("quick", '"top"', '"top"\ny = [-2, -1]', "surface: no face"),
+        ("turbinate", "turbinate_section", "nothing", "section: .* cannot be read"),
+        ("turbinate", "[1.2, 2.9]", "[3.2, 7.0]", "corners: must lie on the outline"),
+        ("turbinate", "[[4.3, 17.7], [1.2, 2.9]", "[[1.2, 2.9], [4.3, 17.7]", "corners: .* clockw"),
     ],
 )
-def test_impossible_meshes_are_refused(name: str, changes, message: str) -> None:
+def test_impossible_meshes_are_refused(name, old, new, message):
     with pytest.raises(SceneError, match=message):
-        build_mesh(variant(name, *changes))
+        build_mesh(variant(name, (old, new)))
 
 
-def test_a_scene_without_its_folder_cannot_be_meshed() -> None:
+def test_a_scene_is_found_by_name_or_path_and_meshed_with_its_folder_alone():
+    assert find_scene("quick") == find_scene(FOLDER / "quick.toml")
+    with pytest.raises(SceneError, match="turbinate-fine"):
+        find_scene("turbine")
     with pytest.raises(SceneError, match="folder"):
         build_mesh(parse_scene(find_scene("turbinate").text))
 
 
-def write_outline(path: Path, points) -> Path:
+def read_back(folder, points):
+    """Write an outline and read it."""
+    path = folder / "outline.csv"
     np.savetxt(path, points, delimiter=",", header="x_mm,z_mm", comments="")
-    return path
+    return read_outline(path)
 
 
-def circle(count: int) -> np.ndarray:
+def circle(count):
     angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
     return np.column_stack([np.cos(angle), np.sin(angle)])
 
 
-def test_an_outline_is_read_clockwise_whichever_way_it_runs(tmp_path) -> None:
-    for points in (circle(20), circle(20)[::-1]):
-        assert polygon_area(read_outline(write_outline(tmp_path / "c.csv", points))) < 0
-
-
-def test_a_round_section_keeps_its_area() -> None:
-    section = map_section(circle(64)[::-1], [[-0.7, 0.7], [0.7, 0.7], [0.7, -0.7], [-0.7, -0.7]])
+def test_a_round_section_keeps_its_area_whichever_way_its_outline_runs(tmp_path):
+    outline, other = (read_back(tmp_path, circle(64)[::way]) for way in (1, -1))
+    assert polygon_area(outline) < 0  # clockwise
+    assert polygon_area(other) < 0
+    section = map_section(outline, [[-0.7, 0.7], [0.7, 0.7], [0.7, -0.7], [-0.7, -0.7]])
     # Green's theorem over the rim of the map.
     t = np.linspace(0, 1, 200)
     one, zero = np.ones_like(t), np.zeros_like(t)
@@ -243,12 +203,6 @@ def test_a_round_section_keeps_its_area() -> None:
         (np.ones((10, 3)), "x, z"),
     ],
 )
-def test_bad_outlines_are_refused(tmp_path, points, message: str) -> None:
+def test_bad_outlines_are_refused(tmp_path, points, message):
     with pytest.raises(SceneError, match=message):
-        read_outline(write_outline(tmp_path / "outline.csv", points))
-
-
-def test_a_scene_is_found_by_name_or_path() -> None:
-    assert find_scene("quick") == find_scene(FOLDER / "quick.toml")
-    with pytest.raises(SceneError, match="turbinate-fine"):
-        find_scene("turbine")
+        read_back(tmp_path, points)

@@ -1,25 +1,12 @@
 import numpy as np
 import pytest
 
-from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods.catalogue import Training
 from palpate.offline.methods.method import Snapshots
-from palpate.offline.reduce.queries import random_loads
 from palpate.offline.validate.against_full import held_out_loads
-from palpate.shared.artifact import read_artifact
-from palpate.shared.model import ReducedModel
+from palpate.offline.validate.queries import random_loads
 
 SNAPSHOTS, QUERIES = 40, 4
-
-
-@pytest.fixture(scope="session")
-def atlas(artifact):
-    return ReducedModel.load(artifact)
-
-
-@pytest.fixture(scope="session")
-def problem(artifact):
-    return FullProblem.of_artifact(read_artifact(artifact))
 
 
 @pytest.fixture(scope="session")
@@ -28,6 +15,12 @@ def training(atlas, problem):
     loads = random_loads(atlas, SNAPSHOTS, rng)
     solved = [problem.solve(load).displacement.ravel() for load in loads]
     return Training(problem, Snapshots(loads, np.stack(solved)), atlas)
+
+
+@pytest.fixture(scope="session")
+def basis(training):
+    """Return the first modes of the snapshots (free dofs, 12)."""
+    return training.pod(12)
 
 
 @pytest.fixture(scope="session")

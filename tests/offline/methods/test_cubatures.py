@@ -6,13 +6,6 @@ import pytest
 from palpate.offline.methods.galerkin import Galerkin
 from palpate.offline.methods.method import Case
 
-MODES = 12
-
-
-@pytest.fixture(scope="module")
-def basis(training):
-    return training.pod(MODES)
-
 
 @pytest.fixture(scope="module")
 def forces(training, basis):
@@ -42,7 +35,9 @@ def test_points_do_the_work_of_all_and_more_do_it_better(problem, basis, forces,
     assert errors[-1] <= 0.01
 
 
-def test_elements_come_whole_and_do_it_too(problem, basis, forces, queries, rng):
+def test_elements_come_whole_and_do_it_too_but_points_are_cheaper(
+    problem, basis, forces, queries, rng
+):
     cubature, model = forces.by_element(30, rng), problem.model
     elements, count = np.unique(cubature.points // 8, return_counts=True)
     assert len(elements) <= 30
@@ -51,8 +46,5 @@ def test_elements_come_whole_and_do_it_too(problem, basis, forces, queries, rng)
     assert (factors > 0).all()
     np.testing.assert_allclose(factors, np.repeat(factors[:, :1], 8, axis=1))
     assert worst(problem, basis, queries, cubature) <= 0.02
-
-
-def test_points_are_cheaper_than_elements(problem, basis, forces, queries, rng):
     points, elements = forces.by_point(80, rng), forces.by_element(10, rng)
     assert worst(problem, basis, queries, points) < worst(problem, basis, queries, elements)

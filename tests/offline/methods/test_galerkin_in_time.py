@@ -3,29 +3,21 @@
 import numpy as np
 import pytest
 
-from palpate.offline.fem.problem import FullProblem, Load
+from palpate.offline.fem.problem import Load
 from palpate.offline.methods.full import Full
 from palpate.offline.methods.galerkin import Galerkin
 from palpate.offline.methods.method import Case
 from palpate.offline.methods.spaces import modal, pod
-from palpate.offline.scenes import find_scene
 
 STEPS = ((0.5, 0.02), (1.0, 0.05), (1.0, 0.3), (1.0, 2.0), (0.2, 0.01), (0.0, 0.0), (0.0, 0.5))
 """Shares of a pressure at the ends of time steps (s)."""
 
 
 @pytest.fixture(scope="module")
-def problem():
-    scene = find_scene("quick-visco")
-    coarse = scene.geometry.model_copy(update={"divisions": (3, 3, 2)})
-    return FullProblem(scene.model_copy(update={"geometry": coarse}))
-
-
-@pytest.fixture(scope="module")
-def cases(problem):
+def cases(visco_problem):
     down = np.array([0.3, 0.0, -1.0]) / np.hypot(0.3, 1.0)
     at = np.array([4.0, 5.5, 8.0])
-    return [Case.of(problem, Load(at, down, 1.5 * share)) for share, _ in STEPS]
+    return [Case.of(visco_problem, Load(at, down, 1.5 * share)) for share, _ in STEPS]
 
 
 def states(method, cases):
@@ -39,18 +31,18 @@ def states(method, cases):
 
 
 @pytest.fixture(scope="module")
-def exact(problem, cases):
-    return states(Full(problem), cases)
+def exact(visco_problem, cases):
+    return states(Full(visco_problem), cases)
 
 
 @pytest.fixture(scope="module")
-def in_its_own_modes(problem, exact):
+def in_its_own_modes(visco_problem, exact):
     known = np.array([state.displacement.ravel() for state in exact])
-    return Galerkin(problem, pod(problem.model, known, 8), in_time=True, accurate=1e-6)
+    return Galerkin(visco_problem, pod(visco_problem.model, known, 8), in_time=True, accurate=1e-6)
 
 
-def test_a_basis_that_holds_the_history_finds_it(problem, cases, exact, in_its_own_modes):
-    method, full = in_its_own_modes, Full(problem)
+def test_a_basis_that_holds_the_history_finds_it(visco_problem, cases, exact, in_its_own_modes):
+    method, full = in_its_own_modes, Full(visco_problem)
     found = states(method, cases)
     for name, off in (("displacement", 1e-4), ("von_mises", 1e-3)):
         ours, true = (
@@ -59,14 +51,8 @@ def test_a_basis_that_holds_the_history_finds_it(problem, cases, exact, in_its_o
         np.testing.assert_allclose(ours, true, atol=off * np.abs(true[3]).max())
 
 
-def test_it_remembers_at_the_points_what_the_full_model_does(cases, exact, in_its_own_modes):
-    found = in_its_own_modes.history(states(in_its_own_modes, cases)[4]).points[..., :6]
-    true = exact[4].points[..., :6]
-    np.testing.assert_allclose(found, true, atol=1e-3 * np.abs(true).max())
-
-
-def test_few_modes_are_stiffer_and_a_step_changes_no_state(problem, cases, exact):
-    method = Galerkin(problem, modal(problem.model, 6), in_time=True)
+def test_few_modes_are_stiffer_and_a_step_changes_no_state(visco_problem, cases, exact):
+    method = Galerkin(visco_problem, modal(visco_problem.model, 6), in_time=True)
     first = method.at_rest()
     second = method.step(first, cases[0], 0.02).state
     assert not method.opened(first).q.any()
@@ -77,7 +63,7 @@ def test_few_modes_are_stiffer_and_a_step_changes_no_state(problem, cases, exact
     assert 0.0 < work[0] < work[1]
 
 
-def test_time_does_not_go_back(problem, cases, in_its_own_modes):
-    for method in (Full(problem), in_its_own_modes):
+def test_time_does_not_go_back(visco_problem, cases, in_its_own_modes):
+    for method in (Full(visco_problem), in_its_own_modes):
         with pytest.raises(ValueError, match="dt"):
             method.step(method.at_rest(), cases[0], -0.1)

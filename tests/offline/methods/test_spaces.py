@@ -57,16 +57,12 @@ def missed(model, basis, u):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_basis_is_orthonormal_in_the_energy_at_rest(spaces, model, name):
+def test_a_basis_is_orthonormal_in_the_energy_at_rest_and_holds_smaller_ones(spaces, model, name):
     basis = spaces[name](SIZE)
     assert basis.shape == (len(model.free), SIZE)
     gram = basis.T @ (model.rest_stiffness @ basis)
     np.testing.assert_allclose(gram, np.eye(SIZE), atol=1e-9)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_a_larger_basis_holds_the_smaller(spaces, model, name):
-    assert missed(model, spaces[name](SIZE), spaces[name](SIZE // 2)).max() <= 1e-6
+    assert missed(model, basis, spaces[name](SIZE // 2)).max() <= 1e-6
 
 
 def test_the_mass_of_a_linear_field_is_its_integral(problem, M):
@@ -96,13 +92,12 @@ def test_ritz_vectors_of_a_load_are_wilson_s_sequence(model, M, loads):
     assert missed(model, basis[:, :2], second).max() <= 1e-9
 
 
-def test_a_block_holds_every_load_s_own_vectors_moment_by_moment(model, M, loads):
+def test_a_block_holds_every_load_s_own_vectors_and_a_load_given_twice_adds_nothing(
+    model, M, loads
+):
     basis = krylov(model, M, loads, 2 * loads.shape[1])
     for load in loads.T:
         assert missed(model, basis, krylov(model, M, load[:, None], 2)).max() <= 1e-6
-
-
-def test_a_load_given_twice_adds_nothing(model, M, loads):
     once = krylov(model, M, loads[:, :3], 6)
     twice = krylov(model, M, np.hstack([loads[:, :3], 2 * loads[:, :3]]), 6)
     assert missed(model, once, twice).max() <= 1e-6
@@ -122,14 +117,6 @@ def test_static_derivatives_are_of_third_order_in_the_load(problem, queries):
     assert errors[0] < 0.01
     assert errors[0] / errors[1] == pytest.approx(8, rel=0.3)
     assert errors[1] / errors[2] == pytest.approx(8, rel=0.3)
-
-
-def test_they_hold_the_linear_answer_of_several_contacts(problem, queries):
-    case = Case.of(problem, *(load for load, _ in queries[:2]))
-    loads = loads_about(problem, case)
-    total = np.zeros_like(problem.mesh.nodes)
-    total[case.nodes] = case.forces
-    np.testing.assert_allclose(loads[:, 0], total.ravel(), atol=1e-12 * np.abs(total).max())
 
 
 def test_energy_pod_leaves_least_energy_and_euclidean_pod_least_length(spaces, model, training):

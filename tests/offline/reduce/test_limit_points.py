@@ -5,42 +5,29 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from palpate.offline.reduce.limit_points import (
-    FAR,
-    MARGIN,
-    REACH,
-    SLIP_REACH,
-    limit_load_share,
-    lowered_depths,
-    lowered_limits,
-    path_independent_share,
-)
+from palpate.offline.reduce import limit_points
+from palpate.offline.reduce.limit_points import FAR, MARGIN, REACH, SLIP_REACH
 from palpate.shared.errors import QueryError
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH
-from palpate.shared.model import ReducedModel
 
-LIMIT = 2.0
-
-RADIUS = 2.0
-
+LIMIT = RADIUS = 2.0
 EDGE = 5.0
 
 
 class Plate:
     """Softening tissue of a flat surface, 10 mm wide, that snaps at a pressure near one corner."""
 
+    lost = np.inf, np.inf
+    """Between these pressures no equilibrium is found."""
+
     def __init__(self, snap):
         x = np.linspace(0.0, 10.0, 21)
-        corners = np.arange(21 * 21).reshape(21, 21)
-        a, b = corners[:-1, :-1].ravel(), corners[1:, :-1].ravel()
-        c, d = corners[1:, 1:].ravel(), corners[:-1, 1:].ravel()
+        a = np.add.outer(21 * np.arange(20), np.arange(20)).ravel()  # corners of squares
+        triangles = np.vstack([np.stack([a, a + 21, a + 22], 1), np.stack([a, a + 22, a + 1], 1)])
         vertices = np.stack([*np.meshgrid(x, x, indexing="ij"), np.zeros((21, 21))], axis=2)
-        self.surface = Surface(
-            vertices.reshape(-1, 3),
-            np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.int32),
-            np.tile([0.0, 0.0, 1.0], (21 * 21, 1)),
-        )
+        normals = np.tile([0.0, 0.0, 1.0], (21 * 21, 1))
+        self.surface = Surface(vertices.reshape(-1, 3), triangles.astype(np.int32), normals)
         self.limits = np.tile(np.eye(LIMIT_FIELDS)[1:4].sum(axis=0), (21 * 21, 1))
         self.limits[:, 0] = LIMIT
         self.models = SimpleNamespace(centres=np.zeros((40, 3)))
@@ -51,24 +38,24 @@ class Plate:
         moved = pressure**1.8
         if pressure > self.snap and np.hypot(*position[:2]) < 2.0:
             moved *= 1.2
-        return SimpleNamespace(converged=True, parts=((0, 1.0, np.array([moved])),))
-
-
-def limits_of(atlas, rng):
-    """Limits of a plate or an atlas lowered where it gives way."""
-    return lowered_limits(
-        atlas.surface, atlas.limits, atlas.scene, len(atlas.models.centres), asking(atlas), rng
-    )
-
-
-def depths_of(atlas, rng):
-    """The same of depths."""
-    count = len(atlas.models.centres)
-    return lowered_depths(atlas.surface, atlas.limits, count, asking(atlas), rng)
+        found = not self.lost[0] < pressure < self.lost[1]
+        return SimpleNamespace(
+            converged=found, parts=((0, 1.0, np.array([moved if found else np.inf])),)
+        )
 
 
 def asking(atlas):
     return lambda _, function, rows: [function(atlas, *row) for row in rows]
+
+
+def limits_of(atlas, rng):
+    """Limits of a plate or an atlas lowered where it gives way."""
+    return limit_points.lowered_limits(atlas, asking(atlas), rng)
+
+
+def depths_of(atlas, rng):
+    """The same of depths."""
+    return limit_points.lowered_depths(atlas, asking(atlas), rng)
 
 
 @pytest.mark.parametrize("snap", [0.78, 0.98, 1.03])
@@ -84,28 +71,15 @@ def test_the_range_ends_before_the_tissue_gives_way_and_only_there(snap, rng):
     np.testing.assert_array_equal(plate.limits[:, 0], LIMIT)  # the atlas's own is left alone
 
 
-def test_softening_tissue_keeps_its_range(rng):
-    plate = Plate(np.inf)
+def test_tissue_that_only_softens_and_slips_off_nowhere_keeps_its_range(rng):
+    plate, edge = Plate(np.inf), Edge(slip=np.inf)
     np.testing.assert_array_equal(limits_of(plate, rng), plate.limits)
+    np.testing.assert_array_equal(depths_of(edge, rng), edge.limits)
 
 
-def test_an_unconverged_answer_is_no_jump():
-    plate = Plate(np.inf)
-    sound = plate.press
-
-    def press(position, pressure, direction):
-        answer = sound(position, pressure, direction)
-        if 0.9 * LIMIT < pressure < 0.97 * LIMIT:
-            answer = SimpleNamespace(converged=False, parts=((0, 1.0, np.full(1, np.inf)),))
-        return answer
-
-    plate.press = press
-    assert limit_load_share(plate, np.zeros(3), np.array([0.0, 0.0, -1.0]), LIMIT) == 1.0
-
-
-def test_a_trained_scene_does_not_give_way_in_its_range(artifact, rng):
-    atlas = ReducedModel.load(artifact)
+def test_a_trained_slab_hardly_gives_way_in_its_range_and_nothing_slips_off(atlas, rng):
     assert (limits_of(atlas, rng)[:, 0] >= 0.7 * atlas.limits[:, 0]).all()
+    np.testing.assert_array_equal(depths_of(atlas, rng), atlas.limits)
 
 
 class Side:
@@ -120,6 +94,9 @@ class Side:
 class Edge(Plate):
     """Tissue with an edge across it that a deep tip carries along, 1 mm at most."""
 
+    blind = False
+    """Whether no way leads to an answer on the near side."""
+
     def __init__(self, slip):
         super().__init__(np.inf)
         self.limits[:, TIP_DEPTH] = 1.0
@@ -131,6 +108,8 @@ class Edge(Plate):
         return Side()
 
     def touch(self, position, warm=None):
+        if self.blind and warm is not None and position[0] < EDGE:
+            raise QueryError("position", "below the surface")
         depth, beyond = RADIUS - position[2], position[0] - EDGE
         side = np.sign(beyond) or 1.0
         if warm is not None:
@@ -152,24 +131,8 @@ def test_the_depth_ends_where_the_way_to_a_contact_matters_and_only_there(rng):
     np.testing.assert_array_equal(plate.limits[:, TIP_DEPTH], 1.0)
 
 
-def test_tissue_that_slips_off_nowhere_keeps_its_depth(rng):
-    plate = Edge(slip=np.inf)
-    np.testing.assert_array_equal(depths_of(plate, rng), plate.limits)
-
-
-def test_a_way_with_no_answer_tells_nothing():
-    plate = Edge(slip=0.5)
-    sound = plate.touch
-
-    def touch(position, warm=None):
-        if warm is not None and position[0] < EDGE:
-            raise QueryError("position", "below the surface")
-        return sound(position, warm)
-
-    plate.touch = touch
-    assert path_independent_share(plate, np.array([EDGE + 0.1, 5.0, 0.0])) == 1.0
-
-
-def test_nothing_slips_off_a_trained_slab(artifact, rng):
-    atlas = ReducedModel.load(artifact)
-    np.testing.assert_array_equal(depths_of(atlas, rng), atlas.limits)
+def test_what_has_no_answer_is_no_jump_and_tells_nothing_of_the_way():
+    plate, edge, down = Plate(np.inf), Edge(slip=0.5), np.array([0.0, 0.0, -1.0])
+    plate.lost, edge.blind = (0.9 * LIMIT, 0.97 * LIMIT), True
+    assert limit_points.limit_load_share(plate, np.zeros(3), down, LIMIT) == 1.0
+    assert limit_points.path_independent_share(edge, np.array([EDGE + 0.1, 5.0, 0.0])) == 1.0

@@ -7,18 +7,16 @@ from pathlib import Path
 import palpate.offline
 from palpate.offline.run.streams import Stage, stream
 
-OWN = {"footprint_models.py", "streams.py"}
+MAKERS = {"footprint_models.py", "streams.py"}
 """Sources that may make random numbers: of a scene's or a local model's seed alone."""
 
-
-def sources():
-    """Text of all that takes part in training, by name."""
-    folder = Path(palpate.offline.__file__).parent
-    paths = [
-        folder / "train.py",
-        *(p for name in ("fem", "reduce", "run", "validate") for p in folder.glob(f"{name}/*.py")),
-    ]
-    return {path.name: path.read_text() for path in paths}
+FOLDER = Path(palpate.offline.__file__).parent
+SOURCES = {
+    path.name: path.read_text()
+    for part in ("train.py", "fem/*.py", "reduce/*.py", "run/*.py", "validate/*.py")
+    for path in FOLDER.glob(part)
+}
+"""Text of all that takes part in training."""
 
 
 def test_no_two_stages_share_a_stream():
@@ -27,12 +25,8 @@ def test_no_two_stages_share_a_stream():
         assert drawn[one] != drawn[other], f"{one.name} and {other.name}"
 
 
-def test_stages_of_training_take_their_numbers_from_the_enumeration():
-    makers = {name for name, text in sources().items() if "default_rng(" in text}
-    assert makers == OWN
-
-
-def test_no_stage_is_drawn_from_in_two_places_of_training():
-    used = re.findall(r"Stage\.([A-Z_]+)", "".join(sources().values()))
+def test_training_takes_its_numbers_from_the_enumeration_and_each_stage_in_one_place():
+    assert {name for name, text in SOURCES.items() if "default_rng(" in text} == MAKERS
+    used = re.findall(r"Stage\.([A-Z_]+)", "".join(SOURCES.values()))
     assert len(used) > 10
     assert sorted(used) == sorted(set(used))

@@ -14,29 +14,15 @@ from palpate.online.session import frames
 from palpate.online.session.frames import REPLY, REQUEST, Flag, Output, Reason
 
 EXAMPLES = Path(__file__).parents[3] / "online" / "client" / "examples"
+PLUS, SHARP = EXAMPLES / "palpate_session.hpp", EXAMPLES / "SessionStep.cs"
 COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
 
-SHARP_SIZES = {
-    "ushort": 2,
-    "Output": 2,
-    "Flag": 2,
-    "Reason": 4,
-    "uint": 4,
-    "float": 4,
-    "double": 8,
-    "ShortVector": 12,
-    "Models": 16,
-    "Weights": 16,
-    "Vector": 24,
-    "Matrix": 72,
-}
+SIZES = {"ushort": 2, "Output": 2, "Flag": 2, "Reason": 4, "uint": 4, "float": 4, "double": 8}
+SIZES |= {"ShortVector": 12, "Models": 16, "Weights": 16, "Vector": 24, "Matrix": 72}
 PLUS_TYPES = {
-    "std::uint16_t": "uint16",
-    "std::uint32_t": "uint32",
-    "std::int32_t": "int32",
-    "float": "float32",
-    "double": "float64",
-}
+    "std::uint16_t": "uint16", "std::uint32_t": "uint32", "std::int32_t": "int32",
+    "float": "float32", "double": "float64",
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -85,33 +71,25 @@ def test_cpp_tells_what_is_wrong(program, url):
 
 
 @pytest.mark.parametrize(("struct", "dtype"), [("Request", REQUEST), ("Reply", REPLY)])
-def test_members_in_cpp_are_the_fields_in_order(struct, dtype):
-    source = (EXAMPLES / "palpate_session.hpp").read_text()
-    body = re.search(rf"struct {struct} {{(.*?)}};", source, re.S)[1]
-    members = re.findall(r"([\w:]+) (\w+)((?:\[\d\])*);", body)
-    found = [
+def test_members_in_cpp_and_csharp_are_the_fields(struct, dtype):
+    plus, sharp = PLUS.read_text(), SHARP.read_text()
+    body = re.search(rf"struct {struct} {{(.*?)}};", plus, re.S)[1]
+    assert [
         (name, PLUS_TYPES[kind], tuple(map(int, re.findall(r"\d", shape))))
-        for kind, name, shape in members
-    ]
-    assert found == [(n, k.base.name, k.shape) for n, (k, _) in dtype.fields.items()]
-
-
-@pytest.mark.parametrize(("struct", "dtype"), [("Request", REQUEST), ("Reply", REPLY)])
-def test_offsets_in_csharp_are_those_of_the_layout(struct, dtype):
-    source = (EXAMPLES / "SessionStep.cs").read_text()
-    size, body = re.search(
-        rf"Size = (\d+)\)\]\s+public struct {struct}\s+{{(.*?)\n    }}", source, re.S
-    ).groups()
+        for kind, name, shape in re.findall(r"([\w:]+) (\w+)((?:\[\d\])*);", body)
+    ] == [(name, kind.base.name, kind.shape) for name, (kind, _) in dtype.fields.items()]
+    declared = rf"Size = (\d+)\)\]\s+public struct {struct}\s+{{(.*?)\n    }}"
+    size, body = re.search(declared, sharp, re.S).groups()
     assert int(size) == dtype.itemsize
-    members = re.findall(r"\[FieldOffset\((\d+)\)\] public (\w+) (\w+);", body)
-    found = [(name, int(offset), SHARP_SIZES[kind]) for offset, kind, name in members]
-    assert found == [(camel(n), o, k.itemsize) for n, (k, o) in dtype.fields.items()]
+    assert [
+        (name, int(offset), SIZES[kind])
+        for offset, kind, name in re.findall(r"\[FieldOffset\((\d+)\)\] public (\w+) (\w+);", body)
+    ] == [(camel(name), offset, kind.itemsize) for name, (kind, offset) in dtype.fields.items()]
 
 
 @pytest.mark.parametrize("bits", [Output, Flag, Reason])
 def test_bits_are_the_same_everywhere(bits):
-    plus = (EXAMPLES / "palpate_session.hpp").read_text()
-    sharp = (EXAMPLES / "SessionStep.cs").read_text()
+    plus, sharp = PLUS.read_text(), SHARP.read_text()
     for source, name in ((plus, str.lower), (sharp, camel)):
         body = re.search(rf"enum {bits.__name__} : [\w:]+\s*{{(.*?)}}", source, re.S)[1]
         found = {key: int(value) for key, value in re.findall(r"(\w+) = (\d+)", body)}

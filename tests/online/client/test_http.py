@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from palpate.online.client.http import Client, ServiceError
-from palpate.online.serve.settings import Settings
 from palpate.shared.errors import PalpateError
 
 from ..conftest import place_comes_free
@@ -39,13 +38,10 @@ def test_refusals_are_raised(url):
         assert refused.value.status == 404
 
 
-@pytest.mark.parametrize("url", ["toy", "https://127.0.0.1:1", "http://"])
-def test_other_addresses_are_refused(url):
-    with pytest.raises(PalpateError, match="not an address"):
-        Client(url)
-
-
-def test_where_no_service_answers_is_said():
+def test_other_addresses_are_refused_and_where_no_service_answers_is_said():
+    for url in ("toy", "https://127.0.0.1:1", "http://"):
+        with pytest.raises(PalpateError, match="not an address"):
+            Client(url)
     with socket.create_server(("127.0.0.1", 0)) as bound:
         port = bound.getsockname()[1]
     with pytest.raises(PalpateError, match="no service answers there"):
@@ -54,7 +50,7 @@ def test_where_no_service_answers_is_said():
 
 def test_a_session_that_cannot_be_recorded_is_closed(serving, tmp_path):
     """There is no such folder: the error is told, and the session's place is free again."""
-    with serving(Settings(tmp_path, max_sessions=1), toy=FakeModel()) as url, Client(url) as client:
+    with serving(max_sessions=1) as url, Client(url) as client:
         with pytest.raises(FileNotFoundError):
             client.session("toy", record=tmp_path / "missing" / "session.h5")
         place_comes_free(url).close()

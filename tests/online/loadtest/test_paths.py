@@ -40,15 +40,10 @@ def test_it_covers_the_surface(surface, path):
     assert max(distance) < 2.0
 
 
-def test_equal_seeds_make_equal_paths(surface):
-    times = np.linspace(0.0, 2.0, 50)
-    one, two = (tool_path(surface, TIP, times, np.random.default_rng(3)) for _ in range(2))
-    np.testing.assert_array_equal(one, two)
-
-
-def test_the_rate_does_not_change_the_path(surface):
-    coarse, fine = np.linspace(0.0, 2.0, 51), np.linspace(0.0, 2.0, 501)
-    one, two = (
-        tool_path(surface, TIP, times, np.random.default_rng(3)) for times in (coarse, fine)
+def test_neither_the_rate_nor_chance_changes_the_path(surface):
+    one, same, two = (
+        tool_path(surface, TIP, np.linspace(0.0, 2.0, count), np.random.default_rng(3))
+        for count in (51, 51, 501)
     )
+    np.testing.assert_array_equal(one, same)
     np.testing.assert_allclose(one, two[::10], atol=1e-9)

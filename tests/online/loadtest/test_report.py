@@ -39,31 +39,20 @@ def test_quantiles_are_those_of_the_values(rng):
     assert quantiles(np.full(3, np.nan))["p50_us"] is None
 
 
-def test_latency_counts_from_when_a_message_was_due():
-    messages = gather([log([0.5], latency_ms=3.0, late_ms=2.0)])
-    assert messages.latency == pytest.approx([3000.0])
-    assert messages.lateness == pytest.approx([2000.0])
-
-
-def test_streams_are_put_in_one_order():
-    messages = gather([log([0.1, 0.3], 1.0), log([0.2, 0.4], 2.0)])
+def test_latency_counts_from_when_a_message_was_due_and_streams_are_put_in_one_order():
+    messages = gather([log([0.1, 0.3], 3.0, late_ms=2.0), log([0.2, 0.4], 2.0)])
     assert messages.due == pytest.approx([0.1, 0.2, 0.3, 0.4])
-    assert messages.latency == pytest.approx([1000.0, 2000.0, 1000.0, 2000.0])
+    assert messages.latency == pytest.approx([3000.0, 2000.0, 3000.0, 2000.0])
+    assert messages.lateness == pytest.approx([2000.0, 0.0, 2000.0, 0.0])
 
 
 def test_a_window_is_clean_if_host_and_generator_were_on_time():
     due = np.arange(0.05, 5.0, 0.1)
     late = np.where((due > 2.0) & (due < 2.1), 0.5, 0.01)
     messages = gather([log(due, late_ms=late)])
-    assert clean_windows(machine(5, steal=[4]), messages).tolist() == [
-        True,
-        True,
-        False,
-        True,
-        False,
-    ]
+    assert clean_windows(machine(5, steal=[4]), messages).tolist() == [1, 1, 0, 1, 0]
     messages.lateness[-12] = np.nan  # never sent
-    assert clean_windows(machine(5), messages).tolist() == [True, True, False, False, True]
+    assert clean_windows(machine(5), messages).tolist() == [1, 1, 0, 0, 1]
 
 
 def test_what_became_of_messages_is_told_apart():
@@ -100,23 +89,18 @@ def test_recovery_is_when_latencies_are_as_before(slow_until, recovered):
     assert found["during"]["p50_us"] == pytest.approx(50_000.0, rel=1e-3)
 
 
-def test_a_lost_message_is_no_recovery():
+@pytest.mark.parametrize(
+    ("begin", "end", "fate", "recovered"),
+    [
+        (4.8, 4.9, LOST, 1.0),  # in the last window but one: no recovery
+        (2.0, 4.5, SUPERSEDED, 0.0),  # neither hides a recovery
+        (0.0, 6.0, LOST, None),
+    ],
+)
+def test_lost_messages_are_no_recovery_and_superseded_ones_do_not_count(
+    begin, end, fate, recovered
+):
     due = np.arange(0.01, 6.0, 0.01)
-    outcome = np.full(len(due), ANSWERED)
-    outcome[-120:-110] = LOST  # in the last window but one
-    messages = gather([log(due, outcome=outcome)])
-    found = summarize_overload(messages, machine(6), 2.0, 4.0)
-    assert found["recovered_s"] == 1.0
-
-
-def test_superseded_frames_do_not_hide_a_recovery_nor_make_one():
-    due = np.arange(0.01, 6.0, 0.01)
-    outcome = np.full(len(due), ANSWERED)
-    outcome[(due > 2.0) & (due < 4.5)] = SUPERSEDED
-    messages = gather([log(due, outcome=outcome)])
-    found = summarize_overload(messages, machine(6), 2.0, 4.0)
-    assert found["recovered_s"] == 0.0
-    outcome[:] = LOST
-    messages = gather([log(due, outcome=outcome)])
-    found = summarize_overload(messages, machine(6), 2.0, 4.0)
-    assert found["recovered_s"] is None
+    outcome = np.where((due > begin) & (due < end), fate, ANSWERED)
+    found = summarize_overload(gather([log(due, outcome=outcome)]), machine(6), 2.0, 4.0)
+    assert found["recovered_s"] == recovered

@@ -3,6 +3,7 @@
 import json
 import re
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -11,8 +12,6 @@ from palpate.online.loadtest.report import table
 from palpate.online.loadtest.run import Plan, run
 from palpate.online.serve.settings import Settings
 from palpate.shared.errors import PalpateError
-
-from ..fake_model import FakeModel
 
 
 @pytest.mark.parametrize("region", ["none", "all"])
@@ -36,6 +35,16 @@ def test_no_frame_of_a_session_is_lost(url):
     assert len(outcome.messages["frames"].due) == 200
     assert len(outcome.messages["queries"].due) == 10
 
+    for (
+        messages
+    ) in outcome.messages.values():  # none before it is due, and latency counts from then
+        assert (messages.lateness >= 0).all()
+        known = np.isfinite(messages.latency)
+        assert (messages.latency > messages.lateness)[known].all()
+    borders = np.diff(outcome.machine.borders)
+    assert (borders > 0).all()
+    assert len(outcome.machine.steal) == len(borders)
+
 
 def test_superseded_frames_are_told_from_lost_ones(url):
     plan = Plan(url, "toy", sessions=1, rate=9000.0, duration=0.5)
@@ -44,14 +53,26 @@ def test_superseded_frames_are_told_from_lost_ones(url):
     assert summary["lost"] == 0
 
 
-def test_a_session_that_is_refused_says_why(url):
-    with pytest.raises(PalpateError, match="16 sessions are open"):
-        run(Plan(url, "toy", sessions=Settings.max_sessions + 1))
+def test_a_session_that_the_service_ends_is_told_and_the_other_goes_on(serving):
+    with serving(session_idle=0.15) as url:
+        plan = Plan(url, "toy", sessions=1, rate=3.0, queries=20.0, duration=1.0)
+        summary = run(plan).summary
+    assert "no frame for" in summary["complaints"][0]
+    assert summary["lost"] > 0
+    assert summary["queries"]["answered"] == 20
 
 
-def test_a_load_of_nothing_is_refused(url):
-    with pytest.raises(PalpateError, match="--sessions or --queries-per-second"):
-        run(Plan(url, "toy", sessions=0))
+@pytest.mark.parametrize(
+    ("plan", "why"),
+    [
+        ({"sessions": Settings.max_sessions + 1}, "16 sessions are open"),
+        ({"sessions": 0}, "--sessions or --queries-per-second"),
+        ({"duration": 0.5, "echo": True}, "palpate serve --echo"),
+    ],
+)
+def test_what_cannot_be_done_is_refused(url, plan, why):
+    with pytest.raises(PalpateError, match=why):
+        run(Plan(url, "toy", **plan))
 
 
 def test_too_much_is_refused_and_told_apart(url):
@@ -62,8 +83,8 @@ def test_too_much_is_refused_and_told_apart(url):
     assert set(summary["overload"]) == {"before", "during", "after", "recovered_s"}
 
 
-def test_what_the_service_adds_is_measured(serving, tmp_path):
-    with serving(Settings(tmp_path, echo=True, token="secret"), toy=FakeModel()) as url:
+def test_what_the_service_adds_is_measured(serving):
+    with serving(echo=True, token="secret") as url:
         plan = Plan(url, "toy", rate=100.0, queries=50.0, duration=0.5, echo=True, token="secret")
         outcome = run(plan)
     assert {name: len(m.due) for name, m in outcome.messages.items()} == {
@@ -73,11 +94,6 @@ def test_what_the_service_adds_is_measured(serving, tmp_path):
     for added in outcome.summary["added"].values():
         assert 0 < added["added_us"] < 10 * added["empty_us"]
     assert "times an empty round trip" in table(outcome.summary)
-
-
-def test_without_an_echo_it_cannot_be_measured(url):
-    with pytest.raises(PalpateError, match="palpate serve --echo"):
-        run(Plan(url, "toy", duration=0.5, echo=True))
 
 
 def test_the_command_prints_json_and_draws(url, tmp_path):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from palpate.online.loadtest.generator import ANSWERED, LOST, SUPERSEDED
-from palpate.online.loadtest.sessions import FrameStream, _frame
-from palpate.online.session.frames import REPLY, REQUEST, Flag, decode_request
+from palpate.online.loadtest.streams import FrameStream
+from palpate.online.session.frames import REPLY, REQUEST, Flag
 
 POSITIONS = np.arange(15.0).reshape(5, 3)
 
@@ -31,21 +31,6 @@ def reply(number, superseded=0, payload=b""):
     if len(body) < 2**16:
         return b"\x82\x7e" + len(body).to_bytes(2, "big") + body
     return b"\x82\x7f" + len(body).to_bytes(8, "big") + body
-
-
-def test_frames_are_those_of_the_layout(session):
-    for number in (0, 3):
-        session.send(number, now=7)
-        message = session.far.recv(1000)
-        opcode, begin, end = _frame(message[:1] + bytes([message[1] & 0x7F]) + message[2:], 0, 99)
-        assert (opcode, end - begin) == (2, REQUEST.itemsize)
-        assert message[2:6] == bytes(4)  # a mask that changes nothing
-        request = decode_request(message[6:])
-        assert request.seq == number
-        assert request.client_time == number / 10
-        assert request.position == tuple(POSITIONS[number])
-        assert request.outputs == 2
-        assert session.log.sent[number] == 7
 
 
 @pytest.mark.parametrize("payload", [b"", bytes(70_000)])

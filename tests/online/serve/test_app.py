@@ -4,10 +4,13 @@ import pytest
 from starlette.testclient import TestClient
 
 from palpate.online.serve.app import create_app
+from palpate.online.serve.schemas import Accessible, Answer, Mesh, SceneList, SceneSummary
 from palpate.online.serve.settings import Settings
 from palpate.online.serve.store import Store
+from palpate.online.serve.wire import BINARY, JSON, MSGPACK
 from palpate.shared.errors import PalpateError
 
+from ..conftest import error_of
 from ..fake_model import FakeModel
 
 
@@ -31,9 +34,7 @@ def test_it_lives_at_once_and_is_ready_when_warm(slow_store, tmp_path):
     with TestClient(app) as client:
         assert client.get("/health").json() == {"status": "ok"}
         for path in ("/ready", "/scenes", "/scenes/toy", "/scenes/toy/mesh"):
-            response = client.get(path)
-            assert response.status_code == 503
-            assert response.json()["error"]["code"] == "not_ready"
+            assert error_of(client.get(path), 503)["code"] == "not_ready"
         loaded.set()
         assert ready.wait(5.0)
         assert client.get("/ready").json() == {"status": "ready"}
@@ -49,10 +50,8 @@ def test_a_service_that_is_told_to_stop_does_not_wait_for_its_models(slow_store,
 
 
 def test_a_service_without_any_model_is_not_ready(serve):
-    with serve(broken=PalpateError("broken.h5: truncated")) as client:
-        response = client.get("/ready")
-        assert response.status_code == 503
-        assert "broken.h5: truncated" in response.json()["error"]["message"]
+    with serve(PalpateError("broken.h5: truncated")) as client:
+        assert "broken.h5: truncated" in error_of(client.get("/ready"), 503)["message"]
         assert client.get("/scenes").json()["refused"]
 
 
@@ -70,17 +69,11 @@ def test_openapi_tells_units_ranges_and_examples(client):
     solve = document["paths"]["/scenes/{name}/solve"]["post"]
     reference = solve["requestBody"]["content"]["application/json"]["schema"]["$ref"]
     assert reference == "#/components/schemas/SolveRequest"
-    assert set(solve["responses"]["200"]["content"]) == {
-        "application/json",
-        "application/octet-stream",
-        "application/msgpack",
-    }
+    assert set(solve["responses"]["200"]["content"]) == {JSON, BINARY, MSGPACK}
 
 
 def test_answers_are_as_documented(client):
     """Hot answers bypass their models at run time, so hold them against the models here."""
-    from palpate.online.serve.schemas import Accessible, Answer, Mesh, SceneList, SceneSummary
-
     example = client.get("/scenes/toy").json()["example"]
     answer = client.post("/scenes/toy/solve", json={**example, "region": "surface"}).text
     documents = {

@@ -36,15 +36,6 @@ def test_a_name_is_served_once(fake_store):
     assert "another file already holds 'toy'" in store.refused[0].reason
 
 
-def test_a_model_that_fails_its_first_answers_is_refused(fake_store):
-    def warm(model):
-        raise Refusal("no_equilibrium", "contacts.0.pressure", "The answer is not finite")
-
-    store = fake_store(toy=FakeModel())
-    store.open(warm)
-    assert "not finite" in store.refused[0].reason
-
-
 def test_nothing_is_given_out_before_all_are_ready(fake_store):
     store = fake_store(toy=FakeModel())
     store.open(ignore)
@@ -52,3 +43,12 @@ def test_nothing_is_given_out_before_all_are_ready(fake_store):
         store.model("toy")
     store.ready = True
     assert store.model("toy").model.name == "toy"
+
+
+def test_a_model_that_fails_its_first_answers_is_refused(fake_store):
+    def warm(model):
+        raise Refusal("no_equilibrium", "contacts.0.pressure", "The answer is not finite")
+
+    store = fake_store(toy=FakeModel())
+    store.open(warm)
+    assert "not finite" in store.refused[0].reason

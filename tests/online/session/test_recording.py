@@ -7,7 +7,6 @@ from click.testing import CliRunner
 
 from palpate.online import commands
 from palpate.online.client.connection import ServiceError
-from palpate.online.client.http import Client
 from palpate.online.client.session import Session
 from palpate.online.session.frames import (
     REPLY_FIELDS,
@@ -28,24 +27,18 @@ from ..fake_model import FakeModel
 @pytest.fixture
 def stiff():
     """Return a toy that needs many strides, so that the number of steps matters."""
-    model = FakeModel()
-    model.stride = 0.3
-    return model
+    return FakeModel(stride=0.3)
 
 
 @pytest.fixture
-def recorded(serving, stiff, tmp_path, rng):
-    """Return the recording of a wild session, and its replies."""
+def recorded(opening, stiff, tmp_path, rng, monkeypatch):
+    """Return the recording of a wild session, written piece by piece, and its replies."""
+    monkeypatch.setattr("palpate.online.session.recording.CHUNK", 10)
     path = tmp_path / "session.h5"
-    positions = rng.uniform([0, 0, 4.5], [10, 10, 8], (100, 3))
-    with (
-        serving(toy=stiff) as url,
-        Client(url) as client,
-        client.session("toy", record=path) as session,
-    ):
+    with opening(stiff, record=path) as session:
         replies = [
             session.step(position, Output.STRESS if i % 3 == 0 else 0)
-            for i, position in enumerate(positions)
+            for i, position in enumerate(rng.uniform([0, 0, 4.5], [10, 10, 8], (100, 3)))
         ]
         for i in range(50):  # without waiting, so that some are superseded
             session.send((5.0, 5.0, 7.0 - 0.01 * i))
@@ -69,24 +62,10 @@ def test_a_recording_holds_what_was_asked_and_answered(recorded):
             assert file[field.name].attrs["description"]
 
 
-def test_a_replay_gives_the_same_answers(recorded, stiff):
-    path, replies = recorded
-    flags = {reply.flags & (Flag.CLAMPED | Flag.FALLBACK) for reply in replies}
-    assert len(flags) > 1
-    report = replay(read_recording(path), stiff)
-    assert report == (len(replies), 0, None, 0.0)
-
-
-def test_snapshots_are_recorded_and_replayed(serving, tmp_path, rng):
-    model = FakeModel(in_time=True)
-    model.stride = 0.3
-    path = tmp_path / "session.h5"
+def test_snapshots_are_recorded_and_replayed(opening, tmp_path, rng):
+    model, path = FakeModel(in_time=True, stride=0.3), tmp_path / "session.h5"
     places = rng.uniform([0, 0, 4.5], [10, 10, 8], (60, 3))
-    with (
-        serving(toy=model) as url,
-        Client(url) as client,
-        client.session("toy", record=path) as session,
-    ):
+    with opening(model, record=path) as session:
         assert session.greeting["longest_step"] == LONGEST
         assert session.greeting["snapshots"] > 0
         for number, place in enumerate(places):
@@ -110,28 +89,17 @@ def test_snapshots_are_recorded_and_replayed(serving, tmp_path, rng):
     assert (report.different, report.force_difference) == (0, 0.0)
 
 
-def test_a_replay_tells_what_differs(recorded, stiff):
-    path, _ = recorded
+def test_a_replay_gives_the_same_answers_and_tells_what_differs(recorded, stiff):
+    path, replies = recorded
     recording = read_recording(path)
+    assert len({reply.flags & (Flag.CLAMPED | Flag.FALLBACK) for reply in replies}) > 1
+    assert replay(recording, stiff) == (len(replies), 0, None, 0.0)
     stiff.stiffness *= 1.0 + 1e-15 * 8
     report = replay(recording, stiff)
     assert report.different > 0
     assert 0 < report.force_difference < 1e-12
     touching = np.flatnonzero(recording.replies["flags"] & Flag.CONTACT)
     assert report.first_different == touching[0]
-
-
-def test_long_sessions_are_written_piece_by_piece(serving, tmp_path, monkeypatch):
-    monkeypatch.setattr("palpate.online.session.recording.CHUNK", 10)
-    path = tmp_path / "session.h5"
-    with (
-        serving(toy=FakeModel()) as url,
-        Client(url) as client,
-        client.session("toy", record=path) as session,
-    ):
-        for i in range(25):
-            session.step((5.0, 5.0, 7.0 - 0.01 * i))
-    assert [request.seq for request in read_recording(path).requests] == list(range(1, 26))
 
 
 @pytest.fixture
@@ -168,27 +136,20 @@ def test_a_reply_to_a_frame_of_the_clients_own_is_left_out(url, tmp_path):
     assert [request.seq for request in read_recording(path).requests] == [reply.seq]
 
 
-def test_other_files_are_refused(tmp_path):
+def test_other_files_and_other_scenes_are_refused(recorded, tmp_path):
     text, foreign, newer = (tmp_path / name for name in ("text", "foreign", "newer"))
     text.write_text("no HDF5")
-    with h5py.File(foreign, "w") as file:
-        file["x"] = [1.0]
-    with h5py.File(newer, "w") as file:
+    with h5py.File(foreign, "w"), h5py.File(newer, "w") as file:
         file.attrs["format"], file.attrs["format_version"] = "palpate-session", 9
     for path, reason in (
         (tmp_path / "missing", "cannot be read"),
         (text, "cannot be read"),
         (foreign, "not a recording"),
         (newer, "version 9"),
+        (recorded[0], "of scene 'toy', the artifact of 'other'"),
     ):
         with pytest.raises(RecordingError, match=reason):
-            read_recording(path)
-
-
-def test_a_recording_of_another_scene_is_refused(recorded):
-    path, _ = recorded
-    with pytest.raises(RecordingError, match="of scene 'toy', the artifact of 'other'"):
-        replay(read_recording(path), FakeModel("other"))
+            replay(read_recording(path), FakeModel("other"))
 
 
 def test_the_command_tells_and_its_exit_code_too(recorded, stiff, monkeypatch):

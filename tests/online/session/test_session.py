@@ -1,8 +1,6 @@
 """Sessions on a real socket: what is answered, what is refused, and how they end."""
 
-import asyncio
 import json
-import time
 
 import numpy as np
 import pytest
@@ -10,18 +8,11 @@ import pytest
 from palpate.online.client.connection import ServiceError, SessionClosed
 from palpate.online.client.http import Client
 from palpate.online.client.session import Session
-from palpate.online.serve.metrics import Metrics
-from palpate.online.serve.settings import Settings
-from palpate.online.serve.store import ServedModel
 from palpate.online.session import frames, protocol
-from palpate.online.session import session as server_session
 from palpate.online.session.frames import Flag, Output, Reason, Request
-from palpate.online.session.session import Sessions, State
-from palpate.online.session.tracker import ToolTracker
-from palpate.online.session.websocket import PENDING, READ_AT, STOPPING
 from palpate.shared.errors import PalpateError
 
-from ..conftest import place_comes_free
+from ..conftest import error_of, place_comes_free
 from ..fake_model import FakeModel
 
 PRESSED = (5.0, 5.0, 6.5)  # half a millimetre deep
@@ -55,13 +46,10 @@ def test_a_position_is_answered_with_force_and_tangent(session):
     assert 0 < reply.solve_time <= reply.server_sent - reply.server_received
     assert 0 < reply.valid_radius < reply.depth
     np.testing.assert_array_equal(reply.model, [3, -1, -1, -1])
-
-
-def test_away_from_the_tissue_force_is_zero_up_to_contact(session):
-    reply = session.step(FREE)
-    assert reply.flags == Flag.CONVERGED | Flag.IN_RANGE
-    assert not reply.force.any()
-    assert reply.valid_radius == pytest.approx(1.0)
+    free = session.step(FREE)
+    assert free.flags == Flag.CONVERGED | Flag.IN_RANGE
+    assert not free.force.any()
+    assert free.valid_radius == pytest.approx(1.0)  # up to contact
 
 
 def test_a_position_without_an_answer_repeats_the_last_good_one_and_claims_nothing(session):
@@ -82,14 +70,11 @@ def test_a_position_without_an_answer_repeats_the_last_good_one_and_claims_nothi
 
 @pytest.mark.parametrize("half", [0, Output.HALF])
 def test_fields_come_when_asked_for(session, half):
-    model = FakeModel()
+    model, kind = FakeModel(), np.float16 if half else np.float32
     touch = model.touch(PRESSED)
-    wanted = Output.COORDINATES | Output.DISPLACEMENT | Output.VON_MISES | Output.STRESS | half
-    reply = session.step(PRESSED, wanted)
-    kind = np.float16 if half else np.float32
-    np.testing.assert_array_equal(
-        reply.displacement, model.displacement(touch, "surface").astype(kind)
-    )
+    reply = session.step(PRESSED, sum(Output) - Output.HALF + half)
+    moved = model.displacement(touch, "surface").astype(kind)
+    np.testing.assert_array_equal(reply.displacement, moved)
     stress = model.von_mises(touch, "all")
     np.testing.assert_array_equal(reply.von_mises, stress[model.surface_nodes].astype(kind))
     assert reply.max_von_mises == stress.max()
@@ -112,8 +97,14 @@ def test_json_says_the_same(session):
     assert set(reply) <= set(binary._fields)
 
 
+def test_json_has_a_limit(opening):
+    with opening(max_json_numbers=10) as session:
+        error = ask(session, json.dumps({"position": PRESSED, "outputs": ["displacement"]}))
+        assert error["error"]["code"] == "too_large_for_json"
+
+
 @pytest.mark.parametrize(
-    ("text", "field"),
+    ("message", "field"),
     [
         ("{", "body"),
         ("[]", "body"),
@@ -123,38 +114,16 @@ def test_json_says_the_same(session):
         ('{"position": [1, 2, 3], "output": []}', "output"),
         ('{"position": [1, 2, 3], "outputs": ["half"]}', "outputs.0"),
         ('{"position": [1, 2, 3], "seq": -1}', "seq"),
+        ('{"snapshot": 99}', "snapshot"),
+        ('{"snapshot": 1, "restore": 1}', "snapshot"),
+        ('{"restore": null}', "snapshot"),
+        ('{"snapshot": "a"}', "snapshot"),
+        (frames.encode_request(Request(1, 0.0, (0.0, -np.inf, 0.0))), "position"),
+        (frames.encode_request(Request(1, 0.0, PRESSED)) + b"\0", "frame"),
     ],
 )
-def test_wrong_json_names_the_field_and_the_session_goes_on(session, text, field):
-    assert ask(session, text)["error"]["field"] == field
-    assert session.step(PRESSED).good
-
-
-def test_json_has_a_limit(serving, tmp_path):
-    with (
-        serving(Settings(tmp_path, max_json_numbers=10), toy=FakeModel()) as url,
-        Session(url, "toy") as session,
-    ):
-        error = ask(session, json.dumps({"position": PRESSED, "outputs": ["displacement"]}))
-        assert error["error"]["code"] == "too_large_for_json"
-
-
-@pytest.mark.parametrize(
-    ("request_", "field"),
-    [
-        (Request(1, float("nan"), PRESSED), "client_time"),
-        (Request(1, 0.0, (float("nan"), 0.0, 0.0)), "position"),
-        (Request(1, 0.0, (0.0, float("-inf"), 0.0)), "position"),
-        (Request(1, 0.0, PRESSED, 1 << 15), "outputs"),
-        (None, "frame"),
-    ],
-)
-def test_a_frame_of_nonsense_names_the_field_and_the_session_goes_on(session, request_, field):
-    whole = b"\x02\x00" + bytes(39)  # a byte too long
-    session._connection.send(whole if request_ is None else frames.encode_request(request_))
-    with pytest.raises(ServiceError) as error:
-        session.receive()
-    assert (error.value.code, error.value.field) == ("invalid_frame", field)
+def test_what_is_wrong_is_named_and_the_session_goes_on(session, message, field):
+    assert ask(session, message)["error"]["field"] == field
     assert session.step(PRESSED).good
 
 
@@ -167,9 +136,9 @@ def test_another_version_is_told_and_ends_the_session(session):
     assert closed.value.code == 4001
 
 
-def test_an_answer_that_is_not_finite_stays_inside(serving):
+def test_an_answer_that_is_not_finite_stays_inside(opening):
     model = FakeModel()
-    with serving(toy=model) as url, Session(url, "toy") as session:
+    with opening(model) as session:
         model.poison = True
         reply = session.step(PRESSED)
         assert reply.flags == Flag.FALLBACK
@@ -178,9 +147,7 @@ def test_an_answer_that_is_not_finite_stays_inside(serving):
 
 def test_a_session_has_a_history_of_its_own(serving):
     """Not that of one beside it; nor of one before it, of more than are kept at hand."""
-    model = FakeModel()
-    model.stride = 0.2
-    with serving(toy=model) as url:
+    with serving(FakeModel(stride=0.2)) as url:
         with Session(url, "toy") as one, Session(url, "toy") as other:
             for step in (0.0, 0.1):
                 assert one.step((5.0 + step, 5.0, 6.5)).good
@@ -190,8 +157,8 @@ def test_a_session_has_a_history_of_its_own(serving):
                 assert session.step((float(i), 1.0, 6.5)).good
 
 
-def test_too_many_sessions_are_refused(serving, tmp_path):
-    with serving(Settings(tmp_path, max_sessions=1), toy=FakeModel()) as url:
+def test_too_many_sessions_are_refused(serving):
+    with serving(max_sessions=1) as url:
         with Session(url, "toy"):
             with pytest.raises(ServiceError, match="1 sessions are open") as refused:
                 Session(url, "toy")
@@ -200,11 +167,8 @@ def test_too_many_sessions_are_refused(serving, tmp_path):
         place_comes_free(url).close()
 
 
-def test_a_silent_session_is_closed(serving, tmp_path):
-    with (
-        serving(Settings(tmp_path, session_idle=0.1), toy=FakeModel()) as url,
-        Session(url, "toy") as session,
-    ):
+def test_a_silent_session_is_closed(opening):
+    with opening(session_idle=0.1) as session:
         with pytest.raises(SessionClosed, match="no frame for") as closed:
             session.receive()
         assert closed.value.code == 4000
@@ -220,9 +184,7 @@ def test_an_unknown_scene_has_no_session(url, caplog):
 
 
 def test_a_scene_without_a_tip_has_no_session(serving):
-    model = FakeModel()
-    model.has_tip = False
-    with serving(toy=model, other=FakeModel("other")) as url:
+    with serving(FakeModel(has_tip=False), FakeModel("other")) as url:
         with pytest.raises(ServiceError, match="trained without a tip") as refused:
             Session(url, "toy")
         assert (refused.value.status, refused.value.code) == (404, "no_tip")
@@ -232,14 +194,9 @@ def test_a_scene_without_a_tip_has_no_session(serving):
             assert session.step(PRESSED).good
 
 
-def test_without_a_handshake_there_is_no_session(client):
-    response = client.get("/scenes/toy/session")
-    assert response.status_code == 426
-    assert response.json()["error"]["code"] == "upgrade_required"
+def test_without_a_handshake_there_is_no_session_but_its_description(client):
+    assert error_of(client.get("/scenes/toy/session"), 426)["code"] == "upgrade_required"
     assert client.get("/scenes/other/session").status_code == 404
-
-
-def test_the_layout_is_in_the_description_of_the_service(client):
     document = client.get("/openapi.json").json()
     responses = document["paths"]["/scenes/{name}/session"]["get"]["responses"]
     assert protocol.tables() in responses["101"]["description"]
@@ -251,84 +208,7 @@ def test_a_session_closed_by_its_client_says_so(session):
         session.step(PRESSED)
 
 
-@pytest.mark.parametrize(
-    ("text", "field"),
-    [
-        ('{"snapshot": 99}', "snapshot"),
-        ('{"snapshot": 1, "restore": 1}', "snapshot"),
-        ('{"restore": null}', "snapshot"),
-        ('{"snapshot": "a"}', "snapshot"),
-    ],
-)
-def test_a_command_that_makes_no_sense_is_refused(session, text, field):
-    assert ask(session, text)["error"]["field"] == field
-    assert session.step(PRESSED).good
-
-
-class Line:
-    """A client in place of a socket, of which `Sessions` serves one session."""
-
-    def __init__(self, *messages):
-        self.messages = list(messages)
-        self.sent, self.tasks = [], 0
-
-    async def receive(self):
-        if self.messages:
-            return self.messages.pop(0)
-        return await asyncio.Future()  # silence
-
-    async def send(self, message):
-        await asyncio.sleep(0)
-        self.sent.append(message)
-        self.tasks = len(asyncio.all_tasks())
-
-    def run(self, tmp_path, **settings):
-        extensions = {PENDING: lambda: False, READ_AT: time.perf_counter}
-        sessions = Sessions(None, Settings(tmp_path, **settings), Metrics())
-        model = FakeModel()
-        served = ServedModel(model, {}, list(PRESSED))
-        session = server_session.Session(
-            sessions, served, ToolTracker(model), {"extensions": extensions},
-            self.receive, self.send,
-        )  # fmt: skip
-        asyncio.run(session.run())
-        return session
-
-
-CONNECT, OTHER_VERSION = (
-    {"type": "websocket.connect"},
-    {"type": "websocket.receive", "bytes": b"\0\0"},
-)
-
-
-def test_a_session_goes_through_its_states(tmp_path):
-    """And one that ends is not watched any more: what interrupts it must not stop its last word."""
-    line = Line(CONNECT, OTHER_VERSION)
-    session = line.run(tmp_path)
-    assert session._state is State.CLOSED
-    assert [message["type"] for message in line.sent] == [
-        "websocket.accept", "websocket.send", "websocket.send", "websocket.close"
-    ]  # fmt: skip
-    assert line.tasks == 1
-    with pytest.raises(RuntimeError, match=r"cannot go from State\.CLOSED to State\.WAITING"):
-        session._enter(State.WAITING)
-
-
-@pytest.mark.parametrize(
-    ("last", "closed"),
-    [
-        ({"type": "websocket.disconnect", "code": 1000}, None),
-        ({"type": "websocket.disconnect", "code": STOPPING}, 1001),
-        (None, 4000),
-    ],
-)
-def test_how_a_session_ends(tmp_path, last, closed):
-    line = Line(CONNECT, *([] if last is None else [last]))
-    assert line.run(tmp_path, session_idle=0.02)._state is State.CLOSED
-    assert line.sent[-1].get("code") == closed
-
-
-def ask(session, text):
-    """Send text; return the JSON that comes back."""
-    session._connection.send(text)
+def ask(session, message):
+    """Send a message; return the JSON that comes back."""
+    session._connection.send(message)
     return json.loads(session._connection.receive())

@@ -17,9 +17,11 @@ def model(request):
     return FakeModel(in_time=request.param)
 
 
-@pytest.fixture
-def in_time():
-    return FakeModel(in_time=True)
+def begun(model, *at, **changes):
+    """A tracker of a model changed like this, and its first answer."""
+    vars(model).update(changes)
+    tracker = ToolTracker(model)
+    return tracker, tracker.follow(at, 0.0, 0.0)
 
 
 def is_fallback(answer, good):
@@ -28,26 +30,25 @@ def is_fallback(answer, good):
 
 
 def test_a_position_that_can_be_solved_takes_one_step(model):
-    answer = ToolTracker(model).follow((5.0, 5.0, 6.5), budget=0.0)
+    _, answer = begun(model, 5.0, 5.0, 6.5)
     assert (answer.flags, answer.steps, answer.reason) == (TOUCHING, 1, Reason.NONE)
     np.testing.assert_array_equal(answer.touch.position, [5.0, 5.0, 6.5])
 
 
-def test_a_long_step_is_walked_in_strides(model):
-    model.stride = 0.3
-    tracker = ToolTracker(model)
-    tracker.follow((5.0, 5.0, 6.9), budget=0.0)
+def test_a_long_step_is_walked_in_strides_while_there_is_time(model):
+    tracker, _ = begun(model, 5.0, 5.0, 6.9, stride=0.3)
     answer = tracker.follow((5.9, 5.0, 6.4), budget=10.0)
     assert (answer.flags, answer.reason) == (TOUCHING, Reason.NONE)
     np.testing.assert_array_equal(answer.touch.position, [5.9, 5.0, 6.4])
     assert answer.steps > 4
+    late = tracker.follow((1.0, 5.0, 6.5), budget=0.0)
+    assert is_fallback(late, answer)
+    assert late.reason == Reason.NO_EQUILIBRIUM
 
 
 def test_a_step_too_long_for_its_time_stops_on_the_way(model):
-    model.stride = 0.3
-    tracker = ToolTracker(model)
-    tracker.follow((1.0, 5.0, 6.5), budget=0.0)
-    answer = tracker.repeat((9.0, 5.0, 6.5), steps=12, now=0.08)
+    tracker, _ = begun(model, 1.0, 5.0, 6.5, stride=0.3)
+    answer = tracker.follow((9.0, 5.0, 6.5), budget=10.0, most=12, now=0.08)
     assert answer.flags == TOUCHING | Flag.CLAMPED
     assert (answer.steps, answer.reason) == (12, Reason.NO_EQUILIBRIUM)
     share = (answer.touch.position[0] - 1.0) / 8.0
@@ -60,28 +61,16 @@ def test_a_step_too_long_for_its_time_stops_on_the_way(model):
         assert again.touch.time == pytest.approx(0.09)
 
 
-def test_without_time_the_last_good_answer_stands(model):
-    model.stride = 0.3
-    tracker = ToolTracker(model)
-    good = tracker.follow((1.0, 5.0, 6.5), budget=0.0)
-    answer = tracker.follow((9.0, 5.0, 6.5), budget=0.0)
-    assert is_fallback(answer, good)
-    assert answer.reason == Reason.NO_EQUILIBRIUM
-
-
 def test_where_equilibria_end_the_tool_stops(model):
     """Strides get shorter towards the last equilibrium, and end."""
-    tracker = ToolTracker(model)
-    tracker.follow((5.0, 5.0, 6.5), budget=0.0)
+    tracker, _ = begun(model, 5.0, 5.0, 6.5)
     answer = tracker.follow((5.0, 5.0, 5.0), budget=10.0)
     assert answer.flags == TOUCHING & ~Flag.IN_RANGE | Flag.CLAMPED
     assert model.deepest - 1.5 / 32 <= answer.touch.depth <= model.deepest
 
 
 def test_where_tissue_snaps_the_search_goes_on_from_position_to_position(model):
-    model.snap = 3
-    tracker = ToolTracker(model)
-    good = tracker.follow((5.0, 5.0, 7.0 - model.deepest), budget=0.0)
+    tracker, good = begun(model, 5.0, 5.0, 7.0 - model.deepest, snap=3)
     heights = (5.4, 5.3, 5.2, 5.1)
     answers = [tracker.follow((5.0, 5.0, z), 10.0, 0.01 * i) for i, z in enumerate(heights)]
     assert all(is_fallback(answer, good) for answer in answers[:3])
@@ -91,10 +80,7 @@ def test_where_tissue_snaps_the_search_goes_on_from_position_to_position(model):
 
 
 def test_a_search_that_finds_nothing_starts_again_from_rest(model):
-    model.stride = 0.3
-    model.snap = PATIENCE
-    tracker = ToolTracker(model)
-    good = tracker.follow((5.0, 5.0, 7.0 - model.deepest), budget=0.0)
+    tracker, good = begun(model, 5.0, 5.0, 7.0 - model.deepest, stride=0.3, snap=PATIENCE)
     for _ in range(2 * PATIENCE):
         assert is_fallback(tracker.follow((5.0, 5.0, 5.2), budget=0.0), good)
     if not model.steps:
@@ -102,8 +88,7 @@ def test_a_search_that_finds_nothing_starts_again_from_rest(model):
 
 
 def test_a_position_that_makes_no_sense_falls_back_at_once_and_takes_no_time(model):
-    tracker = ToolTracker(model)
-    good = tracker.follow((5.0, 5.0, 6.5), 0.0, 0.0)
+    tracker, good = begun(model, 5.0, 5.0, 6.5)
     answer = tracker.follow((5.0, 5.0, 3.0), 10.0, 0.05)
     assert is_fallback(answer, good)
     assert (answer.steps, answer.reason) == (1, Reason.BELOW_SURFACE)
@@ -113,7 +98,7 @@ def test_a_position_that_makes_no_sense_falls_back_at_once_and_takes_no_time(mod
 
 
 def test_before_any_answer_nothing_is_claimed(model):
-    answer = ToolTracker(model).follow((5.0, 5.0, 4.0), budget=0.0)
+    _, answer = begun(model, 5.0, 5.0, 4.0)
     assert (answer.flags, answer.reason) == (Flag.FALLBACK, Reason.BELOW_SURFACE)
     assert not answer.touch.force.any()
     assert not answer.touch.tangent.any()
@@ -124,15 +109,13 @@ def test_repeating_takes_the_same_steps(model, rng):
     tracker, repeater = ToolTracker(model), ToolTracker(model)
     for i, position in enumerate(rng.uniform([0, 0, 4.5], [10, 10, 8], (200, 3))):
         answer = tracker.follow(position, 2e-5, 0.001 * i)
-        again = repeater.repeat(position, answer.steps, 0.001 * i)
+        again = repeater.follow(position, np.inf, 0.001 * i, answer.steps)
         assert (again.flags, again.steps) == (answer.flags, answer.steps)
         np.testing.assert_array_equal(again.touch.force, answer.touch.force)
 
 
 def test_a_restarted_tracker_is_a_new_one(model):
-    model.stride = 0.3
-    tracker = ToolTracker(model)
-    tracker.follow((1.0, 5.0, 6.5), budget=0.0)
+    tracker, _ = begun(model, 1.0, 5.0, 6.5, stride=0.3)
     tracker.restart()
     answer = tracker.follow((9.0, 5.0, 6.5), 0.0, 9.0)
     assert (answer.flags, answer.touch.time) == (TOUCHING, 0.0)
@@ -153,16 +136,15 @@ def test_a_snapshot_brings_back_the_state(model):
 
 
 def test_a_restored_state_knows_nothing_of_a_search(model):
-    model.snap = 2
-    tracker = ToolTracker(model)
-    good = tracker.follow((5.0, 5.0, 7.0 - model.deepest), 0.0, 0.0)
+    tracker, good = begun(model, 5.0, 5.0, 7.0 - model.deepest, snap=2)
     kept = tracker.snapshot()
     for now in (0.01, 0.02, 0.03):
         assert is_fallback(tracker.follow((5.0, 5.0, 5.3), 0.0, now), good)
         tracker.restore(kept)
 
 
-def test_the_clients_time_passes(in_time):
+def test_the_clients_time_passes():
+    in_time = FakeModel(in_time=True)
     tracker = ToolTracker(in_time)
     for now in (100.0, 100.001, 100.003, 100.003):
         answer = tracker.follow((5.0, 5.0, 6.5), 0.0, now)
@@ -172,24 +154,19 @@ def test_the_clients_time_passes(in_time):
 
 
 @pytest.mark.parametrize(("passed", "counted"), [(7.0, LONGEST), (-0.5, 0.0), (1e300, LONGEST)])
-def test_a_client_that_stalls_or_goes_back_is_told(in_time, passed, counted):
-    tracker = ToolTracker(in_time)
+def test_a_client_that_stalls_or_goes_back_is_told(model, passed, counted):
+    """Elastic tissue knows no time."""
+    tracker = ToolTracker(model)
     tracker.follow((5.0, 5.0, 6.5), 0.0, 100.0)
-    for flags in (TOUCHING | Flag.STALLED, TOUCHING):
+    for flag in (Flag.STALLED, 0):
         answer = tracker.follow((5.0, 5.0, 6.4), 0.0, 100.0 + passed)
-        assert answer.flags == flags
-        assert answer.touch.time == pytest.approx(counted)
-
-
-def test_elastic_tissue_knows_no_time():
-    tracker = ToolTracker(FakeModel())
-    for now in (100.0, 7.0, 1e300):
-        assert tracker.follow((5.0, 5.0, 6.5), 0.0, now).flags == TOUCHING
+        assert answer.flags == (TOUCHING | flag if model.steps else TOUCHING)
+        assert answer.touch.time == pytest.approx(counted if model.steps else 0.0)
 
 
 def test_over_the_valid_radius_a_linear_force_holds():
     """By Hertz's law, F = d^1.5."""
-    answer = ToolTracker(FakeModel()).follow((5.0, 5.0, 6.5), budget=0.0)
+    _, answer = begun(FakeModel(), 5.0, 5.0, 6.5)
     depth, radius = answer.touch.depth, answer.valid_radius
     for s in (-radius, radius):
         exact, linear = (depth + s) ** 1.5, depth**1.5 + 1.5 * depth**0.5 * s

@@ -34,7 +34,21 @@ def deformation(rng, size=0.4, least=0.2):
             return F
 
 
-def isochoric_invariants(F):
-    """Invariants of the isochoric part of ``F^T F``, and det F."""
-    squares, J = np.linalg.svd(F, compute_uv=False) ** 2, np.linalg.det(F)
-    return squares.sum() / J ** (2 / 3), J ** (2 / 3) * (1 / squares).sum(), J
+def rotation(rng):
+    """Rotation (3, 3) at random."""
+    Q, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+    return Q * np.linalg.det(Q)
+
+
+def central_difference(function, at, step=1e-3):
+    """Derivative of ``function`` with respect to the entries of ``at``, last axis."""
+    columns = []
+    for i in range(at.size):
+        shift = np.zeros(at.size)
+        shift[i] = step
+        shift = shift.reshape(at.shape)
+        # Fourth order, so that the truncation error is far below the 1e-7 asked for.
+        near = function(at + shift) - function(at - shift)
+        far = function(at + 2 * shift) - function(at - 2 * shift)
+        columns.append((8 * near - far) / (12 * step))
+    return np.stack(columns, axis=-1)

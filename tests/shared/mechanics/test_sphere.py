@@ -15,16 +15,19 @@ from palpate.shared.mechanics.sphere import (
     touch,
 )
 
+from .material_point import rotation
+
 TIP = tip_of(2.0, 15.0)
 
 
 def plate(kind=8):
-    """Four faces of the plane z = 0, 2 mm wide each, outward normal +z."""
+    """Four faces of the plane z = 0, 2 mm wide each, outward normal +z, and their surface."""
     reference = QUAD8_NODES if kind == 8 else QUAD_CORNERS
     corners = [np.add(reference, [x, y]) for x in (-1, 1) for y in (-1, 1)]
     nodes, faces = np.unique(np.vstack(corners).round(9), axis=0, return_inverse=True)
     nodes = np.column_stack([nodes, np.zeros(len(nodes))])
-    return nodes, faces.reshape(4, -1).astype(np.int32)
+    faces = faces.reshape(4, -1).astype(np.int32)
+    return nodes, faces, surface_of(nodes, faces)
 
 
 def surface_of(nodes, faces):
@@ -63,8 +66,7 @@ def test_the_penalty_is_twice_continuously_differentiable():
 
 @pytest.mark.parametrize("kind", [4, 8])
 def test_force_and_stiffness_are_derivatives_of_the_energy(kind, rng):
-    nodes, faces = plate(kind)
-    surface = surface_of(nodes, faces)
+    nodes, faces, surface = plate(kind)
     moved = 0.02 * rng.standard_normal(nodes.shape)
     x = np.array([0.13, -0.21, 1.9])
     _, gradient, reaction, deepest, touching = pressed(surface, x, moved, STIFFNESS)
@@ -93,8 +95,7 @@ def test_force_and_stiffness_are_derivatives_of_the_energy(kind, rng):
 
 @pytest.mark.parametrize("kind", [4, 8])
 def test_the_blocks_that_are_not_looked_at_are_not_touched(kind, rng):
-    nodes, faces = plate(kind)
-    surface = surface_of(nodes, faces)
+    nodes, _, surface = plate(kind)
     everywhere = surface._replace(reach=np.full_like(surface.reach, np.inf))
     for _ in range(20):
         bend = rng.uniform(-0.5, 0.5, 2)  # 1/mm
@@ -107,21 +108,20 @@ def test_the_blocks_that_are_not_looked_at_are_not_touched(kind, rng):
 
 
 def test_the_force_does_not_depend_on_the_frame(rng):
-    nodes, faces = plate()
+    nodes, faces, surface = plate()
     moved = 0.02 * rng.standard_normal(nodes.shape)
     x = np.array([0.3, 0.1, 1.9])
-    Q, _ = np.linalg.qr(rng.standard_normal((3, 3)))
-    Q *= np.linalg.det(Q)
-    energy, _, force, _, _ = pressed(surface_of(nodes, faces), x, moved)
+    Q = rotation(rng)
+    energy, _, force, _, _ = pressed(surface, x, moved)
     turned = pressed(surface_of(nodes @ Q.T, faces), Q @ x, moved @ Q.T)
     assert turned[0] == pytest.approx(energy, rel=1e-9)
     np.testing.assert_allclose(turned[2], Q @ force, rtol=1e-9, atol=1e-9 * np.abs(force).max())
 
 
 def test_on_a_rigid_plane_the_force_is_known():
-    nodes, faces = plate()
+    nodes, _, surface = plate()
     depth = 0.05
-    *_, force, deepest, _ = pressed(surface_of(nodes, faces), np.array([0, 0, 1.95]), 0 * nodes)
+    *_, force, deepest, _ = pressed(surface, np.array([0, 0, 1.95]), 0 * nodes)
     # the pressure in the depth d(r) = depth - r^2 / 2R, integrated over the disc
     expected = 2 * np.pi * TIP.radius * penalty(TIP, depth)[0]
     assert force[2] == pytest.approx(expected, rel=0.04)
@@ -131,21 +131,16 @@ def test_on_a_rigid_plane_the_force_is_known():
 
 
 def test_a_tip_out_of_reach_or_behind_is_not_felt():
-    nodes, faces = plate()
-    surface = surface_of(nodes, faces)
-    assert pressed(surface, np.array([0, 0, 2.0001]), 0 * nodes)[0] == 0.0
-    assert pressed(surface, np.array([0, 0, -1.9]), 0 * nodes)[0] == 0.0  # the far side of a wall
-    assert pressed(surface, np.array([9.0, 0, 1.0]), 0 * nodes)[0] == 0.0
+    nodes, _, surface = plate()
+    for x in ([0, 0, 2.0001], [0, 0, -1.9], [9.0, 0, 1.0]):  # above, behind the wall, beside
+        assert pressed(surface, np.array(x), 0 * nodes)[0] == 0.0
 
 
 @pytest.mark.parametrize(("degrees", "goes_on"), [(30, True), (60, False)])
 def test_the_surface_goes_on_round_a_blunt_edge_only(degrees, goes_on):
-    nodes, faces = plate()
-    bent = nodes.copy()
-    beyond = bent[:, 0] > 0
-    along = bent[beyond, 0].copy()
-    bent[beyond, 0] = along * np.cos(np.radians(degrees))
-    bent[beyond, 2] = -along * np.sin(np.radians(degrees))
+    nodes, faces, _ = plate()
+    bent, (x, _, z), angle = nodes.copy(), nodes.T, np.radians(degrees)
+    bent[:, ::2] = np.where(x > 0, [x * np.cos(angle), -x * np.sin(angle)], [x, z]).T
     accessible = bent[faces].mean(axis=1)[:, 0] < 0
     surface = tip_surface(bent, faces, accessible, TIP.radius)
     assert len(surface.faces) == (4 if goes_on else 2)

@@ -1,5 +1,6 @@
 """A local model with every quadrature point is the Galerkin model; with all modes, the full one."""
 
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,20 +11,19 @@ from palpate.offline.fem.mesh import build_mesh
 from palpate.offline.fem.model import FullModel
 from palpate.offline.fem.potential import Potential
 from palpate.offline.fem.terms import DeadLoad, PastStress, TipContact, TipLoad, advanced
-from palpate.offline.reduce.viscous import deviatoric_stiffness
 from palpate.offline.scenes import find_scene
-from palpate.shared.compiled import bind, bind_compiled
+from palpate.shared.compiled import bind, room
 from palpate.shared.mechanics import newton
-from palpate.shared.mechanics.sphere import room_for, tip_of, tip_surface
+from palpate.shared.mechanics.sphere import BLOCK, tip_of, tip_surface
 from palpate.shared.mechanics.viscosity import step_weights
 from palpate.shared.reduced import contact_search, press
-from palpate.shared.reduced.corrections import Secants, Tangent, forget_secants
-from palpate.shared.reduced.past import begin_step, end_step, opened, remembering
+from palpate.shared.reduced.corrections import Secants, Tangent, TangentWork, forget_secants
+from palpate.shared.reduced.past import KNOTS, Elastic, opened, recall_points, remembering
 from palpate.shared.reduced.points import LANES, STATE, Points
-from palpate.shared.reduced.problem import Problem, Work, descend
-from palpate.shared.reduced.terms import Contact, Dead, Elastic, reaction
+from palpate.shared.reduced.problem import Problem, Work, newton_method
+from palpate.shared.reduced.terms import Contact, ContactWork, Dead, reaction
 
-from ..mechanics.material_point import TISSUES
+from ..mechanics.material_point import TISSUES, central_difference
 
 RADIUS = 2.0
 PRONY = ((0.3, 0.05), (0.2, 1.0))
@@ -46,22 +46,32 @@ ACCURATE = 1e-5
 
 @njit(cache=True)
 def begin(past, mu):
-    return bind_compiled(begin_step(past, mu, 0, 0))
+    past.begin_step(mu, 0, 0)
 
 
 @njit(cache=True)
 def end(past, points, work, q):
-    end_step(past, points, work, 0, q)
+    past.end_step(points, work, 0, q)
 
 
 @njit(cache=True)
 def potential(problem, q, residual):
-    return newton.potential(problem, q, residual)
+    return problem.potential(q, residual)
 
 
 @njit(cache=True)
 def factorise(problem, q):
-    return newton.factorise(problem, q, 0.0)
+    return problem.factorise(q, 0.0)
+
+
+@njit(cache=True)
+def correct(problem, residual, step):
+    problem.correct(residual, step)
+
+
+@njit(cache=True)
+def recall(past, points, work):
+    recall_points(points, work, past, 0)
 
 
 class Twins:
@@ -92,12 +102,11 @@ class Twins:
                 law=law,
             )
         )
-        fields, latest = np.zeros((2, 9 * self.count), np.float32), np.zeros(modes)
-        numbers = np.zeros((3, self.count))
-        self.work = bind(Work(*fields, *numbers, stepped=latest.astype(np.float32), latest=latest))
+        work = room(Work, r=modes, c=self.count)
+        self.state, self.work = work.latest, bind(work)
         self.past = Elastic()
         if in_time:
-            D = (self.B.T @ (deviatoric_stiffness(model) @ self.B)).astype(np.float32)
+            D = (self.B.T @ (model.deviatoric_stiffness @ self.B)).astype(np.float32)
             self.past = remembering(D[None], len(PRONY), self.count)
             opened(self.past.records[0], len(PRONY), modes, self.count).share[-1] = 1.0
         self._past = bind(self.past)
@@ -107,12 +116,11 @@ class Twins:
         if self.in_time:
             for own, weights in zip(self.past.time, step_weights(PRONY, dt), strict=True):
                 own[:] = weights
-        past = begin(self._past, self.mu)
+        begin(self._past, self.mu)
         self.apply(share)
-        problem = bind(Problem(self.points, past, self.load, self.correction, self.work))
+        problem = bind(Problem(self.points, self._past, self.load, self.correction, self.work))
         work = np.zeros((4, len(self.q)))
-        energy, smallest = potential(problem, self.q, work[0])
-        status, *_ = descend(problem, self.q, work, energy, smallest, TARGET, *self.search)
+        status, *_ = newton_method(problem, self.q, work, TARGET, *self.search)
         assert status == newton.CONVERGED
         return problem
 
@@ -156,7 +164,7 @@ class Pressed(Twins):
 
     def apply(self, share):
         self.f[:] = self.nodal.T @ (share * self.whole).ravel()
-        self.external[:] = self.f + (self.past.exerted if self.in_time else 0.0)
+        self.external[:] = self.f + (self.past.step.exerted if self.in_time else 0.0)
         forget_secants(self.inverse, self.origin)
 
     def full_load(self, share):
@@ -173,8 +181,10 @@ class Touched(Twins):
         mesh, r = self.mesh, modes
         surface = tip_surface(mesh.nodes, mesh.faces, mesh.accessible, RADIUS)
         self.contact = TipContact(self.model, surface, tip_of(RADIUS, tissue.young))
-        faces, rows = len(surface.faces), 3 * surface.faces.shape[1]
-        self.x, self.latest, self.factor = np.zeros(3), np.zeros(r), np.zeros((r, r))
+        (faces, k), ends = surface.faces.shape, surface.corner_shape.shape[1]
+        sizes = {"nodes": len(mesh.nodes), "f": faces, "k": k, "ends": ends, "block": BLOCK}
+        work, self.x, self.factor = room(ContactWork, r=r, **sizes), np.zeros(3), np.zeros((r, r))
+        self.latest = work.latest
         self.load = bind(
             Contact(
                 tip=self.contact.tip,
@@ -184,27 +194,19 @@ class Touched(Twins):
                 modes=self.nodal.reshape(-1, 3, r),
                 faces=np.arange(faces, dtype=np.int32),
                 corners=surface.faces,
-                moved=np.zeros((len(mesh.nodes), 3)),
-                own=np.zeros((rows * faces, r)),
-                folded=np.zeros((rows * faces, r)),
-                square=np.zeros((rows, rows)),
-                product=np.zeros((r, r)),
-                touching=room_for(surface, faces),
-                latest=self.latest,
+                work=work,
             )
         )
+        work = room(TangentWork, r=r, state=STATE, tangent_points=self.count)
+        work.units[:] = np.tile(np.eye(9).repeat(LANES, 1), self.count // LANES)
         self.correction = bind(
             Tangent(
                 points=self.points,
-                state=np.zeros(STATE * self.count, np.float32),
-                units=np.tile(np.eye(9, dtype=np.float32).repeat(LANES, 1), self.count // LANES),
-                moduli=np.zeros((9, 9 * self.count), np.float32),
-                products=np.zeros((r, 9 * self.count), np.float32),
                 bulk=np.zeros((r, r)),
-                formed=np.full(2 * r + 1, np.inf),
+                formed=np.full((3, r), np.inf),
                 lag=0.0,
-                whole=np.zeros((r, r)),
                 factor=self.factor,
+                work=work,
             )
         )
 
@@ -242,21 +244,18 @@ def assert_close(found, expected, tolerance=ACCURATE):
     assert np.linalg.norm(found - expected) <= tolerance * np.linalg.norm(expected)
 
 
-@pytest.mark.parametrize("modes", [24, 96], ids=["some-modes", "all-modes"])
-@pytest.mark.parametrize("in_time", [False, True], ids=["at-once", "in-time"])
-@pytest.mark.parametrize("kind", [Pressed, Touched], ids=["dead", "tip"])
-def test_all_points_make_the_galerkin_model_and_all_modes_the_full_one(kind, in_time, modes, rng):
-    compare(kind(TISSUES["neo-hookean"], in_time, modes), rng)
-
-
-@pytest.mark.parametrize("law", [law for law in TISSUES if law != "neo-hookean"])
-def test_so_it_is_with_every_other_law(law, rng):
-    compare(Touched(TISSUES[law], True, 24), rng)
-
-
-def compare(twins, rng):
-    """Go through a course and compare energy, force and reaction in and off equilibrium."""
-    modes = len(twins.q)
+@pytest.mark.parametrize(
+    ("kind", "law", "in_time", "modes"),
+    [
+        *itertools.product((Pressed, Touched), ("neo-hookean",), (False, True), (24, 96)),
+        *((Touched, law, True, 24) for law in TISSUES if law != "neo-hookean"),
+    ],
+)
+def test_all_points_make_the_galerkin_model_and_all_modes_the_full_one(
+    kind, law, in_time, modes, rng
+):
+    """Of energy, force and reaction in and off equilibrium, along a course."""
+    twins = kind(TISSUES[law], in_time, modes)
     B, q, residual, force = twins.B, twins.q, np.zeros(modes), np.zeros(len(twins.B))
     for share, dt in COURSE:
         problem = twins.solve(share, dt)
@@ -280,3 +279,58 @@ def compare(twins, rng):
                 assert_close(found[0], answer.force)
                 assert_close(found[1], answer.tangent)
         twins.remember(dt)
+
+
+def test_residual_and_tangent_are_derivatives(rng):
+    """With a past, and with the tip off the tissue: contact is stiffer than differences can see."""
+    twins = Touched(TISSUES["neo-hookean"], True, 24)
+    twins.solve(*COURSE[0])
+    twins.remember(COURSE[0][1])
+    problem, residual = twins.solve(-1.0, 0.1), np.empty(24)
+    q = rng.standard_normal(24)
+
+    def gradient(at):
+        potential(problem, at, residual)
+        return residual.copy()
+
+    slopes = central_difference(
+        lambda at: np.array(potential(problem, at, residual)[0]), q, step=2e-2
+    )
+    assert_close(slopes, gradient(q), 1e-4)
+    assert factorise(problem, q)
+    L = np.tril(twins.factor)
+    assert_close(central_difference(gradient, q, step=2e-2), L @ L.T, 1e-4)
+
+
+def test_a_secant_is_what_the_inverse_tangent_answers_from_then_on(rng):
+    twins = Pressed(TISSUES["neo-hookean"], False, 24)
+    problem, inverse = twins.solve(0.0, 0.0), twins.inverse
+    K, load = np.diag(rng.uniform(0.5, 2.0, 24)), rng.standard_normal(24)
+    twins.external[:] = load
+    forget_secants(inverse, twins.origin)
+    states, correction = rng.standard_normal((3, 24)), np.empty(24)
+    for state in states:
+        twins.state[:] = state
+        correct(problem, K @ state - load, correction)
+    step = states[-1] - states[-2]
+    np.testing.assert_allclose(inverse @ K @ step, step, atol=1e-12)
+    np.testing.assert_allclose(inverse, inverse.T, atol=1e-12)
+    np.testing.assert_allclose(correction, -inverse @ (K @ states[-1] - load), atol=1e-12)
+    assert np.linalg.eigvalsh(inverse)[0] > 0.0
+
+
+def test_few_knots_keep_the_weight_and_about_the_past_of_a_path():
+    twins = Pressed(TISSUES["neo-hookean"], True, 24)
+    for number in range(60):
+        twins.solve(0.5 + 0.4 * np.sin(0.3 * number), 0.03)
+        twins.remember(0.03)
+    memory = opened(twins.past.records[0], len(PRONY), 24, twins.count)
+    assert len(memory.knots) == KNOTS
+    np.testing.assert_allclose(memory.share.sum(axis=0), 1.0, rtol=1e-12)
+    assert np.all(memory.share >= 0)
+    np.testing.assert_array_equal(memory.knots[-1], memory.q)
+    assert_close(memory.share.T @ memory.knots, memory.mean, 0.05)
+    exact = memory.points.copy()
+    memory.points[:] = np.nan
+    recall(twins._past, twins.points, twins.work)
+    assert_close(memory.points, exact, 0.02)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from palpate.offline.fem.problem import FullProblem
-from palpate.offline.reduce.transfer import neighbours, overlaps
+from palpate.offline.reduce.join import neighbours, overlaps
 from palpate.shared.artifact import read_artifact
 from palpate.shared.model import ReducedModel
 

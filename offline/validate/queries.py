@@ -31,10 +31,9 @@ def random_loads(model: ReducedModel, count: int, rng: np.random.Generator) -> l
     Contact points are uniform over the area, one in eight on the rim of the surface; directions are
     uniform in the cone, one in eight on its border; pressures are denser towards the limit.
     """
-    loads = []
+    loads, tilt = [], model.scene.endoscope.max_tilt
     for i, point in enumerate(random_points_and_rim(model.surface, count, rng)):
         x, normal, _, fields = model.surface.locate(point, model.limits)
-        tilt = model.scene.endoscope.max_tilt
         direction = cone(normal, tilt, 1, rng, border=i % 8 == 1)[0]
         limit = pressure_limit(fields, normal, direction)
         loads.append(Load(x, direction, float(limit * np.sqrt(rng.random()))))
@@ -68,29 +67,19 @@ def random_histories(
 
 
 class Tool:
-    """A footprint or the rigid tip on the surface, and how it moves on from where it is.
+    """A footprint or the rigid tip on the surface, first on its rim if wanted, and how it moves on.
 
     A footprint leans as it did at the beginning, as far as it may.
-
-    Parameters
-    ----------
-    model : ReducedModel
-        Whose surface and range of loads it is.
-    rng : Generator
-    tip : bool
-    rim : bool
-        Whether to begin on the rim of the surface.
     """
 
     def __init__(self, model: ReducedModel, rng: np.random.Generator, tip: bool, rim: bool) -> None:
         self._surface, self._ranges = model.surface, model.limits
         self._endoscope, self._rng, self._tip = model.scene.endoscope, rng, tip
         self._level = 0.0
-        self._go(
-            self._surface.vertices[rng.choice(self._surface.rim())]
-            if rim
-            else random_points(self._surface, 1, rng)[0]
-        )
+        if rim:
+            self._go(self._surface.vertices[rng.choice(self._surface.rim())])
+        else:
+            self._go(random_points(self._surface, 1, rng)[0])
         self._lean = cone(self._normal, self._endoscope.max_tilt, 1, rng)[0] + self._normal
 
     def history(self) -> list[Step]:

@@ -1,0 +1,116 @@
+"""From tables of one local model each to those of all, and what neighbours have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from palpate.offline.fem.model import FullModel
+from palpate.offline.reduce.ritz import Region
+from palpate.shared.local_models import LocalModels, LocalTips, ViscousModels
+
+Array = NDArray[np.float64]
+Field = NDArray[np.float32]
+Tables = TypeVar("Tables", LocalModels, LocalTips)
+
+NEXT, FOLLOWED = 1.6, 2.0
+"""Distance of centres, in extents of a patch, up to which one takes over the other's answer, and
+its history."""
+
+
+def with_points(
+    tables: Tables, points: NDArray[np.integer[Any]], weights: Array, **others: Any
+) -> Tables:
+    """One local model with other cubature points."""
+    own = replace(tables, points=points.astype(np.int32), weights=weights, **others)
+    return replace(own, point_from=np.array([0, len(points)]))
+
+
+def half(values: Array) -> Field:
+    """A field of one local model, in half precision as it is stored."""
+    return values[None].astype(np.float16).astype(np.float32)
+
+
+def join(
+    model: FullModel, bases: Sequence[Region], region: NDArray[np.int32], parts: list[LocalModels]
+) -> LocalModels:
+    """Tables of all local models, which lie in given regions, from those of each."""
+    models = _joined(
+        parts,
+        basis=np.stack([basis.basis for basis in bases]),
+        steps=np.stack([basis.steps for basis in bases]),
+        region=region,
+        extent=parts[0].extent,
+        blend=parts[0].blend,
+        tips=None,
+        viscous=None,
+    )
+    followed = neighbours(models, FOLLOWED * models.extent)
+    tips = [part.tips for part in parts if part.tips is not None]
+    if tips:
+        pairs = followed if model.prony else neighbours(models, NEXT * models.extent)
+        modes = np.concatenate([tip.modes for tip in tips])
+        own = {} if model.prony else {"deviatoric": None}
+        products = overlaps(model, models, modes, pairs)
+        models = replace(models, tips=_joined(tips, pairs=pairs, overlaps=products, **own))
+    soft = [part.viscous.deviatoric for part in parts if part.viscous is not None]
+    if soft:
+        products = overlaps(model, models, models.modes, followed)
+        models = replace(models, viscous=ViscousModels(np.concatenate(soft), followed, products))
+    return models
+
+
+def _joined(parts: Sequence[Tables], **own: Any) -> Tables:
+    """Tables one after the other, but for fields of their own."""
+    own["point_from"] = np.concatenate([[0], np.cumsum([len(part.points) for part in parts])])
+    for name in {field.name for field in fields(parts[0])} - own.keys():
+        own[name] = np.concatenate([getattr(part, name) for part in parts])
+    return type(parts[0])(**own)
+
+
+def neighbours(models: LocalModels, reach: float) -> NDArray[np.int32]:
+    """Pairs (n, 2) of patches whose centres are at most ``reach`` mm apart, the smaller first."""
+    pairs = cKDTree(models.centres).query_pairs(reach, output_type="ndarray")
+    pairs = np.sort(pairs, axis=1)[np.lexsort((pairs.max(axis=1), pairs.min(axis=1)))]
+    return pairs.astype(np.int32)
+
+
+def overlaps(
+    model: FullModel, models: LocalModels, modes: Field, pairs: NDArray[np.int32]
+) -> Field:
+    """Products (n, r, r) of the modes (p, M, r) of both patches of each pair, in energy at rest.
+
+    In half precision: products of orthonormal modes are at most one.
+    """
+    found = np.empty((len(pairs), modes.shape[2], modes.shape[2]), np.float16)
+    regions = models.region[pairs]
+    for number in np.unique(regions[:, 0]):
+        stiffened = model.rest_stiffness @ _basis(model, models, number)
+        for other in np.unique(regions[regions[:, 0] == number, 1]):
+            cross = stiffened.T @ _basis(model, models, other)
+            for i in np.flatnonzero((regions == (number, other)).all(axis=1)):
+                k, n = pairs[i]
+                found[i] = modes[k].T @ cross @ modes[n]
+    return found.astype(np.float32)
+
+
+def deviatoric_of(model: FullModel, models: LocalModels, modes: NDArray[np.floating[Any]]) -> Field:
+    """Part of the rest stiffness (1, m, m) that relaxes, in modes (M, m) of the first region."""
+    u = _basis(model, models, 0) @ modes
+    return (u.T @ (model.deviatoric_stiffness @ u)).astype(np.float32)[None]
+
+
+def nodal_modes(models: LocalModels, modes: Field) -> Field:
+    """Modes (r, 3 n) mm at the nodes, of modes (M, r) in the first region."""
+    return (models.steps[0][:, None] * modes).T @ models.basis[0].astype(np.float32)
+
+
+def _basis(model: FullModel, models: LocalModels, region: int) -> Array:
+    """Modes (free dofs, M) mm of a region."""
+    rows = models.basis[region][:, model.free] * models.steps[region][:, None]
+    return np.ascontiguousarray(rows.T, dtype=float)

@@ -1,0 +1,41 @@
+"""Blocks of one tissue that are clamped at their bottom, and what touches them."""
+
+import numpy as np
+
+from palpate.offline.fem.mesh import build_mesh
+from palpate.offline.fem.model import FullModel
+from palpate.offline.fem.terms import TipContact
+from palpate.offline.scenes import find_scene
+from palpate.shared.mechanics.neo_hookean import NeoHookeanTissue
+from palpate.shared.mechanics.sphere import tip_of, tip_surface
+
+YOUNG, POISSON = 15.0, 0.45
+ELEMENTS = ("hex8", "hex8-mean-dilatation", "hex8-fbar", "hex20")
+
+
+def tissue_of(poisson=POISSON, prony=()):
+    return NeoHookeanTissue(law="neo-hookean", young=YOUNG, poisson=poisson, prony=prony)
+
+
+def body(element, divisions, size, poisson=POISSON, prony=()):
+    """Full model of a block."""
+    scene = find_scene("quick")
+    geometry = scene.geometry.model_copy(
+        update={"element": element, "divisions": divisions, "size": size}
+    )
+    mesh = build_mesh(scene.model_copy(update={"geometry": geometry}))
+    return FullModel(mesh, element, tissue_of(poisson, prony))
+
+
+def tip_contact(model, radius):
+    """Contact of a block's top with a rigid tip."""
+    mesh = model.mesh
+    surface = tip_surface(mesh.nodes, mesh.faces, mesh.accessible, radius)
+    return TipContact(model, surface, tip_of(radius, YOUNG))
+
+
+def support_force(model, displacement):
+    """Force (3,) mN with which a deformed body holds on to its support."""
+    force = np.zeros(displacement.size)
+    model.internal(displacement.ravel(), force)
+    return force.reshape(-1, 3)[model.mesh.clamped].sum(axis=0)
