@@ -30,7 +30,7 @@ serve: .venv/run | $(artifact)
 
 # A file of tests stays in one process, which has its set-ups.
 test: lint
-	$(bin)/pytest -q -n auto --dist loadfile
+	$(bin)/pytest -q -n auto --maxprocesses 4 --dist loadfile
 
 lint: .venv/dev
 	$(bin)/ruff check
