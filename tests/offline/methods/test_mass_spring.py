@@ -17,11 +17,6 @@ DOWN = np.array([0.0, 0.0, -1.0])
 
 
 @pytest.fixture(scope="module")
-def problem():
-    return FullProblem(find_scene("quick"))
-
-
-@pytest.fixture(scope="module")
 def method(problem):
     return MassSpring(problem, 1)
 

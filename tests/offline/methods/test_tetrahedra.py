@@ -28,11 +28,6 @@ def body(request):
 
 
 @pytest.fixture(scope="module")
-def problem():
-    return FullProblem(find_scene("quick"))
-
-
-@pytest.fixture(scope="module")
 def method(problem):
     return TensorMass(problem, 1)
 
