@@ -25,16 +25,16 @@ class FieldRecovery:
     ----------
     body : Body
     models : LocalModels
-    transfer_of : callable
-        What knows the past of an answer of tissue that remembers.
+    transfer : callable
+        What knows the past under the tip (True) or under loads.
     """
 
     def __init__(
-        self, body: Body, models: LocalModels, transfer_of: Callable[[Answer], Transfer]
+        self, body: Body, models: LocalModels, transfer: Callable[[bool], Transfer]
     ) -> None:
         self._body = body
         self._models = models
-        self._transfer_of = transfer_of
+        self._transfer = transfer
         self._recovery = stress_recovery(body.nodes, body.elements, body.law, precision=np.float32)
         self._stress = np.zeros(len(body.nodes))
 
@@ -43,7 +43,7 @@ class FieldRecovery:
         if answer.past is None:
             return self._by_region(answer, answer.parts)
         return self._by_region(
-            answer, self._transfer_of(answer).displacements(answer.time, answer.active)
+            answer, self._transfer(answer.tip).displacements(answer.time, answer.active)
         )
 
     def _by_region(
@@ -81,7 +81,7 @@ class FieldRecovery:
 
     def _remembered(self, answer: Answer) -> Array:
         """``B`` of ``mechanics.viscosity`` (e, 6, 8) at the points of all elements."""
-        transfer = self._transfer_of(answer)
+        transfer = self._transfer(answer.tip)
         B = np.zeros((len(self._body.elements), 6, 8))
         for k, share, knot in transfer.knots(answer.active):
             u = self._field(self._by_region(answer, [(k, 1.0, knot)]))

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Mapping
 from functools import cached_property
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,14 +18,13 @@ from palpate.shared.artifact import Artifact, ArtifactError, read_artifact
 from palpate.shared.errors import QueryError
 from palpate.shared.fields import FieldRecovery
 from palpate.shared.geometry.surface import Surface, SurfaceIndex, boundary_triangles
-from palpate.shared.local_models import Body, Estimator, Estimators, LocalModels, ViscousModels
+from palpate.shared.local_models import Body, Estimator, Estimators, LocalModels
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import TIP_DEPTH
-from palpate.shared.mechanics.viscosity import Weights, step_weights
 from palpate.shared.query import check_place, checked_load, out_of_range, vector
 from palpate.shared.reduced import press, touch
 from palpate.shared.reduced.outcome import TOUCH_FEATURES, Outcome
-from palpate.shared.reduced.past import Elastic, Remembering, remembering
+from palpate.shared.reduced.past import Elastic, Remembering
 from palpate.shared.reduced.transfer import LeftBehind, Local, Past, Transfer, estimate_history
 from palpate.shared.reduced.workspace import Warm, Workspace
 from palpate.shared.scene import Scene, SceneError, parse_scene
@@ -80,10 +80,10 @@ class ReducedModel:
         self.models = models
         self.estimators = estimators
         self.surface_nodes, self.surface_triangles = boundary_triangles(body.faces)
-        self.fields = FieldRecovery(body, models, self._transfer_of)
+        self.fields = FieldRecovery(body, models, self.transfer)
         self._own = self.new_warm()
         self._index: SurfaceIndex = surface.ground(limits)
-        self._last_step: tuple[float, Weights] | None = None
+        self._transfers: dict[bool, Transfer] = {}
 
     @classmethod
     def load(cls, path: str | Path) -> ReducedModel:
@@ -153,15 +153,23 @@ class ReducedModel:
             raise QueryError("position", f"scene {self.name!r} was trained without a tip")
         if in_time and not self.scene.tissue.prony:
             raise QueryError("time", f"scene {self.name!r} is elastic and knows none")
-        tables = self.touch_models if tip else self.press_models
-        past: Elastic | Remembering = Elastic()
-        if in_time:
-            viscous = self.models.viscous_tips if tip else self.models.viscous
-            assert viscous is not None, "or the tissue would have no past"
-            points = tables.points.weights.shape[1]
-            past = remembering(viscous.deviatoric, len(self.scene.tissue.prony), points)
         estimator = self.estimators.touches if tip else self.estimators.loads
-        return Workspace(tables, self._index, estimator.coefficients, past)
+        past = self.transfer(tip).new_past() if in_time else Elastic()
+        return Workspace(self._tables(tip), self._index, estimator.coefficients, past)
+
+    def transfer(self, tip: bool) -> Transfer:
+        """Takes the past under loads or under the tip from one local model to the next."""
+        if tip not in self._transfers:
+            models = self.models.viscous_tips if tip else self.models.viscous
+            assert models is not None, "or there would be no past"
+            points = self._tables(tip).points.weights.shape[1]
+            self._transfers[tip] = Transfer(
+                models.deviatoric, models.pairs, models.overlap, self.scene.tissue.prony, points
+            )
+        return self._transfers[tip]
+
+    def _tables(self, tip: bool) -> press.PressModels | touch.TouchModels:
+        return self.touch_models if tip else self.press_models
 
     @cached_property
     def press_models(self) -> press.PressModels:
@@ -173,22 +181,6 @@ class ReducedModel:
         """Local models of the rigid tip."""
         assert self.models.tips is not None
         return touch_models(self.body, self.models, self.models.tips)
-
-    @cached_property
-    def press_transfer(self) -> Transfer:
-        """Takes the past under loads from one local model to the next."""
-        return self._transfer(self.models.viscous, self.press_models.points.weights.shape[1])
-
-    @cached_property
-    def touch_transfer(self) -> Transfer:
-        """Takes the past under the tip from one local model to the next."""
-        return self._transfer(self.models.viscous_tips, self.touch_models.points.weights.shape[1])
-
-    def _transfer(self, models: ViscousModels | None, points: int) -> Transfer:
-        assert models is not None, "or there would be no past"
-        return Transfer(
-            models.deviatoric, models.pairs, models.overlap, self.scene.tissue.prony, points
-        )
 
     def press(
         self,
@@ -239,13 +231,14 @@ class ReducedModel:
         at, towards, radius = checked_load(
             self.scene.endoscope, self.pressure_max, position, pressure, direction, radius
         )
-        own = self._warm(warm, past, dt).press(in_time=past is not None)
+        own = self._warm(warm, past, dt).workspace(tip=False, in_time=past is not None)
         press.place(own.solver, at, towards)
         check_place(self.scene.endoscope, own.outcome.distance.item(), own.outcome.tilt.item())
         answering = own.answering()
         moves: Moves = {}
         if past is not None:
-            moves = self._begin(own, answering, self.press_transfer, past, dt)
+            own.begin_step(self.scene.tissue.prony, dt)
+            moves = self.transfer(False).begin(own, answering, past)
         press.press(own.solver, pressure, radius)
         if past is None:
             press.estimate(own.solver, pressure)
@@ -322,7 +315,7 @@ class ReducedModel:
         """
         started = time.perf_counter()
         at = vector("position", position)
-        own = self._warm(warm, past, dt).touch(in_time=past is not None)
+        own = self._warm(warm, past, dt).workspace(tip=True, in_time=past is not None)
         last = at if past is None or past.position is None else past.position
         touch.place(own.solver, at, last)
         depth, radius = own.outcome.depth.item(), self.body.tip.radius
@@ -339,7 +332,8 @@ class ReducedModel:
         answering = own.answering()
         moves: Moves = {}
         if past is not None:
-            moves = self._begin(own, answering, self.touch_transfer, past, dt)
+            own.begin_step(self.scene.tissue.prony, dt)
+            moves = self.transfer(True).begin(own, answering, past)
         touch.touch(own.solver, at, most)
         touched = own.outcome.touched.item() > 0
         if past is None and touched:
@@ -406,17 +400,6 @@ class ReducedModel:
             warm.forget()
         return warm
 
-    def _begin(
-        self, own: Workspace, answering: Answering, transfer: Transfer, past: Past, dt: float
-    ) -> Moves:
-        """Write past and time step into a workspace; return what earlier moves left behind."""
-        assert isinstance(own.past, Remembering)
-        if self._last_step is None or self._last_step[0] != dt:
-            self._last_step = dt, step_weights(self.scene.tissue.prony, dt)
-        for own_weights, weights in zip(own.past.time, self._last_step[1], strict=True):
-            own_weights[:] = weights
-        return transfer.begin(own, answering, past)
-
     def _in_time(
         self,
         own: Workspace,
@@ -437,25 +420,18 @@ class ReducedModel:
         travel = 0.0
         if position is not None and past.position is not None:
             travel = math.dist(position.tolist(), past.position.tolist())
+        main = max(answering, key=itemgetter(2))[1] if answering else -1
         after = Past(
-            time=past.time + dt,
-            locals={k: local for k, _, local in active},
-            main=max(active, key=lambda part: part[1])[0] if active else -1,
-            position=position,
-            share=max(past.share, share),
-            response=max(past.response, response),
-            travel=past.travel + travel,
-            smallest=min(past.smallest, found.min_jacobian),
-        )
+            past.time + dt, {k: local for k, _, local in active}, main, position,
+            max(past.share, share), max(past.response, response), past.travel + travel,
+            min(past.smallest, found.min_jacobian),
+        )  # fmt: skip
         features, errors = estimate_history(
             estimator.coefficients, found.upward, after.share, after.response, after.travel,
             after.smallest,
         )  # fmt: skip
         left = after.share > 1.0 + 1e-9  # the trained range, now or before
         return features, _UNKNOWN if left else errors, after, active
-
-    def _transfer_of(self, answer: Answer) -> Transfer:
-        return self.touch_transfer if answer.tip else self.press_transfer
 
     def displacement(self, answer: Answer, region: Region = "all") -> Field:
         """Nodal displacement (k, 3) mm, of all nodes or those of ``surface_nodes``."""

@@ -126,8 +126,7 @@ class TipTrainer:
         own, most = self._workspace, MAX_ITERATIONS - 1
         if isinstance(self.past, Remembering):
             most = MAX_ITERATIONS
-            for mine, weights in zip(self.past.time, step_weights(self._prony, dt), strict=True):
-                mine[:] = weights
+            own.begin_step(self._prony, dt)
         place(own.solver, position, position)
         touch(own.solver, position, most)
         outcome, warm, past = own.outcome, own.warm, None
@@ -141,8 +140,8 @@ class TipTrainer:
             depth=outcome.depth.item(),
             normal=outcome.upward.copy(),
             q=warm.q[0].copy(),
-            factor=np.tril(warm.factor[0]),
-            coupling=warm.coupling[0].T.copy(),
+            factor=np.tril(own.scratch.factor),
+            coupling=own.scratch.coupling.T.copy(),
             force=outcome.force.copy(),
             past=past,
             most=self._most,

@@ -4,11 +4,12 @@ Theory.  See ``reduced.problem`` for the potential.  Its minimum is sought with 
 that secants make up (BFGS): the rest stiffness is the identity, so few of them are needed.
 
 A search starts where it is likely to end.  A local model that answered last is *warm*: its answer
-differs from its first guess much as this one will.  A *cold* model starts from the guess, with an
-inverse tangent that differs from the identity in few directions; both are polynomials in the load
-and its place.  Where neither leads to an equilibrium the search starts from the last answer that
-the tissue remembers, which is rest for elastic tissue: a guess can lie beyond a fold of the load
-path.
+differs from its first guess much as this one will; in time, where the force of the past is followed
+by the inverse tangent, the start misses the answer much as the last one did.  A *cold* model starts
+from the guess, with an inverse tangent that differs from the identity in few directions; both are
+polynomials in the load and its place.  Where neither leads to an equilibrium the search starts from
+the last answer that the tissue remembers, which is rest for elastic tissue: a guess can lie beyond
+a fold of the load path.
 
 What the points miss of the internal force in equilibrium, the *defect* of the cubature, is a smooth
 function of the load.  It is fitted by polynomials on each local model and taken off ``f``: the
@@ -86,6 +87,7 @@ class PressWarm(NamedTuple):
     number: Annotated[Ints, "slots"]  # -1 for an empty slot
     q: Annotated[Array, "slots, r"]
     guess: Annotated[Array, "slots, r"]  # its first guess
+    missed: Annotated[Array, "slots, r"]  # the answer less where it was expected
     past: Annotated[Array, "slots, r"]  # force of the past in it, on linear tissue
     inverse: Annotated[Array, "slots, r, r"]  # see ``corrections.Secants``
     origin: Annotated[Array, "slots, 2, r"]
@@ -240,7 +242,7 @@ def _solve(solver, k, slot):
     """Equilibrium of model k under ``scratch.load``; its answer goes to memory's slot."""
     models, warm, scratch, outcome = solver.models, solver.warm, solver.scratch, solver.outcome
     q, load, guess, start = warm.q[slot], scratch.load, scratch.guess, scratch.start
-    inverse, origin = warm.inverse[slot], warm.origin[slot]
+    inverse, origin, missed = warm.inverse[slot], warm.origin[slot], warm.missed[slot]
     problem, past = local_problem(solver, k, slot), solver.past
     size = past.external_force(load, scratch.external, origin)
     tolerance = TOLERANCE_IN_TIME if past.in_time else TOLERANCE
@@ -252,6 +254,10 @@ def _solve(solver, k, slot):
             for i in range(len(q)):
                 start[i] = guess[i] + q[i] - warm.guess[slot, i]
             past.follow(inverse, q, warm.past[slot], scratch.change, start)
+            if past.in_time:
+                for i in range(len(q)):
+                    start[i] += missed[i]
+                    missed[i] -= start[i]
         elif attempt == 1:
             start[:] = guess
             forget_secants(inverse, origin)
@@ -269,6 +275,10 @@ def _solve(solver, k, slot):
             break
     found = status == newton.CONVERGED
     q[:] = start
+    if attempt == 0 and past.in_time:
+        missed += q
+    else:
+        missed[:] = 0.0
     warm.guess[slot] = guess
     warm.number[slot] = k if found else -1
     past.note_force(warm.past[slot])

@@ -134,7 +134,7 @@ def _place_face(load, c, own):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def reaction(load, factor, coupling, step, force, tangent):
+def reaction(load, factor, coupling, slope, force, tangent):
     """Force on the tool and its derivative in an equilibrium whose tangent is factorised.
 
     Parameters
@@ -142,9 +142,9 @@ def reaction(load, factor, coupling, step, force, tangent):
     load : Contact
     factor : ndarray, shape (r, r)
     coupling : ndarray, shape (3, r), out, mN/mm
-        Minus the derivative of the residual in the tip's place: the answer moves by
-        ``tangent^-1 coupling`` per millimetre.
-    step : ndarray, shape (r,), scratch
+        Minus the derivative of the residual in the tip's place.
+    slope : ndarray, shape (3, r), out, 1/mm
+        Of the answer in the tip's place: ``tangent^-1 coupling``.
     force : ndarray, shape (3,), out, mN
     tangent : ndarray, shape (3, 3), out, mN/mm
     """
@@ -160,7 +160,7 @@ def reaction(load, factor, coupling, step, force, tangent):
                 for n in range(len(row)):
                     target[n] += row[n]
     for i in range(3):
-        step[:] = coupling[i]
-        back_substitute(factor, step)
+        slope[i] = coupling[i]
+        back_substitute(factor, slope[i])
         for j in range(3):
-            tangent[j, i] = np.dot(coupling[j], step) - touching.own[j, i]
+            tangent[j, i] = np.dot(coupling[j], slope[i]) - touching.own[j, i]

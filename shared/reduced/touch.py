@@ -42,7 +42,7 @@ from palpate.shared.reduced.features import (
     log_residual,
     tip_features,
 )
-from palpate.shared.reduced.points import Points, back_substitute, project
+from palpate.shared.reduced.points import Points, project
 from palpate.shared.reduced.problem import Problem, Work
 from palpate.shared.reduced.terms import Contact, ContactWork, reaction
 
@@ -92,8 +92,7 @@ class TouchWarm(NamedTuple):
 
     number: Annotated[Ints, "slots"]  # -1 for an empty slot
     q: Annotated[Array, "slots, r"]
-    factor: Annotated[Array, "slots, r, r"]  # of the tangent there
-    coupling: Annotated[Array, "slots, 3, r"]  # B there
+    slope: Annotated[Array, "slots, 3, r"]  # 1/mm, K^-1 B there
     position: Annotated[Array, "3"]  # mm
     bulk: Annotated[Array, "slots, r, r"]  # see ``corrections.Tangent``
     formed: Annotated[Array, "slots, 3, r"]
@@ -106,8 +105,9 @@ class TouchScratch(NamedTuple):
     newton: Annotated[Array, "4, r"]
     x: Annotated[Array, "3"]  # mm
     q: Annotated[Array, "slots, r"]  # answers, or where searches have ended
-    factor: Annotated[Array, "slots, r, r"]
-    coupling: Annotated[Array, "slots, 3, r"]
+    slope: Annotated[Array, "slots, 3, r"]
+    factor: Annotated[Array, "r, r"]  # of the last model's tangent
+    coupling: Annotated[Array, "3, r"]  # its B
     forces: Annotated[Array, "slots, 3"]  # mN, of the models
     tangents: Annotated[Array, "slots, 3, 3"]  # mN/mm
     tangent: TangentWork
@@ -203,9 +203,11 @@ def _solve(solver, k, slot, x, most):
     outcome.min_jacobian[0] = min(outcome.min_jacobian[0], smallest)
     if status != newton.CONVERGED:
         return
-    coupling, force = scratch.coupling[slot], scratch.forces[slot]
+    coupling, force = scratch.coupling, scratch.forces[slot]
     residual, step = scratch.newton[0], scratch.newton[1]
-    reaction(problem.load, problem.correction.factor, coupling, step, force, scratch.tangents[slot])
+    reaction(
+        problem.load, scratch.factor, coupling, scratch.slope[slot], force, scratch.tangents[slot]
+    )
     problem.correct(residual, step)
     energy += 0.5 * np.dot(residual, step)
     q += step
@@ -231,7 +233,7 @@ def local_problem(solver, k, slot):
     lag = LAG_IN_TIME if solver.past.in_time else LAG_AT_ONCE
     tangent = Tangent(
         bind_compiled(models.tangent_points.of(k)), warm.bulk[slot], warm.formed[slot], lag,
-        scratch.factor[slot], scratch.tangent,
+        scratch.factor, scratch.tangent,
     )  # fmt: skip
     return bind_compiled(
         Problem(
@@ -265,11 +267,9 @@ def _start(solver, k, slot, x, q):
 @njit(cache=True, error_model="numpy", nogil=True)
 def _follow(warm, slot, x, q):
     """Follow the derivatives of the last answer to the position x."""
-    q[:] = 0.0
+    q[:] = warm.q[slot]
     for i in range(3):
-        q += (x[i] - warm.position[i]) * warm.coupling[slot, i]
-    back_substitute(warm.factor[slot], q)
-    q += warm.q[slot]
+        q += (x[i] - warm.position[i]) * warm.slope[slot, i]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -315,8 +315,7 @@ def _remember(solver, x):
             k = active.number[slot]
             if found:
                 warm.q[slot] = scratch.q[slot]
-                warm.factor[slot] = scratch.factor[slot]
-                warm.coupling[slot] = scratch.coupling[slot]
+                warm.slope[slot] = scratch.slope[slot]
                 points = solver.models.points.of(k)
                 solver.past.end_step(points, scratch.work, slot, scratch.q[slot])
             elif k != warm.number[slot]:

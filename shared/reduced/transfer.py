@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from palpate.shared.reduced.features import estimate_errors
 from palpate.shared.reduced.outcome import HISTORY_FEATURES
-from palpate.shared.reduced.past import Memory, Remembering, opened, recall_points
+from palpate.shared.reduced.past import Memory, Remembering, opened, recall_points, remembering
 
 if TYPE_CHECKING:
     from palpate.shared.reduced.workspace import Workspace
@@ -155,6 +155,10 @@ class Transfer:
         coupling = np.sqrt(self._share / self._tau)
         coupled = d[:, :, None, None] * np.outer(coupling, coupling) - np.diag(1.0 / self._tau)
         self._rates, self._coupled = np.linalg.eigh(coupled)
+
+    def new_past(self) -> Remembering:
+        """Room for what the local models of a caller remember."""
+        return remembering(self._deviatoric, len(self._tau), self._points)
 
     def opened(self, record: Array) -> Memory:
         """Views of a record."""

@@ -6,7 +6,8 @@ itself remembers is a value of its own, ``transfer.Past``.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from palpate.shared.compiled import bind, room
 from palpate.shared.geometry.surface import SurfaceIndex
 from palpate.shared.mechanics.sphere import BLOCK
+from palpate.shared.mechanics.viscosity import step_weights
 from palpate.shared.reduced.blend import MAX_ACTIVE, Active
 from palpate.shared.reduced.features import (
     CHANGES,
@@ -80,7 +82,7 @@ class Workspace:
             )  # fmt: skip
             units = self.scratch.tangent.units.reshape(9, -1, 9, LANES)
             units[np.arange(9), :, np.arange(9)] = 1.0
-        self.past = past
+        self.past, self._dt = past, math.nan
         self.active = room(Active, **sizes)
         self._record, self.outcome = new_outcome()
         self.solver = bind(
@@ -92,6 +94,14 @@ class Workspace:
         self.active.number[:] = -1
         self.forget()
 
+    def begin_step(self, prony: Sequence[tuple[float, float]], dt: float) -> None:
+        """Make the next answer that at the end of a time step (s) of tissue that remembers."""
+        assert isinstance(self.past, Remembering)
+        if dt != self._dt:
+            for own, weights in zip(self.past.time, step_weights(prony, dt), strict=True):
+                own[:] = weights
+            self._dt = dt
+
     def forget(self) -> None:
         """Make the next answer independent of the last."""
         self.warm.number[:] = -1
@@ -102,8 +112,7 @@ class Workspace:
         warm.number[:] = self.active.number
         warm.q[:] = self.scratch.q
         warm.formed[:] = np.inf
-        warm.factor[:] = np.eye(warm.q.shape[1])
-        warm.coupling[:] = 0.0  # the answer to another position is unknown
+        warm.slope[:] = 0.0  # the answer to another position is unknown
 
     def answering(self) -> list[tuple[int, int, float]]:
         """Slot, number and weight of the local models that answer."""
@@ -129,15 +138,8 @@ class Warm:
         self._make = make
         self._made: dict[tuple[bool, bool], Workspace] = {}
 
-    def press(self, in_time: bool) -> Workspace:
-        """For loads."""
-        return self._part(False, in_time)
-
-    def touch(self, in_time: bool) -> Workspace:
-        """For the tip."""
-        return self._part(True, in_time)
-
-    def _part(self, tip: bool, in_time: bool) -> Workspace:
+    def workspace(self, tip: bool, in_time: bool) -> Workspace:
+        """For the tip or for loads, on tissue that remembers or not."""
         if (tip, in_time) not in self._made:
             self._made[tip, in_time] = self._make(tip, in_time)
         return self._made[tip, in_time]

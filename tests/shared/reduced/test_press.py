@@ -73,7 +73,7 @@ def test_beyond_the_range_the_defect_stays_what_it_is_at_its_end(atlas, single, 
     def load(share):
         warm = atlas.new_warm()
         assert len(atlas.press(single.centres[0], share * loads[-1], warm=warm).parts) == 1
-        return warm.press(in_time=False).scratch.load.copy()
+        return warm.workspace(tip=False, in_time=False).scratch.load.copy()
 
     def bend(*shares):
         first, middle, last = (load(share) for share in shares)

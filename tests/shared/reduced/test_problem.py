@@ -225,8 +225,8 @@ class Touched(Twins):
         """Force on the tool (3,) mN and its derivative (3, 3) mN/mm."""
         assert factorise(problem, self.q)
         force, tangent = np.zeros(3), np.zeros((3, 3))
-        coupling, step = np.zeros((3, len(self.q))), np.zeros(len(self.q))
-        reaction(self.load, self.factor, coupling, step, force, tangent)
+        coupling, slope = np.zeros((2, 3, len(self.q)))
+        reaction(self.load, self.factor, coupling, slope, force, tangent)
         return force, tangent
 
     def galerkin_reaction(self, full, share):
