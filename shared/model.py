@@ -76,13 +76,15 @@ class ReducedModel:
         self.info = info
         self.body = body
         self.surface = surface
-        self.limits = limits
+        self.limits = limits.copy()
         self.models = models
+        if not self.has_tip:
+            self.limits[:, TIP_DEPTH] = 0.0
         self.estimators = estimators
         self.surface_nodes, self.surface_triangles = boundary_triangles(body.faces)
         self.fields = FieldRecovery(body, models, self.transfer)
         self._own = self.new_warm()
-        self._index: SurfaceIndex = surface.ground(limits)
+        self._index: SurfaceIndex = surface.ground(self.limits)
         self._transfers: dict[bool, Transfer] = {}
 
     @classmethod
@@ -150,7 +152,10 @@ class ReducedModel:
             If the scene has no tip, or its tissue no past.
         """
         if tip and self.models.tips is None:
-            raise QueryError("position", f"scene {self.name!r} was trained without a tip")
+            raise QueryError(
+                "position",
+                f"scene {self.name!r} was trained without a tip: endoscope.tip = true adds it",
+            )
         if in_time and not self.scene.tissue.prony:
             raise QueryError("time", f"scene {self.name!r} is elastic and knows none")
         estimator = self.estimators.touches if tip else self.estimators.loads

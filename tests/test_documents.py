@@ -88,14 +88,9 @@ def test_its_python_runs(visco_artifact, capsys):
     example = re.search(
         r"```python\n(from palpate import REST, ReducedModel.*?)```", TEXTS[DOCUMENTS[0]], re.S
     )
-    own = (("artifacts/turbinate-visco.h5", str(visco_artifact)), ("(10, 20, 11)", "(5, 5, 8)"),
-           ("(11.9, 20, 11)", "(5, 5, 9.8)"))  # fmt: skip
-    script = example[1]
-    for shown, here in own:
-        assert shown in script
-        script = script.replace(shown, here)
-    names = {}
-    exec(script, names)
+    shown, names = "artifacts/quick-visco.h5", {}
+    assert shown in example[1]
+    exec(example[1].replace(shown, str(visco_artifact)), names)
     assert names["answer"].converged
     assert names["answer"].time == pytest.approx(1.0)
     assert np.linalg.norm(names["answer"].contact_displacement) > 0
