@@ -3,14 +3,24 @@
 import os
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.online.loadtest import generator
-from palpate.online.loadtest.generator import ANSWERED, SUPERSEDED, Log, Machine
+from palpate.online.loadtest.streams import (
+    ANSWERED,
+    DROPPED,
+    LOST,
+    SUPERSEDED,
+    WINDOW,
+    Machine,
+    Stream,
+)
 from palpate.online.session.frames import Flag
+from palpate.online.settings import Plan
 
 ON_TIME = 100.0
 """Latest that a message may be sent in a clean window, µs after it was due."""
@@ -19,31 +29,51 @@ QUANTILES = {"p50_us": 50.0, "p90_us": 90.0, "p99_us": 99.0, "p999_us": 99.9, "m
 
 Array = NDArray[np.float64]
 
-
 Messages = np.recarray[Any, Any]
-"""What became of n messages, in the order in which they were due; see `gather`."""
+"""What became of n messages, `streams.MESSAGE`, in the order in which they were due."""
 
 
-def gather(logs: Sequence[Log]) -> Messages:
-    """Put the messages of several streams in one table.
+class Outcome(NamedTuple):
+    """What a load test found; ``echoes`` and ``checks`` are to compare the others with."""
 
-    Its columns are `due` (s), `outcome` and `flags`, and in µs `lateness` from when it was due to
-    when its turn came, NaN if that never was; `latency` from due to answered, and what the server
-    says that it spent to `solve` and to `recover` fields, NaN without an answer.
-    """
-    columns = {
-        name: np.concatenate([getattr(log, name) for log in logs])
-        for name in ("due", "sent", "received", "outcome", "solve", "recover", "flags")
+    summary: dict[str, Any]  # JSON-able
+    machine: Machine
+    clean: NDArray[np.bool_]  # (w,), which windows of the machine were clean
+    messages: dict[str, Messages]  # by kind, those that were sent
+
+
+def judge(plan: Plan, machine: Machine, streams: Sequence[Stream], normal: float) -> Outcome:
+    """Summarize what became of the messages of a plan; the load was `normal` s as planned."""
+    every = gather(streams)
+    by_kind: dict[str, list[Stream]] = {}
+    for stream in streams:
+        by_kind.setdefault(stream.kind, []).append(stream)
+    messages = {kind: gather(alike) for kind, alike in by_kind.items()}
+    clean = clean_windows(machine, every)
+    summaries = {
+        kind: summarize(found, clean[window_of(machine, found)], by_kind[kind])
+        for kind, found in messages.items()
+        if kind in ("frames", "queries")
     }
-    due, sent, received = (columns[name] for name in ("due", "sent", "received"))
-    columns["due"] = 1e-9 * due
-    columns["lateness"] = np.where(sent > 0, 1e-3 * (sent - due), np.nan)
-    columns["latency"] = 1e-3 * (received - due)
-    for name in ("latency", "solve", "recover"):
-        columns[name] = np.where(columns["outcome"] == ANSWERED, columns[name], np.nan)
-    order = np.argsort(due, kind="stable")
-    dtype = [(name, column.dtype) for name, column in columns.items()]
-    return np.rec.fromarrays([column[order] for column in columns.values()], dtype=dtype)
+    summary: dict[str, Any] = {"plan": asdict(plan) | {"token": None}}
+    summary |= summaries.pop(next(iter(messages))) | summaries
+    summary["machine"] = summarize_machine(machine, clean, every)
+    if plan.echo:
+        summary["added"] = {
+            kind: summarize_added(messages[kind], messages[empty])
+            for kind, empty in (("frames", "echoes"), ("queries", "checks"))
+            if kind in messages
+        }
+    if plan.overload > 1.0:
+        first = messages.get("frames", every)
+        summary["overload"] = summarize_overload(first, machine, normal, normal + plan.duration)
+    return Outcome(summary, machine, clean, messages)
+
+
+def gather(streams: Sequence[Stream]) -> Messages:
+    """Put the messages of several streams in one table."""
+    messages = np.concatenate([stream.log for stream in streams])
+    return messages[np.argsort(messages["due"], kind="stable")].view(np.recarray)
 
 
 def clean_windows(machine: Machine, messages: Messages) -> NDArray[np.bool_]:
@@ -56,7 +86,7 @@ def clean_windows(machine: Machine, messages: Messages) -> NDArray[np.bool_]:
 
 def window_of(machine: Machine, messages: Messages) -> NDArray[np.int64]:
     """Find the window in which each message was due."""
-    found = np.searchsorted(1e-9 * machine.borders[1:-1], messages.due, "right")
+    found = np.searchsorted(machine.borders[1:-1], messages.due, "right")
     return found.astype(np.int64)
 
 
@@ -70,7 +100,7 @@ def quantiles(microseconds: Array) -> dict[str, float | None]:
 
 
 def summarize(
-    messages: Messages, clean: NDArray[np.bool_], complaints: Sequence[str]
+    messages: Messages, clean: NDArray[np.bool_], streams: Sequence[Stream]
 ) -> dict[str, Any]:
     """Say what became of frames or queries, those marked `clean` apart."""
     outcomes = Counter(messages.outcome.tolist())
@@ -78,16 +108,16 @@ def summarize(
     return {
         "due": len(messages),
         "answered": outcomes.pop(ANSWERED, 0),
-        "lost": outcomes.pop(generator.LOST, 0),
+        "lost": outcomes.pop(LOST, 0),
         "superseded": outcomes.pop(SUPERSEDED, 0),
-        "dropped": outcomes.pop(generator.DROPPED, 0),
+        "dropped": outcomes.pop(DROPPED, 0),
         "refused": {str(status): number for status, number in sorted(outcomes.items())},
         "flags": {bit.name: int((flags & bit > 0).sum()) for bit in Flag},
         "clean": quantiles(messages.latency[clean]),
         "all": quantiles(messages.latency),
         "solve_us": quantiles(messages.solve),
         "clean_solve_us": quantiles(messages.solve[clean]),
-        "complaints": sorted({complaint for complaint in complaints if complaint}),
+        "complaints": sorted({stream.complaint for stream in streams if stream.complaint}),
     }
 
 
@@ -104,11 +134,12 @@ def summarize_added(messages: Messages, empty: Messages) -> dict[str, float]:
     return {"added_us": added, "empty_us": empty_us, "ratio": added / empty_us}
 
 
-def summarize_machine(machine: Machine, messages: Messages) -> dict[str, Any]:
+def summarize_machine(
+    machine: Machine, clean: NDArray[np.bool_], messages: Messages
+) -> dict[str, Any]:
     """Say how well machine and generator kept the time."""
-    clean = clean_windows(machine, messages)
     return {
-        "window_s": generator.WINDOW,
+        "window_s": WINDOW,
         "windows": len(clean),
         "clean_windows": int(clean.sum()),
         "steal_s": round(float(machine.steal.sum()), 2),
@@ -140,7 +171,7 @@ def summarize_overload(
     for w in np.unique(window[phases == 2])[::-1]:
         if np.isinf(bar) or _worst(messages, window, w) > bar:
             break
-        recovered = max(0.0, round(1e-9 * float(machine.borders[w]) - end, 3))
+        recovered = max(0.0, round(float(machine.borders[w]) - end, 3))
     report["recovered_s"] = recovered
     return report
 
@@ -190,3 +221,31 @@ def table(summary: dict[str, Any]) -> str:
 def _row(values: dict[str, float | None]) -> str:
     columns = ("p50_us", "p99_us", "p999_us", "max_us")
     return " | ".join("" if (v := values[name]) is None else f"{v:.0f}" for name in columns)
+
+
+def draw(outcome: Outcome, path: Path) -> None:
+    """Write a PNG: latencies over time, unclean windows in grey, and their distribution."""
+    import matplotlib  # only this needs it
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context({"font.size": 9}):
+        figure = Figure(figsize=(11, 4.2), layout="constrained")
+        over_time, shares = figure.subplots(1, 2, width_ratios=(3, 2), sharey=True)
+        borders = outcome.machine.borders
+        for start, end, clean in zip(borders, borders[1:], outcome.clean, strict=False):
+            if not clean:
+                over_time.axvspan(start, end, color="0.9", lw=0)
+        for label, colour in (("frames", "C0"), ("queries", "C1")):
+            if (messages := outcome.messages.get(label)) is None:
+                continue
+            milliseconds = messages.latency / 1e3
+            over_time.plot(messages.due, milliseconds, ".", color=colour, ms=1, label=label)
+            known = np.sort(milliseconds[np.isfinite(milliseconds)])
+            longer = 1.0 - np.arange(len(known)) / max(len(known), 1)
+            shares.step(longer, known, color=colour, label=label)
+        over_time.set(yscale="log", xlabel="time [s]", ylabel="latency from when due [ms]")
+        over_time.legend(loc="upper right", markerscale=8)
+        shares.set(xscale="log", xlabel="share of messages that took longer")
+        for axes in (over_time, shares):
+            axes.grid(alpha=0.3)
+        figure.savefig(path, dpi=130)

@@ -1,22 +1,22 @@
 """Put a load on a service: tools over the surface, and queries beside them."""
 
+import json
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.online.client.connection import Connection, scene_path
+from palpate.online.client.connection import Connection, scene_path, split_address
 from palpate.online.client.http import Client
-from palpate.online.loadtest import report
-from palpate.online.loadtest.generator import Machine, Stream, drive
-from palpate.online.loadtest.paths import Tip, tool_path
-from palpate.online.loadtest.report import Messages, clean_windows, gather, window_of
-from palpate.online.loadtest.streams import FrameStream, QueryStream, write_requests
+from palpate.online.loadtest.paths import tool_path
+from palpate.online.loadtest.report import Outcome, judge
+from palpate.online.loadtest.streams import FrameStream, QueryStream, Stream, drive
+from palpate.online.serve.wire import BINARY, JSON
+from palpate.online.session.frames import Output
 from palpate.online.session.websocket import ECHO
+from palpate.online.settings import Plan
 from palpate.shared.errors import PalpateError
 
 Array = NDArray[np.float64]
@@ -28,35 +28,6 @@ SHARE = 0.15
 """Largest pressure of queries over the largest of the scene: most points of a body take that."""
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What to put on a service: the options of ``palpate loadtest``, whose help says more."""
-
-    url: str
-    scene: str
-    sessions: int = 1
-    rate: float = 1000.0  # frames of each session, 1/s
-    queries: float = 0.0  # in all, 1/s
-    duration: float = 10.0  # s
-    overload: float = 1.0  # what rates are multiplied with for another duration, before a third one
-    region: str = "all"
-    connections: int = 4
-    depth: float = 1.0  # mm
-    outputs: int = 0  # bits of `session.frames.Output`
-    echo: bool = False
-    token: str | None = None
-    seed: int = 0
-
-
-class Outcome(NamedTuple):
-    """What a load test found; ``echoes`` and ``checks`` are to compare the others with."""
-
-    summary: dict[str, Any]  # JSON-able
-    machine: Machine
-    clean: NDArray[np.bool_]  # (w,), which windows of the machine were clean
-    messages: dict[str, Messages]  # by kind, those that were sent
-
-
 def run(plan: Plan) -> Outcome:
     """Put a load on a service and report what became of it.
 
@@ -66,35 +37,37 @@ def run(plan: Plan) -> Outcome:
     if not (plan.sessions or plan.queries):
         raise PalpateError("nothing to send: ask for --sessions or --queries-per-second")
     with ExitStack() as stack:
-        streams: list[tuple[str, Stream]] = []
-        for kind, stream in _streams(plan):
+        streams: list[Stream] = []
+        for stream in _streams(plan):
             stack.callback(stream.close)
-            streams.append((kind, stream))
-        machine = drive([stream for _, stream in streams])
-    return _judge(plan, machine, streams)
+            streams.append(stream)
+        machine = drive(streams)
+    return judge(plan, machine, streams, LEAD + plan.duration)
 
 
-def _streams(plan: Plan) -> Iterator[tuple[str, Stream]]:
-    """Connect to the service and make the streams of a plan, each with its kind."""
+def _streams(plan: Plan) -> Iterator[Stream]:
+    """Connect to the service and make the streams of a plan."""
     rng = np.random.default_rng(plan.seed)
     with Client(plan.url, token=plan.token) as client:
         ranges = client.scene(plan.scene)["ranges"]
         surface = client.accessible(plan.scene)
+    outputs = sum(Output[name.upper()] for name in plan.outputs)
     for i in range(plan.sessions):
         due = _schedule(plan, plan.rate, i / plan.sessions)
-        path = tool_path(surface, Tip(ranges["radius"], plan.depth), due, rng)
+        path = tool_path(surface, ranges["radius"], plan.depth, due, rng)
         line = _connect(plan, scene_path(plan.scene, "/session"))
-        yield "frames", FrameStream(line, due, path, plan.outputs)
+        yield FrameStream("frames", due, line, path, outputs)
     if plan.sessions and plan.echo:
         due = _schedule(plan, plan.rate, 0.5 / plan.sessions)
-        yield "echoes", FrameStream(_connect(plan, ECHO), due, path)
+        yield FrameStream("echoes", due, _connect(plan, ECHO), path)
     if plan.queries:
         due = _schedule(plan, plan.queries, 0.5)
         places = rng.choice(surface.vertices, len(due))
         loads = places, rng.uniform(0.0, SHARE * ranges["pressure"][1], len(due))
-        yield "queries", _queries(plan, "/solve", due, loads)
+        yield _queries(plan, "queries", "/solve", due, loads)
         if plan.echo:
-            yield "checks", _queries(plan, "/check", _schedule(plan, plan.queries, 0.0), loads)
+            due = _schedule(plan, plan.queries, 0.0)
+            yield _queries(plan, "checks", "/check", due, loads)
 
 
 def _connect(plan: Plan, path: str) -> socket.socket:
@@ -108,10 +81,20 @@ def _connect(plan: Plan, path: str) -> socket.socket:
     return connection.socket
 
 
-def _queries(plan: Plan, verb: str, due: Array, loads: tuple[Array, Array]) -> QueryStream:
-    path = scene_path(plan.scene, verb)
-    requests = write_requests(plan.url, path, plan.token, loads, plan.region)
-    return QueryStream(plan.url, plan.connections, due, requests)
+def _queries(
+    plan: Plan, kind: str, verb: str, due: Array, loads: tuple[Array, Array]
+) -> QueryStream:
+    """Write requests for loads, positions (n, 3) mm and pressures (n,) kPa, answered in binary."""
+    head = [f"POST {scene_path(plan.scene, verb)} HTTP/1.1", f"accept: {BINARY}"]
+    head += [f"host: {split_address(plan.url).netloc}", f"content-type: {JSON}"]
+    head += [f"authorization: Bearer {plan.token}"] if plan.token else []
+    contacts = zip(*(values.tolist() for values in loads), strict=True)
+    bodies = (
+        json.dumps({"contacts": [{"position": at, "pressure": pressure}], "region": plan.region})
+        for at, pressure in contacts
+    )
+    requests = ["\r\n".join([*head, f"content-length: {len(b)}", "", b]).encode() for b in bodies]
+    return QueryStream(kind, due, plan.url, plan.connections, requests)
 
 
 def _schedule(plan: Plan, rate: float, shift: float) -> Array:
@@ -122,34 +105,3 @@ def _schedule(plan: Plan, rate: float, shift: float) -> Array:
         for i, r in enumerate(rates)
     ]
     return np.concatenate(due)
-
-
-def _judge(plan: Plan, machine: Machine, streams: list[tuple[str, Stream]]) -> Outcome:
-    every = gather([stream.log for _, stream in streams])
-    kinds = dict.fromkeys(kind for kind, _ in streams)
-    messages = {name: gather([s.log for kind, s in streams if kind == name]) for name in kinds}
-    clean = clean_windows(machine, every)
-    summaries = {
-        name: report.summarize(
-            messages[name],
-            clean[window_of(machine, messages[name])],
-            [stream.complaint for kind, stream in streams if kind == name],
-        )
-        for name in kinds
-        if name in ("frames", "queries")
-    }
-    summary: dict[str, Any] = {"plan": asdict(plan) | {"token": None}}
-    summary |= summaries.pop(next(iter(kinds))) | summaries
-    summary["machine"] = report.summarize_machine(machine, every)
-    if plan.echo:
-        summary["added"] = {
-            name: report.summarize_added(messages[name], messages[empty])
-            for name, empty in (("frames", "echoes"), ("queries", "checks"))
-            if name in messages
-        }
-    if plan.overload > 1.0:
-        start, end = LEAD + plan.duration, LEAD + 2.0 * plan.duration
-        summary["overload"] = report.summarize_overload(
-            messages.get("frames", every), machine, start, end
-        )
-    return Outcome(summary, machine, clean, messages)

@@ -21,12 +21,12 @@ from palpate.online.serve.answer import answer
 from palpate.online.serve.errors import Refusal
 from palpate.online.serve.metrics import CONTENT_TYPE, Metrics
 from palpate.online.serve.schemas import HistoryRequest, MeshRegion, SolveRequest, parse
-from palpate.online.serve.settings import Settings
 from palpate.online.serve.store import ServedModel, Store
 from palpate.online.serve.wire import BINARY, JSON, MSGPACK, OFFERED, negotiate
 from palpate.online.session import frames, websocket
 from palpate.online.session.protocol import tables
 from palpate.online.session.session import Sessions
+from palpate.online.settings import Settings
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 
 logger = logging.getLogger(__name__)

@@ -18,7 +18,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from palpate.online.serve.errors import Refusal
 from palpate.online.serve.metrics import Metrics
-from palpate.online.serve.settings import Settings
+from palpate.online.settings import Settings
 
 RECEIVED = "palpate.received"
 """Key in the ASGI scope of when the request was read, s of `time.perf_counter`."""

@@ -17,12 +17,12 @@ from starlette.types import Message, Receive, Scope, Send
 
 from palpate.online.serve.errors import Refusal, as_refusal, check_json_size
 from palpate.online.serve.metrics import Metrics
-from palpate.online.serve.settings import Settings
 from palpate.online.serve.store import ServedModel, Store
 from palpate.online.session import frames, protocol
 from palpate.online.session.frames import Output, Request
 from palpate.online.session.tracker import LONGEST, Snapshot, ToolTracker, recover
 from palpate.online.session.websocket import CONNECTION, LINGER, MOST_FRAMES, STOPPING
+from palpate.online.settings import Settings
 
 logger = logging.getLogger(__name__)
 

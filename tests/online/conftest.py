@@ -11,9 +11,9 @@ from palpate.online.client.connection import ServiceError
 from palpate.online.client.session import Session
 from palpate.online.serve.app import create_app
 from palpate.online.serve.process import HttpProtocol
-from palpate.online.serve.settings import Settings
 from palpate.online.serve.store import Store
 from palpate.online.session.websocket import OPTIONS
+from palpate.online.settings import Settings
 from palpate.shared.errors import PalpateError
 
 from .fake_model import FakeModel

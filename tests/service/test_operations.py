@@ -14,7 +14,8 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from palpate.online.client.connection import ServiceError, SessionClosed
 from palpate.online.client.http import Client
-from palpate.online.loadtest.run import Plan, run
+from palpate.online.loadtest.run import run
+from palpate.online.settings import Plan
 from palpate.shared.cli import main
 
 pytestmark = pytest.mark.service

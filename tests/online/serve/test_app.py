@@ -5,9 +5,9 @@ from starlette.testclient import TestClient
 
 from palpate.online.serve.app import create_app
 from palpate.online.serve.schemas import Accessible, Answer, Mesh, SceneList, SceneSummary
-from palpate.online.serve.settings import Settings
 from palpate.online.serve.store import Store
 from palpate.online.serve.wire import BINARY, JSON, MSGPACK
+from palpate.online.settings import Settings
 from palpate.shared.errors import PalpateError
 
 from ..conftest import error_of

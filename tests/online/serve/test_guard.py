@@ -9,7 +9,7 @@ from palpate.online.client.connection import ServiceError
 from palpate.online.client.session import Session
 from palpate.online.serve import guard
 from palpate.online.serve.guard import RateLimit
-from palpate.online.serve.settings import is_loopback
+from palpate.online.serve.process import is_loopback
 from palpate.shared.errors import PalpateError
 
 from ..conftest import error_of
