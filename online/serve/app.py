@@ -4,16 +4,17 @@ import asyncio
 import gc
 import logging
 import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager, suppress
 from importlib.metadata import version
-from typing import Annotated, Any, NamedTuple
+from time import perf_counter
+from typing import Annotated, Any, NamedTuple, get_type_hints
 
 import numpy as np
 import orjson
 from fastapi import APIRouter, FastAPI, Path, Request, Response
 from fastapi.responses import PlainTextResponse
-from pydantic.json_schema import models_json_schema
+from fastapi.routing import APIRoute
 from starlette.routing import WebSocketRoute
 
 from palpate.online.serve import errors, guard, schemas, wire
@@ -30,6 +31,9 @@ from palpate.online.settings import Settings
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 
 logger = logging.getLogger(__name__)
+
+DECODING = "palpate.decoding"
+"""Key in the ASGI scope of when the decoding of the body began, s of `time.perf_counter`."""
 
 
 class Service(NamedTuple):
@@ -77,11 +81,10 @@ def create_app(
     app.state.service = Service(models, settings, counts)
     guard.install(app, settings, counts)
     # FastAPI's own inclusion of a router makes a request 20 µs slower
-    app.router.routes += [*scenes.routes, *service.routes]
+    app.router.routes += [*queries.routes, *scenes.routes, *service.routes]
     app.router.routes.append(WebSocketRoute("/scenes/{name}/session", sessions))
     if settings.echo:
         app.router.routes.append(WebSocketRoute(websocket.ECHO, websocket.echo))
-    _describe_requests(app)
     return app
 
 
@@ -113,7 +116,7 @@ def _warm(sessions: Sessions, served: ServedModel) -> None:
     for region in ("none", "surface", "all"):
         body = orjson.dumps({"contacts": [served.example], "region": region})
         for media_type in OFFERED:
-            answer(served, SolveRequest, body, media_type, 10**9, uncounted)
+            answer(served, parse(SolveRequest, body), media_type, uncounted)
     models, radius = served.model.models, served.model.scene.endoscope.radius
     tour: list[int] = []
     if models.viscous is not None:  # a history goes from one local model to the next and back
@@ -122,35 +125,37 @@ def _warm(sessions: Sessions, served: ServedModel) -> None:
         contacts = ({"position": at, "pressure": 0.1} for at in models.centres[tour].tolist())
         steps = [{"time": 0.1 * i, "contact": contact} for i, contact in enumerate(contacts)]
         body = orjson.dumps({"steps": steps, "region": "all"})
-        answer(served, HistoryRequest, body, JSON, 10**9, uncounted)
+        answer(served, parse(HistoryRequest, body), JSON, uncounted)
     if served.model.has_tip:
         above = [models.centres[k] + 0.9 * radius * models.frames[k, 0] for k in tour]
         sessions.prepare(served, [position.tolist() for position in above])
 
 
-def _describe_requests(app: FastAPI) -> None:
-    """Add the schemas of the request bodies, which are read by hand, to the OpenAPI document."""
-    generate = app.openapi
-
-    def openapi() -> dict[str, Any]:
-        document = generate()
-        _, definitions = models_json_schema(
-            [(kind, "validation") for kind in (SolveRequest, HistoryRequest)],
-            ref_template="#/components/schemas/{model}",
-        )
-        document["components"]["schemas"].update(definitions["$defs"])
-        return document
-
-    app.openapi = openapi  # type: ignore[method-assign]
-
-
 SceneName = Annotated[str, Path(description="Name of a served scene.", examples=["turbinate"])]
-_NAME = {"name": "name", "in": "path", "required": True, "schema": {"type": "string"}} | {
-    "description": "Name of a served scene.",
-    "example": "turbinate",
-}
 
-scenes = APIRouter(prefix="/scenes", tags=["scenes"])  # the hot ones first, as they are tried
+
+class QueryRoute(APIRoute):
+    """Reads path and body of a request itself; FastAPI, which describes them, takes 25 µs longer.
+
+    Endpoints take the request, the name of the scene, and the `load` read from the body.
+    """
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        """Return what answers a request of this route."""
+        kind = get_type_hints(self.endpoint)["load"]
+
+        async def handle(request: Request) -> Response:
+            body = await _read(request, request.app.state.service.settings.max_body)
+            request.scope[DECODING] = perf_counter()
+            load = parse(kind, body)
+            response: Response = await self.endpoint(request, request.path_params["name"], load)
+            return response
+
+        return handle
+
+
+queries = APIRouter(prefix="/scenes", tags=["scenes"], route_class=QueryRoute)
+scenes = APIRouter(prefix="/scenes", tags=["scenes"])
 service = APIRouter(tags=["service"])
 
 
@@ -168,51 +173,36 @@ def _document(model: type, what: str, *codes: int) -> dict[str, Any]:
     return {"response_model": None, "responses": {**answer, **_problems(404, *codes)}}
 
 
-def _by_hand(request: type) -> dict[str, Any]:
-    """Declare path and body by hand; having the framework read them would take 25 µs longer."""
-    reference = {"$ref": f"#/components/schemas/{request.__name__}"}
-    body = {"required": True, "content": {JSON: {"schema": reference}}}
-    return {"openapi_extra": {"parameters": [_NAME], "requestBody": body}}
-
-
-@scenes.post(
-    "/{name}/solve",
-    **_document(schemas.Answer, "How the tissue answers", 406, 413, 415, 422),
-    **_by_hand(SolveRequest),
+@queries.post(
+    "/{name}/solve", **_document(schemas.Answer, "How the tissue answers", 406, 413, 415, 422)
 )
-async def solve(request: Request) -> Response:
+async def solve(request: Request, name: SceneName, load: SolveRequest) -> Response:
     """Press the tissue: force, displacement and stress under a load.
 
     Every request is answered from rest, independently of those before it. The header
     Server-Timing tells the time taken to decode, solve, recover and encode, in ms.
     """
-    return await _answer(request, SolveRequest)
+    return _answer(request, name, load)
 
 
-@scenes.post(
+@queries.post(
     "/{name}/history",
     **_document(schemas.HistoryAnswer, "How the tissue answers, step by step", 406, 413, 415, 422),
-    **_by_hand(HistoryRequest),
 )
-async def history(request: Request) -> Response:
+async def history(request: Request, name: SceneName, load: HistoryRequest) -> Response:
     """Press visco-elastic tissue over time: force and displacement at every step.
 
     Every request starts at rest. Elastic scenes know no time and refuse.
     """
-    return await _answer(request, HistoryRequest)
+    return _answer(request, name, load)
 
 
-@scenes.post(
-    "/{name}/check",
-    response_model=None,
-    responses={200: {"model": schemas.Checked}, **_problems(404, 413, 415, 422)},
-    **_by_hand(SolveRequest),
+@queries.post(
+    "/{name}/check", responses={200: {"model": schemas.Checked}, **_problems(404, 413, 415, 422)}
 )
-async def check(request: Request) -> Response:
+async def check(request: Request, name: SceneName, load: SolveRequest) -> Response:
     """Check that a solve request is well-formed, without solving it."""
-    here: Service = request.app.state.service
-    here.store.model(request.path_params["name"])
-    parse(SolveRequest, await _read(request, here.settings.max_body))
+    request.app.state.service.store.model(name)
     return Response(b'{"valid":true}', media_type=JSON)
 
 
@@ -340,12 +330,14 @@ async def accessible(name: SceneName, request: Request) -> Response:
     return Response(wire.encode(media_type, {"scene": name}, arrays), media_type=media_type)
 
 
-async def _answer(request: Request, kind: type[SolveRequest] | type[HistoryRequest]) -> Response:
+def _answer(request: Request, name: str, load: SolveRequest | HistoryRequest) -> Response:
     here: Service = request.app.state.service
-    media_type = _media_type(request)
-    served = here.store.model(request.path_params["name"])
-    body = await _read(request, here.settings.max_body)
-    return answer(served, kind, body, media_type, here.settings.max_json_numbers, here.metrics)
+    served, media_type, start = (
+        here.store.model(name),
+        _media_type(request),
+        request.scope[DECODING],
+    )
+    return answer(served, load, media_type, here.metrics, start, here.settings.max_json_numbers)
 
 
 def _media_type(request: Request) -> str:

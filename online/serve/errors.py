@@ -60,7 +60,7 @@ class Refusal(PalpateError):
         return Response(self.body(), STATUS[self.code], self.headers, "application/json")
 
 
-def check_json_size(outputs: Collection[str], nodes: int, limit: int, field: str) -> None:
+def check_json_size(outputs: Collection[str], nodes: int, limit: float, field: str) -> None:
     """Refuse fields that would keep the event loop busy with writing decimals."""
     numbers = nodes * (3 * ("displacement" in outputs) + ("von_mises" in outputs))
     if numbers > limit:
