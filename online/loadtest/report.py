@@ -44,14 +44,14 @@ class Outcome(NamedTuple):
 
 def judge(plan: Plan, machine: Machine, streams: Sequence[Stream], normal: float) -> Outcome:
     """Summarize what became of the messages of a plan; the load was `normal` s as planned."""
-    every = gather(streams)
+    every = gather(streams, machine)
     by_kind: dict[str, list[Stream]] = {}
     for stream in streams:
         by_kind.setdefault(stream.kind, []).append(stream)
-    messages = {kind: gather(alike) for kind, alike in by_kind.items()}
+    messages = {kind: gather(alike, machine) for kind, alike in by_kind.items()}
     clean = clean_windows(machine, every)
     summaries = {
-        kind: summarize(found, clean[window_of(machine, found)], by_kind[kind])
+        kind: summarize(found, clean, by_kind[kind])
         for kind, found in messages.items()
         if kind in ("frames", "queries")
     }
@@ -70,24 +70,18 @@ def judge(plan: Plan, machine: Machine, streams: Sequence[Stream], normal: float
     return Outcome(summary, machine, clean, messages)
 
 
-def gather(streams: Sequence[Stream]) -> Messages:
-    """Put the messages of several streams in one table."""
+def gather(streams: Sequence[Stream], machine: Machine) -> Messages:
+    """Put the messages of several streams in one table, with the windows in which they were due."""
     messages = np.concatenate([stream.log for stream in streams])
+    messages["window"] = np.searchsorted(machine.borders[1:-1], messages["due"], "right")
     return messages[np.argsort(messages["due"], kind="stable")].view(np.recarray)
 
 
 def clean_windows(machine: Machine, messages: Messages) -> NDArray[np.bool_]:
     """Tell in which windows (w,) the host took no time and every message was sent on time."""
-    window = window_of(machine, messages)
-    late = ~(messages.lateness <= ON_TIME)  # also those never sent
-    count = len(machine.steal)
-    return (machine.steal == 0) & (np.bincount(window[late], minlength=count) == 0)
-
-
-def window_of(machine: Machine, messages: Messages) -> NDArray[np.int64]:
-    """Find the window in which each message was due."""
-    found = np.searchsorted(machine.borders[1:-1], messages.due, "right")
-    return found.astype(np.int64)
+    clean = machine.steal == 0
+    clean[messages.window[~(messages.lateness <= ON_TIME)]] = False  # also of those never sent
+    return clean
 
 
 def quantiles(microseconds: Array) -> dict[str, float | None]:
@@ -102,9 +96,10 @@ def quantiles(microseconds: Array) -> dict[str, float | None]:
 def summarize(
     messages: Messages, clean: NDArray[np.bool_], streams: Sequence[Stream]
 ) -> dict[str, Any]:
-    """Say what became of frames or queries, those marked `clean` apart."""
+    """Say what became of frames or queries, those of `clean` windows (w,) apart."""
     outcomes = Counter(messages.outcome.tolist())
     flags = messages["flags"][messages.outcome == ANSWERED]
+    unhindered = messages[clean[messages.window]]
     return {
         "due": len(messages),
         "answered": outcomes.pop(ANSWERED, 0),
@@ -113,10 +108,10 @@ def summarize(
         "dropped": outcomes.pop(DROPPED, 0),
         "refused": {str(status): number for status, number in sorted(outcomes.items())},
         "flags": {bit.name: int((flags & bit > 0).sum()) for bit in Flag},
-        "clean": quantiles(messages.latency[clean]),
+        "clean": quantiles(unhindered.latency),
         "all": quantiles(messages.latency),
         "solve_us": quantiles(messages.solve),
-        "clean_solve_us": quantiles(messages.solve[clean]),
+        "clean_solve_us": quantiles(unhindered.solve),
         "complaints": sorted({stream.complaint for stream in streams if stream.complaint}),
     }
 
@@ -165,20 +160,20 @@ def summarize_overload(
             "answered": int((of_phase.outcome == ANSWERED).sum()),
             **quantiles(of_phase.latency),
         }
-    window = window_of(machine, messages)
-    bar = 2.0 * max(_worst(messages, window, w) for w in np.unique(window[phases == 0]))
+    before, after = (np.unique(messages.window[phases == phase]) for phase in (0, 2))
+    bar = 2.0 * max(_worst(messages, w) for w in before)
     recovered = None
-    for w in np.unique(window[phases == 2])[::-1]:
-        if np.isinf(bar) or _worst(messages, window, w) > bar:
+    for w in after[::-1]:
+        if np.isinf(bar) or _worst(messages, w) > bar:
             break
         recovered = max(0.0, round(float(machine.borders[w]) - end, 3))
     report["recovered_s"] = recovered
     return report
 
 
-def _worst(messages: Messages, window: NDArray[np.int64], chosen: int) -> float:
+def _worst(messages: Messages, window: int) -> float:
     """99th percentile of the latencies of a window; infinite if messages got no answer."""
-    latency = messages.latency[(window == chosen) & (messages.outcome != SUPERSEDED)]
+    latency = messages.latency[(messages.window == window) & (messages.outcome != SUPERSEDED)]
     known = np.nan_to_num(latency, nan=np.inf, posinf=np.inf)
     return float(np.percentile(known, 99, method="higher")) if len(known) else np.inf
 

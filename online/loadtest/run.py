@@ -8,8 +8,8 @@ from contextlib import ExitStack
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.online.client.connection import Connection, scene_path, split_address
 from palpate.online.client.http import Client
+from palpate.online.client.session import Connection, scene_path, split_address
 from palpate.online.loadtest.paths import tool_path
 from palpate.online.loadtest.report import Outcome, judge
 from palpate.online.loadtest.streams import FrameStream, QueryStream, Stream, drive

@@ -29,7 +29,7 @@ import numpy as np
 from httptools import HttpResponseParser
 from numpy.typing import NDArray
 
-from palpate.online.client.connection import connect
+from palpate.online.client.session import connect
 from palpate.online.session.frames import REPLY, Request, encode_request
 
 WINDOW = 0.25
@@ -57,6 +57,7 @@ MESSAGE = np.dtype(
         ("latency", "f8"),  # µs, from when it was due to its answer; NaN without one
         ("solve", "f8"),  # µs, that the service says it took to solve; NaN without an answer
         ("recover", "f8"),  # µs, the same to recover the fields of a query
+        ("window", "i4"),  # of the machine, in which it was due
         ("outcome", "i4"),
         ("flags", "i4"),  # of a frame: `session.frames.Flag`
     ]
@@ -75,7 +76,7 @@ class Stream(ABC):
         self, kind: str, due: NDArray[np.float64], sockets: Sequence[socket.socket]
     ) -> None:
         self.kind = kind
-        self.log = np.full(len(due), np.array((0, *4 * [np.nan], LOST, 0), MESSAGE))
+        self.log = np.full(len(due), np.array((0, *4 * [np.nan], 0, LOST, 0), MESSAGE))
         self.log["due"] = due
         self.sockets = list(sockets)
         self.complaint = ""

@@ -91,8 +91,9 @@ def as_refusal(error: Exception) -> Refusal:
     match error:
         case Refusal():
             return error
-        case FrameError():
-            return Refusal(error.code, error.field, error.message)
+        case FrameError(field=field):
+            code = "unknown_version" if field == "version" else "invalid_frame"
+            return Refusal(code, field, error.message)
         case RequestValidationError():  # path and query parameters, all that FastAPI checks here
             return invalid([{**detail, "loc": detail["loc"][1:]} for detail in error.errors()])
         case HTTPException(status_code=405):

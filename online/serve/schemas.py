@@ -25,9 +25,6 @@ Direction = Annotated[list[Annotated[float, Field(ge=-1e3, le=1e3)]], _THREE]
 Vector = Annotated[list[float], _THREE]
 Triangle = Annotated[list[int], _THREE]
 
-SHORTEST_DIRECTION = 1e-3
-"""Length below which a direction is none."""
-
 MOST_STEPS = 200
 """Largest number of steps of a history: so many keep others waiting for some 50 ms."""
 
@@ -63,21 +60,12 @@ class Contact(Strict):
     )
     direction: Direction | None = Field(
         None,
-        description="Where the endoscope pushes, [x, y, z] of any length from 0.001 up; less than "
-        "90 degrees from the inward normal. Default: the inward normal.",
+        description="Where the endoscope pushes, [x, y, z] of any length; less than 90 degrees "
+        "from the inward normal. Default: the inward normal.",
     )
     radius: float | None = Field(
         None, ge=1e-2, le=1e3, description="Radius of the footprint, mm. Default: the scene's."
     )
-
-    @field_validator("direction")
-    @classmethod
-    def _has_a_direction(cls, direction: list[float] | None) -> list[float] | None:
-        if direction is not None and sum(c * c for c in direction) < SHORTEST_DIRECTION**2:
-            raise PydanticCustomError(
-                "zero_vector", "Input should not be a zero vector", {"min_norm": SHORTEST_DIRECTION}
-            )
-        return direction
 
 
 class _Asking(Strict):

@@ -31,22 +31,19 @@ class RefusedFile:
 
 
 class Store:
-    """All models of the ``*.h5`` of a directory, which `load` reads."""
+    """All models of the ``*.h5`` of a directory."""
 
-    def __init__(
-        self, directory: Path, load: Callable[[Path], ReducedModel] = ReducedModel.load
-    ) -> None:
+    def __init__(self, directory: Path) -> None:
         self.directory = directory
         self.models: dict[str, ServedModel] = {}
         self.refused: list[RefusedFile] = []
         self.ready = False
-        self._load = load
 
     def open(self, warm: Callable[[ServedModel], Any]) -> None:
         """Load and warm every model; a file that fails is refused and the others still served."""
         for path in sorted(self.directory.glob("*.h5")):
             try:
-                served = _served(self._load(path))
+                served = _served(ReducedModel.load(path))
                 name = served.model.name
                 if name in self.models:
                     raise PalpateError(f"{path}: another file already holds {name!r}")

@@ -52,10 +52,6 @@ Head = dict[str, Any]
 Arrays = Mapping[str, NDArray[Any]]
 
 
-class WireError(PalpateError):
-    """Bytes that are not a document of this layout."""
-
-
 def encode(media_type: str, head: Head, arrays: Arrays) -> bytes:
     """Write a document in one of the formats on offer.
 
@@ -94,21 +90,24 @@ _WRITERS = {JSON: _encode_json, MSGPACK: _encode_msgpack, BINARY: _encode_binary
 
 
 def decode(body: bytes) -> tuple[Head, dict[str, NDArray[Any]]]:
-    """Read a document of the binary layout: its head, and its arrays as views into `body`."""
+    """Read a document of the binary layout: its head, and its arrays as views into `body`.
+
+    Raises `PalpateError` for bytes that are none.
+    """
     if len(body) < _PREFIX.size:
-        raise WireError(f"{len(body)} bytes are too few for a document")
+        raise PalpateError(f"{len(body)} bytes are too few for a document")
     magic, version, count, head_length, payload_length = _PREFIX.unpack_from(body)
     if magic != MAGIC:
-        raise WireError("not a Palpate document: wrong magic")
+        raise PalpateError("not a Palpate document: wrong magic")
     if version != VERSION:
-        raise WireError(f"layout version {version}; this reader knows version {VERSION}")
+        raise PalpateError(f"layout version {version}; this reader knows version {VERSION}")
     start = _PREFIX.size + head_length
     if len(body) != start + payload_length:
-        raise WireError(f"{len(body)} bytes where the prefix says {start + payload_length}")
+        raise PalpateError(f"{len(body)} bytes where the prefix says {start + payload_length}")
     head = orjson.loads(body[_PREFIX.size : start])
     entries = head.pop("arrays")
     if len(entries) != count:
-        raise WireError(f"{len(entries)} arrays where the prefix says {count}")
+        raise PalpateError(f"{len(entries)} arrays where the prefix says {count}")
     arrays = {}
     for entry in entries:
         size = math.prod(entry["shape"])

@@ -53,10 +53,6 @@ class Command(NamedTuple):
     number: int
 
 
-class RecordingError(PalpateError):
-    """A file that is no recording, or one of another scene."""
-
-
 class Recorder:
     """Writes a session with this greeting to a file, which is overwritten, as it goes."""
 
@@ -132,13 +128,13 @@ class Recording(NamedTuple):
 
 
 def read_recording(path: Path) -> Recording:
-    """Read a recording; raise `RecordingError` if it is missing, damaged or of another version."""
+    """Read a recording; raise `PalpateError` if it is missing, damaged or of another version."""
     try:
         with h5py.File(path, "r") as file:
             if file.attrs.get("format") != FORMAT:
-                raise RecordingError(f"{path}: not a recording of a session")
+                raise PalpateError(f"{path}: not a recording of a session")
             if (version := file.attrs["format_version"]) != FORMAT_VERSION:
-                raise RecordingError(
+                raise PalpateError(
                     f"{path}: format version {version}; this program reads {FORMAT_VERSION}"
                 )
             replies = np.zeros(len(file["seq"]), REPLY)
@@ -151,4 +147,4 @@ def read_recording(path: Path) -> Recording:
             scene = str(file.attrs["scene"])
             return Recording(scene, requests, replies, file["received"][:], commands)
     except (OSError, KeyError, ValueError) as error:
-        raise RecordingError(f"{path}: cannot be read: {error}") from error
+        raise PalpateError(f"{path}: cannot be read: {error}") from error

@@ -27,6 +27,7 @@ def log(due, latency_ms=0.2, late_ms=0.0, outcome=ANSWERED):
     found = np.zeros(len(due), MESSAGE).view(np.recarray)
     found.due, found.latency, found.lateness = due, 1e3 * np.asarray(latency_ms), 1e3 * late_ms
     found.outcome, found.solve, found["flags"] = outcome, 50.0, Flag.CONTACT
+    found.window = found.due  # those of `machine` have a second
     found.latency[found.outcome != ANSWERED] = np.nan
     return found
 
@@ -46,9 +47,10 @@ def test_quantiles_are_those_of_the_values(rng):
 
 def test_streams_are_put_in_one_order():
     streams = [SimpleNamespace(log=log([0.1, 0.3], 3.0)), SimpleNamespace(log=log([0.2, 0.4], 2.0))]
-    messages = gather(streams)
+    messages = gather(streams, machine(1))
     assert messages.due == pytest.approx([0.1, 0.2, 0.3, 0.4])
     assert messages.latency == pytest.approx([3000.0, 2000.0, 3000.0, 2000.0])
+    assert not messages.window.any()
 
 
 def test_a_window_is_clean_if_host_and_generator_were_on_time():

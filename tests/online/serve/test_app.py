@@ -9,13 +9,14 @@ from palpate.online.serve.store import Store
 from palpate.online.serve.wire import BINARY, JSON, MSGPACK
 from palpate.online.settings import Settings
 from palpate.shared.errors import PalpateError
+from palpate.shared.model import ReducedModel
 
 from ..conftest import error_of
 from ..fake_model import FakeModel
 
 
 @pytest.fixture
-def slow_store(tmp_path):
+def slow_store(tmp_path, monkeypatch):
     """Return a store that is loading until the returned event is set."""
     (tmp_path / "toy.h5").touch()
     loaded = threading.Event()
@@ -24,7 +25,8 @@ def slow_store(tmp_path):
         loaded.wait()
         return FakeModel()
 
-    return Store(tmp_path, load), loaded
+    monkeypatch.setattr(ReducedModel, "load", load)
+    return Store(tmp_path), loaded
 
 
 def test_it_lives_at_once_and_is_ready_when_warm(slow_store, tmp_path):

@@ -5,8 +5,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from palpate.online.client.connection import ServiceError
-from palpate.online.client.session import Session
+from palpate.online.client.session import ServiceError, Session
 from palpate.online.serve import guard
 from palpate.online.serve.guard import RateLimit
 from palpate.online.serve.process import is_loopback
