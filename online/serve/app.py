@@ -15,6 +15,7 @@ import orjson
 from fastapi import APIRouter, FastAPI, Path, Request, Response
 from fastapi.responses import PlainTextResponse
 from fastapi.routing import APIRoute
+from starlette.middleware.cors import CORSMiddleware
 from starlette.routing import WebSocketRoute
 
 from palpate.online.serve import errors, guard, schemas, wire
@@ -79,7 +80,16 @@ def create_app(
         telemetry={"tracing": False, "metrics": False, "logs": False},
     )
     app.state.service = Service(models, settings, counts)
-    guard.install(app, settings, counts)
+    app.add_middleware(guard.Guard, settings=settings, metrics=counts)
+    if settings.origins:
+        # outermost: preflights carry no token, and refusals must be readable by the page too
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=settings.origins,
+            allow_methods=["GET", "POST"],
+            allow_headers=["Authorization", "Content-Type"],
+            expose_headers=["Server-Timing", "Retry-After"],
+        )
     # FastAPI's own inclusion of a router makes a request 20 µs slower
     app.router.routes += [*queries.routes, *scenes.routes, *service.routes]
     app.router.routes.append(WebSocketRoute("/scenes/{name}/session", sessions))

@@ -7,12 +7,10 @@ to the worker that accepted it and is none of the others' business.
 
 import asyncio
 import ctypes
-import ipaddress
 import json
 import logging
 import os
 import signal
-import socket
 import sys
 import tempfile
 import threading
@@ -30,7 +28,7 @@ from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 from uvicorn.supervisors.multiprocess import Multiprocess
 
 from palpate.online.serve.errors import Refusal
-from palpate.online.serve.guard import RECEIVED
+from palpate.online.serve.guard import LOCAL, RECEIVED, machine_name
 from palpate.online.serve.metrics import Metrics, make_table
 from palpate.online.session.websocket import OPTIONS
 from palpate.online.settings import Settings
@@ -122,12 +120,12 @@ def serve(settings: Settings) -> None:
         )
     host = settings.host
     if not settings.token and not settings.public:
-        if not is_loopback(host):
+        if machine_name(host) != LOCAL:
             raise PalpateError(
                 f"--host {host or '(any)'} lets other machines in: set PALPATE_TOKEN, or say "
                 "--public to serve anybody"
             )
-        settings = replace(settings, hosts=("localhost", host))
+        settings = replace(settings, hosts=(LOCAL, host))
     set_up_log(settings)
     config = uvicorn.Config(
         "",  # known once the socket is bound
@@ -192,17 +190,6 @@ def _work(settings: Settings, url: str, table: Path) -> FastAPI:
             )
 
     return create_app(settings, on_ready=greet, metrics=metrics)
-
-
-def is_loopback(host: str) -> bool:
-    """Tell whether every address of a name, which must have one, is of this machine alone."""
-    if not host:
-        return False  # any interface
-    try:
-        found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
-    except OSError as error:
-        raise PalpateError(f"--host {host}: {error.strerror}") from error
-    return all(ipaddress.ip_address(str(address[4][0])).is_loopback for address in found)
 
 
 class JsonFormatter(logging.Formatter):

@@ -153,17 +153,6 @@ class ContactAnswer(BaseModel):
     )
 
 
-class ErrorEstimate(BaseModel):
-    """Relative L2 errors against the full model that 95 % of answers stay within, as fractions.
-
-    Null outside the trained range. In a history: the largest error so far relative to the largest
-    norm so far of the field.
-    """
-
-    displacement: float | None
-    von_mises: float | None
-
-
 class Trust(BaseModel):
     """Whether and how far to believe the answer."""
 
@@ -173,7 +162,11 @@ class Trust(BaseModel):
         description="Whether the load is in the range the model was trained for."
     )
     out_of_range: list[str] = Field(description="The contact's fields that are not.")
-    error_estimate: ErrorEstimate
+    error_estimate: dict[FieldName, float | None] = Field(
+        description="Relative L2 errors against the full model that 95 % of answers stay within, "
+        "as fractions. Null outside the trained range. In a history: the largest error so far "
+        "relative to the largest norm so far of the field."
+    )
     min_jacobian: float = Field(description="Smallest volume ratio met; 1 at rest, 0 is collapse.")
 
 
@@ -184,11 +177,10 @@ class Fields(BaseModel):
     von_mises: list[float] | None = Field(None, description="Cauchy stress, kPa")
 
 
-class Timing(BaseModel):
-    """Where the server's time went, µs."""
-
-    solve_us: float
-    recover_us: float
+Timing = Annotated[
+    dict[Literal["solve_us", "recover_us"], float],
+    Field(description="Where the server's time went, µs."),
+]
 
 
 class _Answer(BaseModel):
@@ -296,21 +288,14 @@ class Ranges(BaseModel):
     reach: float = Field(description="Farthest a position may be from the surface, mm.")
 
 
-class Size(BaseModel):
-    """What the fields of this scene hold."""
-
-    nodes: int
-    dofs: int
-    surface_nodes: int
-    triangles: int
-
-
 class SceneSummary(SceneEntry):
     """One scene: what may be asked and how well it is answered."""
 
     ranges: Ranges
     tolerance: dict[str, float] = Field(description="Relative L2 errors promised, as fractions.")
-    size: Size
+    size: dict[Literal["nodes", "dofs", "surface_nodes", "triangles"], int] = Field(
+        description="What the fields of this scene hold."
+    )
     info: dict[str, Any] = Field(description="Training, validation and provenance.")
     example: dict[str, Any] = Field(description="A request that this scene can answer.")
 
