@@ -56,8 +56,7 @@ def loadtest(out: Path | None, as_json: bool, **plan: Any) -> None:
     time or the generator was late are not clean; latencies are given with and without them. For
     Linux and macOS.
     """
-    from palpate.online.loadtest.report import draw, table
-    from palpate.online.loadtest.run import run
+    from palpate.online.loadtest.run import draw, run, table
 
     outcome = run(Plan(**plan))
     click.echo(json.dumps(outcome.summary) if as_json else table(outcome.summary))

@@ -6,9 +6,8 @@ counts from then: a service that stalls is charged with all that should have bee
 at the clock every few microseconds. How late it sent nevertheless is recorded, as is the time that
 the machine's host took from it. Times are in s from the start.
 
-Frames are on a bare socket and written before the test starts: with a WebSocket library the library
-would be measured too. A query that is due while every connection waits for an answer is sent as
-soon as one is free. If that takes longer than a user's patience it is dropped.
+Frames are written before the test starts. A query that is due while every connection waits for an
+answer is sent as soon as one is free. If that takes longer than a user's patience it is dropped.
 """
 
 import gc
@@ -16,7 +15,6 @@ import os
 import re
 import select
 import socket
-import struct
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
@@ -28,6 +26,8 @@ from typing import NamedTuple
 import numpy as np
 from httptools import HttpResponseParser
 from numpy.typing import NDArray
+from websockets.frames import Frame, Opcode
+from websockets.protocol import Protocol, Side
 
 from palpate.online.client.session import connect
 from palpate.online.session.frames import REPLY, Request, encode_request
@@ -64,9 +64,6 @@ MESSAGE = np.dtype(
 )
 
 _PHASES = re.compile(rb"\bsolve;dur=([\d.]+), recover;dur=([\d.]+)")
-
-_TEXT, _BINARY, _CLOSE, _PING, _PONG = 1, 2, 8, 9, 10
-_FINAL, _MASKED = 0x80, 0x80
 
 
 class Stream(ABC):
@@ -145,11 +142,16 @@ class FrameStream(Stream):
         outputs: int = 0,
     ) -> None:
         super().__init__(kind, due, [connection])
-        self._messages = [
-            _message(_BINARY, encode_request(Request(number, time, position, outputs)))
+        requests = (
+            Request(number, time, position, outputs)
             for number, (time, position) in enumerate(zip(due, positions.tolist(), strict=True))
+        )
+        self._messages = [
+            Frame(Opcode.BINARY, encode_request(request)).serialize(mask=True)
+            for request in requests
         ]
-        self._received = self._unsent = b""
+        self._protocol = Protocol(Side.CLIENT, max_size=None)
+        self._unsent = b""
         self._last_sent = self._last_answered = -1
 
     @property
@@ -166,26 +168,20 @@ class FrameStream(Stream):
 
     def take(self, connection: socket.socket, chunk: bytes, now: float) -> None:
         """Take replies, and what else the service has to say."""
-        received = self._received + chunk if self._received else chunk
-        start, end = 0, len(received)
-        while (frame := _frame(received, start, end)) is not None:
-            opcode, begin, start = frame
-            payload = b"" if opcode == _BINARY else received[begin:start]
-            if opcode == _BINARY:
-                self._take_reply(received, begin, now)
-            elif opcode == _PING:
-                self._push(self._unsent + _message(_PONG, payload))
-            elif opcode == _TEXT:
-                self.complaint = payload.decode()
-            elif opcode == _CLOSE:
-                self.lose(connection, payload[2:].decode() or "the service ended the session")
-                return
-        self._received = received[start:]
-        if self._unsent:
-            self._push(self._unsent)
+        protocol = self._protocol
+        protocol.receive_data(chunk)
+        for frame in protocol.events_received():
+            if isinstance(frame, Frame) and frame.opcode is Opcode.BINARY:
+                self._take_reply(bytes(frame.data), now)
+            elif isinstance(frame, Frame) and frame.opcode is Opcode.TEXT:
+                self.complaint = bytes(frame.data).decode()
+        if protocol.close_rcvd is not None:
+            self.lose(connection, protocol.close_rcvd.reason or "the service ended the session")
+        elif message := self._unsent + b"".join(protocol.data_to_send()):
+            self._push(message)
 
-    def _take_reply(self, received: bytes, begin: int, now: float) -> None:
-        reply = np.frombuffer(received, REPLY, 1, begin)[0]
+    def _take_reply(self, frame: bytes, now: float) -> None:
+        reply = np.frombuffer(frame, REPLY, 1)[0]
         number = int(reply["seq"])
         self.answered(number, now, reply["solve_time"], 0.0)
         self.log["flags"][number] = reply["flags"]
@@ -206,24 +202,10 @@ class FrameStream(Stream):
 
     def close(self) -> None:
         """Hang up, with a close message if there is anybody to hear it."""
-        self._push(self._unsent + _message(_CLOSE, struct.pack("!H", 1000)))
+        if self.sockets:
+            self._protocol.send_close(1000)
+            self._push(self._unsent + b"".join(self._protocol.data_to_send()))
         super().close()
-
-
-def _message(opcode: int, payload: bytes) -> bytes:
-    """Write a short WebSocket frame (RFC 6455, section 5.2); its mask of zeros changes nothing."""
-    return bytes((_FINAL | opcode, _MASKED | len(payload), 0, 0, 0, 0)) + payload
-
-
-def _frame(received: bytes, start: int, end: int) -> tuple[int, int, int] | None:
-    """Find a server's frame: its opcode, where its payload begins and where it ends."""
-    if end - start < 2:
-        return None
-    length, begin = received[start + 1], start + 2
-    if length > 125:  # the length follows, in 2 or 8 bytes
-        begin += 2 if length == 126 else 8
-        length = int.from_bytes(received[start + 2 : begin], "big")
-    return (received[start] & 0x0F, begin, begin + length) if begin + length <= end else None
 
 
 class QueryStream(Stream):

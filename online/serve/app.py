@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager, suppress
 from importlib.metadata import version
 from time import perf_counter
-from typing import Annotated, Any, NamedTuple, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 import numpy as np
 import orjson
@@ -23,7 +23,7 @@ from palpate.online.serve.answer import answer
 from palpate.online.serve.errors import Refusal
 from palpate.online.serve.metrics import CONTENT_TYPE, Metrics
 from palpate.online.serve.schemas import HistoryRequest, MeshRegion, SolveRequest, parse
-from palpate.online.serve.store import ServedModel, Store
+from palpate.online.serve.store import ServedModel, Service, Store
 from palpate.online.serve.wire import BINARY, JSON, MSGPACK, OFFERED, negotiate
 from palpate.online.session import frames, websocket
 from palpate.online.session.protocol import tables
@@ -35,14 +35,6 @@ logger = logging.getLogger(__name__)
 
 DECODING = "palpate.decoding"
 """Key in the ASGI scope of when the decoding of the body began, s of `time.perf_counter`."""
-
-
-class Service(NamedTuple):
-    """What endpoints work with, at ``app.state.service``."""
-
-    store: Store
-    settings: Settings
-    metrics: Metrics
 
 
 def create_app(
@@ -57,12 +49,12 @@ def create_app(
     is done; `on_ready` is then called on the thread that answers. One of several workers leaves
     all clients to the others until it is ready.
     """
-    models, counts = store or Store(settings.artifacts), metrics or Metrics()
-    sessions = Sessions(models, settings, counts)
+    here = Service(store or Store(settings.artifacts), settings, metrics or Metrics())
+    sessions = Sessions(here)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        prepared = _prepare(models, sessions, on_ready)
+        prepared = _prepare(here.store, sessions, on_ready)
         if settings.workers > 1:
             await prepared.wait()
         yield
@@ -79,8 +71,8 @@ def create_app(
         # Even unused it looks for a tracer in every request; the service times itself.
         telemetry={"tracing": False, "metrics": False, "logs": False},
     )
-    app.state.service = Service(models, settings, counts)
-    app.add_middleware(guard.Guard, settings=settings, metrics=counts)
+    app.state.service = here
+    app.add_middleware(guard.Guard, settings=settings, metrics=here.metrics)
     if settings.origins:
         # outermost: preflights carry no token, and refusals must be readable by the page too
         app.add_middleware(

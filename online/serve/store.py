@@ -4,9 +4,11 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from palpate.online.serve.errors import Refusal
+from palpate.online.serve.metrics import Metrics
+from palpate.online.settings import Settings
 from palpate.shared.errors import PalpateError
 from palpate.shared.model import ReducedModel
 
@@ -72,6 +74,14 @@ class Store:
         if name not in self.models:
             raise Refusal("unknown_scene", "name", "No such scene is served", sorted(self.models))
         return self.models[name]
+
+
+class Service(NamedTuple):
+    """What endpoints and sessions work with."""
+
+    store: Store
+    settings: Settings
+    metrics: Metrics
 
 
 def _served(model: ReducedModel) -> ServedModel:

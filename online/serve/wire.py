@@ -25,7 +25,7 @@ each can be viewed in place (``new Float32Array(buffer, 16 + H + offset, n)``).
 import math
 import re
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
 
@@ -126,26 +126,20 @@ def negotiate(accept: str) -> str:
 
     Of types liked equally the first on offer wins, unless another is named more exactly.
     """
-    ranges = [_parse(part) for part in (accept.strip() or "*/*").split(",")]
-    liked = {offered: _liking(offered, ranges) for offered in OFFERED}
-    best = max(OFFERED, key=liked.__getitem__)
-    if liked[best][0] == 0.0:
-        raise Refusal(
-            "not_acceptable", "accept", "None of the accepted formats is on offer", OFFERED
-        )
+    qualities = {}  # of media ranges; zero where they make no sense
+    for part in (accept.strip() or "*/*").split(","):
+        name, *parameters = (piece.strip().lower() for piece in part.split(";"))
+        quality = next((p[2:] for p in parameters if p.startswith("q=")), "1")
+        qualities[name] = float(quality) if _QUALITY.fullmatch(quality) else 0.0
+
+    def liking(offered: str) -> tuple[float, int]:
+        """Quality of the most exact range that matches, even if it says no; how exact it is."""
+        kinds = ("*/*", offered.split("/")[0] + "/*", offered)
+        exactness = max((i for i, kind in enumerate(kinds) if kind in qualities), default=0)
+        return qualities.get(kinds[exactness], 0.0), exactness
+
+    best = max(OFFERED, key=liking)
+    if liking(best)[0] == 0.0:
+        message = "None of the accepted formats is on offer"
+        raise Refusal("not_acceptable", "accept", message, OFFERED)
     return best
-
-
-def _parse(part: str) -> tuple[str, float]:
-    """Split a media range from its quality, which is zero if it makes no sense."""
-    name, *parameters = (piece.strip().lower() for piece in part.split(";"))
-    quality = next((p[2:] for p in parameters if p.startswith("q=")), "1")
-    return name, float(quality) if _QUALITY.fullmatch(quality) else 0.0
-
-
-def _liking(offered: str, ranges: Sequence[tuple[str, float]]) -> tuple[float, int]:
-    """Quality of the most exact range that matches a type, even if it says no; how exact it is."""
-    kinds = ("*/*", offered.split("/")[0] + "/*", offered)
-    matching = ((kinds.index(name), quality) for name, quality in ranges if name in kinds)
-    exactness, quality = max(matching, default=(0, 0.0))
-    return quality, exactness

@@ -3,7 +3,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from palpate.online.loadtest.report import (
+from palpate.online.loadtest.run import (
     clean_windows,
     gather,
     quantiles,

@@ -8,8 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from palpate.online.commands import loadtest
-from palpate.online.loadtest.report import table
-from palpate.online.loadtest.run import run
+from palpate.online.loadtest.run import run, table
 from palpate.online.settings import Plan, Settings
 from palpate.shared.errors import PalpateError
 
