@@ -28,7 +28,6 @@ from palpate.online.serve.wire import BINARY, JSON, MSGPACK, OFFERED, negotiate
 from palpate.online.session import frames, websocket
 from palpate.online.session.protocol import tables
 from palpate.online.session.session import Sessions
-from palpate.online.settings import Settings
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 
 logger = logging.getLogger(__name__)
@@ -37,20 +36,14 @@ DECODING = "palpate.decoding"
 """Key in the ASGI scope of when the decoding of the body began, s of `time.perf_counter`."""
 
 
-def create_app(
-    settings: Settings,
-    store: Store | None = None,
-    on_ready: Callable[[Store], None] = lambda store: None,
-    metrics: Metrics | None = None,
-) -> FastAPI:
-    """Make the service.
+def create_app(here: Service, on_ready: Callable[[], None] = lambda: None) -> FastAPI:
+    """Make the application of a service.
 
     It answers at once; the models are loaded and warmed meanwhile, and ``/ready`` says when that
     is done; `on_ready` is then called on the thread that answers. One of several workers leaves
     all clients to the others until it is ready.
     """
-    here = Service(store or Store(settings.artifacts), settings, metrics or Metrics())
-    sessions = Sessions(here)
+    settings, sessions = here.settings, Sessions(here)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -90,7 +83,7 @@ def create_app(
     return app
 
 
-def _prepare(store: Store, sessions: Sessions, on_ready: Callable[[Store], None]) -> asyncio.Event:
+def _prepare(store: Store, sessions: Sessions, on_ready: Callable[[], None]) -> asyncio.Event:
     """Load and warm the models in a thread; return what is set when that is over."""
     loop, prepared = asyncio.get_running_loop(), asyncio.Event()
 
@@ -98,7 +91,7 @@ def _prepare(store: Store, sessions: Sessions, on_ready: Callable[[Store], None]
         gc.collect()
         gc.freeze()  # the collector need not look at the models again
         store.ready = True
-        on_ready(store)
+        on_ready()
         prepared.set()
 
     def load() -> None:
@@ -200,7 +193,7 @@ async def history(request: Request, name: SceneName, load: HistoryRequest) -> Re
 
 
 @queries.post(
-    "/{name}/check", responses={200: {"model": schemas.Checked}, **_problems(404, 413, 415, 422)}
+    "/{name}/check", responses={200: {"model": dict[str, bool]}, **_problems(404, 413, 415, 422)}
 )
 async def check(request: Request, name: SceneName, load: SolveRequest) -> Response:
     """Check that a solve request is well-formed, without solving it."""
@@ -223,14 +216,14 @@ async def session(name: SceneName, request: Request) -> Response:
     raise Refusal("upgrade_required", "upgrade", "A session is opened by a WebSocket handshake")
 
 
-@service.get("/health", response_model=schemas.Status)
-async def health() -> Any:
+@service.get("/health")
+async def health() -> dict[str, str]:
     """Tell that the process lives."""
     return {"status": "ok"}
 
 
-@service.get("/ready", response_model=schemas.Status, responses={503: {"model": schemas.Problem}})
-async def ready(request: Request) -> Any:
+@service.get("/ready", responses={503: {"model": schemas.Problem}})
+async def ready(request: Request) -> dict[str, str]:
     """Tell whether every model is loaded and warm."""
     store: Store = request.app.state.service.store
     store.require_ready()

@@ -19,7 +19,6 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING
 
 import click
 import uvicorn
@@ -33,9 +32,6 @@ from palpate.online.serve.metrics import Metrics, make_table
 from palpate.online.session.websocket import OPTIONS
 from palpate.online.settings import Settings
 from palpate.shared.errors import PalpateError
-
-if TYPE_CHECKING:
-    from palpate.online.serve.store import Store
 
 logger = logging.getLogger(__name__)
 
@@ -167,14 +163,17 @@ def _work(settings: Settings, url: str, table: Path) -> FastAPI:
     """Make the application of one worker, in its own process."""
     # Not before: the supervisor has no use for the models' code.
     from palpate.online.serve.app import create_app
+    from palpate.online.serve.store import Service
 
     set_up_log(settings)
     # Uvicorn tells of every session that opens; that it starts and ends, the supervisor tells.
     logging.getLogger("uvicorn.error").setLevel(logging.WARNING)
     # On systems without file locks there is one worker, which has no use for a table.
     metrics = Metrics(table if settings.workers > 1 else None)
+    service = Service(settings, metrics)
+    store = service.store
 
-    def greet(store: "Store") -> None:
+    def greet() -> None:
         if settings.realtime:
             logger.info("%s; %s", schedule_in_real_time(), lock_memory())
         logger.info("worker %d is ready", metrics.worker)
@@ -182,14 +181,16 @@ def _work(settings: Settings, url: str, table: Path) -> FastAPI:
             return  # the first worker says it once
         for refused in store.refused:
             click.echo(f"Refused {refused.reason}")
-        click.echo(f"Serving {', '.join(store.models) or 'nothing'} on {url} (API: {url}/docs)")
+        click.echo(
+            f"Serving {', '.join(store.models) or 'nothing'} on {url} (API: {url}/docs)"
+        )
         for name, model in list(store.models.items())[:1]:
             click.echo(
                 f"Try: curl {url}/scenes/{name}/solve -H 'Content-Type: application/json' "
                 f"-d '{json.dumps({'contacts': [model.example]})}'"
             )
 
-    return create_app(settings, on_ready=greet, metrics=metrics)
+    return create_app(service, on_ready=greet)
 
 
 class JsonFormatter(logging.Formatter):

@@ -300,18 +300,6 @@ class SceneSummary(SceneEntry):
     example: dict[str, Any] = Field(description="A request that this scene can answer.")
 
 
-class Status(BaseModel):
-    """The service is up."""
-
-    status: Literal["ok", "ready"]
-
-
-class Checked(BaseModel):
-    """The request is well-formed."""
-
-    valid: Literal[True]
-
-
 class ErrorBody(BaseModel):
     """What is wrong."""
 

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from palpate.online.serve.errors import Refusal
 from palpate.online.serve.metrics import Metrics
@@ -76,12 +76,12 @@ class Store:
         return self.models[name]
 
 
-class Service(NamedTuple):
-    """What endpoints and sessions work with."""
+class Service:
+    """What endpoints and sessions work with; without `metrics` this is the only worker."""
 
-    store: Store
-    settings: Settings
-    metrics: Metrics
+    def __init__(self, settings: Settings, metrics: Metrics | None = None) -> None:
+        self.settings, self.store = settings, Store(settings.artifacts)
+        self.metrics = metrics or Metrics()
 
 
 def _served(model: ReducedModel) -> ServedModel:

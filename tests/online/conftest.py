@@ -10,7 +10,7 @@ from starlette.testclient import TestClient
 from palpate.online.client.session import ServiceError, Session
 from palpate.online.serve.app import create_app
 from palpate.online.serve.process import HttpProtocol
-from palpate.online.serve.store import Store
+from palpate.online.serve.store import Service, Store
 from palpate.online.session.websocket import OPTIONS
 from palpate.online.settings import Settings
 from palpate.shared.errors import PalpateError
@@ -48,8 +48,9 @@ def make_app(fake_store, tmp_path):
 
     def make(models, settings):
         models = models or [FakeModel()]
-        store = fake_store(**{getattr(model, "name", "broken"): model for model in models})
-        return create_app(Settings(tmp_path, **settings), store), store
+        fake_store(**{getattr(model, "name", "broken"): model for model in models})
+        service = Service(Settings(tmp_path, **settings))
+        return create_app(service), service.store
 
     return make
 
