@@ -16,7 +16,6 @@ from palpate.online.serve import wire
 from palpate.online.serve.errors import Refusal, check_json_size
 from palpate.online.serve.metrics import PHASES, Metrics
 from palpate.online.serve.schemas import Contact, HistoryRequest, SolveRequest
-from palpate.online.serve.store import ServedModel
 from palpate.online.serve.wire import JSON
 from palpate.shared.answer import Answer, describe
 from palpate.shared.errors import QueryError
@@ -25,7 +24,7 @@ from palpate.shared.reduced.transfer import REST
 
 
 def answer(
-    served: ServedModel,
+    model: ReducedModel,
     request: SolveRequest | HistoryRequest,
     media_type: str,
     metrics: Metrics,
@@ -38,7 +37,6 @@ def answer(
     want a warm start. Raises `Refusal` if a load is not one the model can be asked about, or it has
     no equilibrium; or if a history is asked of elastic tissue.
     """
-    model = served.model
     if media_type == JSON:
         nodes = {"none": 0, "surface": len(model.surface_nodes), "all": len(model.nodes)}
         check_json_size(request.outputs, nodes[request.region], max_json_numbers, "region")

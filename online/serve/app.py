@@ -111,7 +111,7 @@ def _warm(sessions: Sessions, served: ServedModel) -> None:
     for region in ("none", "surface", "all"):
         body = orjson.dumps({"contacts": [served.example], "region": region})
         for media_type in OFFERED:
-            answer(served, parse(SolveRequest, body), media_type, uncounted)
+            answer(served.model, parse(SolveRequest, body), media_type, uncounted)
     models, radius = served.model.models, served.model.scene.endoscope.radius
     tour: list[int] = []
     if models.viscous is not None:  # a history goes from one local model to the next and back
@@ -120,7 +120,7 @@ def _warm(sessions: Sessions, served: ServedModel) -> None:
         contacts = ({"position": at, "pressure": 0.1} for at in models.centres[tour].tolist())
         steps = [{"time": 0.1 * i, "contact": contact} for i, contact in enumerate(contacts)]
         body = orjson.dumps({"steps": steps, "region": "all"})
-        answer(served, parse(HistoryRequest, body), JSON, uncounted)
+        answer(served.model, parse(HistoryRequest, body), JSON, uncounted)
     if served.model.has_tip:
         above = [models.centres[k] + 0.9 * radius * models.frames[k, 0] for k in tour]
         sessions.prepare(served, [position.tolist() for position in above])
@@ -228,7 +228,7 @@ async def ready(request: Request) -> dict[str, str]:
     store: Store = request.app.state.service.store
     store.require_ready()
     if not store.models:
-        reasons = "; ".join(refused.reason for refused in store.refused)
+        reasons = "; ".join(refused["reason"] for refused in store.refused)
         raise Refusal("not_ready", "", f"No artifact could be loaded: {reasons}")
     return {"status": "ready"}
 
@@ -327,12 +327,9 @@ async def accessible(name: SceneName, request: Request) -> Response:
 
 def _answer(request: Request, name: str, load: SolveRequest | HistoryRequest) -> Response:
     here: Service = request.app.state.service
-    served, media_type, start = (
-        here.store.model(name),
-        _media_type(request),
-        request.scope[DECODING],
-    )
-    return answer(served, load, media_type, here.metrics, start, here.settings.max_json_numbers)
+    model, media_type = here.store.model(name).model, _media_type(request)
+    start, limit = request.scope[DECODING], here.settings.max_json_numbers
+    return answer(model, load, media_type, here.metrics, start, limit)
 
 
 def _media_type(request: Request) -> str:

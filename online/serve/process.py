@@ -180,10 +180,8 @@ def _work(settings: Settings, url: str, table: Path) -> FastAPI:
         if metrics.worker or metrics.restarted:
             return  # the first worker says it once
         for refused in store.refused:
-            click.echo(f"Refused {refused.reason}")
-        click.echo(
-            f"Serving {', '.join(store.models) or 'nothing'} on {url} (API: {url}/docs)"
-        )
+            click.echo(f"Refused {refused['reason']}")
+        click.echo(f"Serving {', '.join(store.models) or 'nothing'} on {url} (API: {url}/docs)")
         for name, model in list(store.models.items())[:1]:
             click.echo(
                 f"Try: curl {url}/scenes/{name}/solve -H 'Content-Type: application/json' "

@@ -10,7 +10,6 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, f
 from pydantic_core import PydanticCustomError
 
 from palpate.online.serve.errors import invalid
-from palpate.online.serve.store import RefusedFile
 
 CONVENTIONS = "Units are mm, mN, kPa and s throughout; forces are those of the tissue on the tool."
 """Of every endpoint and of sessions."""
@@ -270,7 +269,7 @@ class SceneList(BaseModel):
     """What is served and what could not be."""
 
     scenes: list[SceneEntry]
-    refused: list[RefusedFile]
+    refused: list[dict[Literal["file", "reason"], str]]
 
 
 class Ranges(BaseModel):

@@ -2,9 +2,8 @@
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from palpate.online.serve.errors import Refusal
 from palpate.online.serve.metrics import Metrics
@@ -15,21 +14,12 @@ from palpate.shared.model import ReducedModel
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class ServedModel:
+class ServedModel(NamedTuple):
     """A reduced model that is served, and what requests need beside it."""
 
     model: ReducedModel
     example: dict[str, Any]  # `position` (mm) and `pressure` (kPa) of a contact it can answer
     tip: list[float]  # mm, a position of the tip's centre at which it presses a little
-
-
-@dataclass(frozen=True)
-class RefusedFile:
-    """An artifact that is not served, and why."""
-
-    file: str
-    reason: str
 
 
 class Store:
@@ -38,7 +28,7 @@ class Store:
     def __init__(self, directory: Path) -> None:
         self.directory = directory
         self.models: dict[str, ServedModel] = {}
-        self.refused: list[RefusedFile] = []
+        self.refused: list[dict[str, str]] = []  # `file` and `reason` of those that are not served
         self.ready = False
 
     def open(self, warm: Callable[[ServedModel], Any]) -> None:
@@ -61,7 +51,7 @@ class Store:
                 logger.info("serving %s from %s", name, path)
                 continue
             logger.error("refused %s", reason)
-            self.refused.append(RefusedFile(path.name, reason))
+            self.refused.append({"file": path.name, "reason": reason})
 
     def require_ready(self) -> None:
         """Raise `Refusal` while models are being loaded."""

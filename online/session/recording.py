@@ -45,14 +45,6 @@ COMMANDS = Field(
 )
 
 
-class Command(NamedTuple):
-    """A snapshot that was taken or restored."""
-
-    replies: int  # number of those that had come before
-    restores: int  # 0 or 1
-    number: int
-
-
 class Recorder:
     """Writes a session with this greeting to a file, which is overwritten, as it goes."""
 
@@ -124,7 +116,7 @@ class Recording(NamedTuple):
     requests: list[Request]  # those that were answered
     replies: NDArray[Any]  # (n,), of `session.frames.REPLY`
     received: NDArray[np.float64]  # (n,), s on the client's clock
-    commands: list[Command]
+    commands: list[tuple[int, int, int]]  # as `COMMANDS`
 
 
 def read_recording(path: Path) -> Recording:
@@ -143,7 +135,7 @@ def read_recording(path: Path) -> Recording:
             columns = replies["seq"], replies["client_time"], file["asked_position"][:]
             asked = (column.tolist() for column in (*columns, file["asked_outputs"][:]))
             requests = [Request(*values) for values in zip(*asked, strict=True)]
-            commands = [Command(*values) for values in file["commands"][:].tolist()]
+            commands = [tuple(row) for row in file[COMMANDS.name][:].tolist()]
             scene = str(file.attrs["scene"])
             return Recording(scene, requests, replies, file["received"][:], commands)
     except (OSError, KeyError, ValueError) as error:

@@ -40,7 +40,7 @@ def replay(recording: Recording, model: ReducedModel) -> Replay:
     snapshots: dict[int, Snapshot] = {}
     again = np.zeros_like(recording.replies)
     for i, request in enumerate(recording.requests):
-        while commands and commands[0].replies <= i:
+        while commands and commands[0][0] <= i:
             _, restores, number = commands.pop(0)
             if restores:
                 tracker.restore(snapshots[number])
