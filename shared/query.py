@@ -56,7 +56,7 @@ def checked_load(
     if direction is None:
         return at, INWARD, radius
     towards = vector("direction", direction)
-    if not any(towards.tolist()):
+    if not towards @ towards > 0.0:  # nor so short that its square is zero
         raise QueryError("direction", "must not be the zero vector")
     return at, towards, radius
 

@@ -10,8 +10,7 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.online.client.connection import ServiceError, scene_path, split_address
-from palpate.online.client.session import Session
+from palpate.online.client.session import ServiceError, Session, scene_path, split_address
 from palpate.online.serve import wire
 from palpate.online.serve.wire import BINARY, JSON
 from palpate.shared.errors import PalpateError

@@ -1,7 +1,5 @@
 """Where a tool goes: over the whole accessible surface, in and out of contact, fast as a hand."""
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
@@ -29,19 +27,14 @@ LIFTED = 1.0
 """How far the tip is lifted, mm."""
 
 
-class Tip(NamedTuple):
-    """A spherical tip: its radius and how deep it presses at most, mm."""
-
-    radius: float
-    depth: float
-
-
-def tool_path(surface: Accessible, tip: Tip, times: Array, rng: np.random.Generator) -> Array:
+def tool_path(
+    surface: Accessible, radius: float, depth: float, times: Array, rng: np.random.Generator
+) -> Array:
     """Move a tip over a surface; return its centre (n, 3) mm at `times` (n,) s, from 0 upwards.
 
-    It goes the shortest way from one random vertex to the next, ``LIFTED`` above the surface and
-    ``tip.depth`` below it in turn, and slows down and speeds up between a tenth of `SPEED` and
-    all of it.
+    It goes the shortest way from one random vertex to the next, `LIFTED` above the surface and
+    `depth` below it in turn (mm), and slows down and speeds up between a tenth of `SPEED` and all
+    of it.
     """
     period, phase = 5.0, rng.uniform(0.0, 2 * np.pi)
     # The integral of SPEED (0.55 - 0.45 cos(2 pi t / period + phase)).
@@ -50,8 +43,8 @@ def tool_path(surface: Accessible, tip: Tip, times: Array, rng: np.random.Genera
     feet, normals = _walk(surface, float(way[-1]), rng)
     along = _lengths(feet)
     swing = np.sin(2 * np.pi * along / WAVE + rng.uniform(0.0, 2 * np.pi))
-    depth = (tip.depth - LIFTED) / 2 + (tip.depth + LIFTED) / 2 * swing
-    centres = feet + (tip.radius - depth)[:, None] * normals
+    below = (depth - LIFTED) / 2 + (depth + LIFTED) / 2 * swing
+    centres = feet + (radius - below)[:, None] * normals
     return make_interp_spline(_lengths(centres), centres, 1)(way)
 
 

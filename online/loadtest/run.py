@@ -1,25 +1,46 @@
-"""Put a load on a service: tools over the surface, and queries beside them."""
+"""Put a load on a service, tools over the surface and queries beside them, and report.
 
+Latencies are given in all windows and in the clean ones.
+"""
+
+import json
+import os
 import socket
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.online.client.connection import Connection, scene_path
 from palpate.online.client.http import Client
-from palpate.online.loadtest import report
-from palpate.online.loadtest.generator import Machine, Stream, drive
-from palpate.online.loadtest.paths import Tip, tool_path
-from palpate.online.loadtest.report import Messages, clean_windows, gather, window_of
-from palpate.online.loadtest.streams import FrameStream, QueryStream, write_requests
+from palpate.online.client.session import Connection, scene_path, split_address
+from palpate.online.loadtest.paths import tool_path
+from palpate.online.loadtest.streams import (
+    ANSWERED,
+    DROPPED,
+    LOST,
+    SUPERSEDED,
+    WINDOW,
+    FrameStream,
+    Machine,
+    QueryStream,
+    Stream,
+    drive,
+)
+from palpate.online.serve.wire import BINARY, JSON
+from palpate.online.session.frames import Flag, Output
 from palpate.online.session.websocket import ECHO
+from palpate.online.settings import Plan
 from palpate.shared.errors import PalpateError
 
 Array = NDArray[np.float64]
+
+Messages = np.recarray[Any, Any]
+"""What became of n messages, `streams.MESSAGE`, in the order in which they were due."""
 
 LEAD = 0.1
 """Seconds before the first message, for the sockets to settle."""
@@ -27,25 +48,10 @@ LEAD = 0.1
 SHARE = 0.15
 """Largest pressure of queries over the largest of the scene: most points of a body take that."""
 
+ON_TIME = 100.0
+"""Latest that a message may be sent in a clean window, µs after it was due."""
 
-@dataclass(frozen=True)
-class Plan:
-    """What to put on a service: the options of ``palpate loadtest``, whose help says more."""
-
-    url: str
-    scene: str
-    sessions: int = 1
-    rate: float = 1000.0  # frames of each session, 1/s
-    queries: float = 0.0  # in all, 1/s
-    duration: float = 10.0  # s
-    overload: float = 1.0  # what rates are multiplied with for another duration, before a third one
-    region: str = "all"
-    connections: int = 4
-    depth: float = 1.0  # mm
-    outputs: int = 0  # bits of `session.frames.Output`
-    echo: bool = False
-    token: str | None = None
-    seed: int = 0
+QUANTILES = {"p50_us": 50.0, "p90_us": 90.0, "p99_us": 99.0, "p999_us": 99.9, "max_us": 100.0}
 
 
 class Outcome(NamedTuple):
@@ -66,35 +72,37 @@ def run(plan: Plan) -> Outcome:
     if not (plan.sessions or plan.queries):
         raise PalpateError("nothing to send: ask for --sessions or --queries-per-second")
     with ExitStack() as stack:
-        streams: list[tuple[str, Stream]] = []
-        for kind, stream in _streams(plan):
+        streams: list[Stream] = []
+        for stream in _streams(plan):
             stack.callback(stream.close)
-            streams.append((kind, stream))
-        machine = drive([stream for _, stream in streams])
+            streams.append(stream)
+        machine = drive(streams)
     return _judge(plan, machine, streams)
 
 
-def _streams(plan: Plan) -> Iterator[tuple[str, Stream]]:
-    """Connect to the service and make the streams of a plan, each with its kind."""
+def _streams(plan: Plan) -> Iterator[Stream]:
+    """Connect to the service and make the streams of a plan."""
     rng = np.random.default_rng(plan.seed)
     with Client(plan.url, token=plan.token) as client:
         ranges = client.scene(plan.scene)["ranges"]
         surface = client.accessible(plan.scene)
+    outputs = sum(Output[name.upper()] for name in plan.outputs)
     for i in range(plan.sessions):
         due = _schedule(plan, plan.rate, i / plan.sessions)
-        path = tool_path(surface, Tip(ranges["radius"], plan.depth), due, rng)
+        path = tool_path(surface, ranges["radius"], plan.depth, due, rng)
         line = _connect(plan, scene_path(plan.scene, "/session"))
-        yield "frames", FrameStream(line, due, path, plan.outputs)
+        yield FrameStream("frames", due, line, path, outputs)
     if plan.sessions and plan.echo:
         due = _schedule(plan, plan.rate, 0.5 / plan.sessions)
-        yield "echoes", FrameStream(_connect(plan, ECHO), due, path)
+        yield FrameStream("echoes", due, _connect(plan, ECHO), path)
     if plan.queries:
         due = _schedule(plan, plan.queries, 0.5)
         places = rng.choice(surface.vertices, len(due))
         loads = places, rng.uniform(0.0, SHARE * ranges["pressure"][1], len(due))
-        yield "queries", _queries(plan, "/solve", due, loads)
+        yield _queries(plan, "queries", "/solve", due, loads)
         if plan.echo:
-            yield "checks", _queries(plan, "/check", _schedule(plan, plan.queries, 0.0), loads)
+            due = _schedule(plan, plan.queries, 0.0)
+            yield _queries(plan, "checks", "/check", due, loads)
 
 
 def _connect(plan: Plan, path: str) -> socket.socket:
@@ -108,10 +116,20 @@ def _connect(plan: Plan, path: str) -> socket.socket:
     return connection.socket
 
 
-def _queries(plan: Plan, verb: str, due: Array, loads: tuple[Array, Array]) -> QueryStream:
-    path = scene_path(plan.scene, verb)
-    requests = write_requests(plan.url, path, plan.token, loads, plan.region)
-    return QueryStream(plan.url, plan.connections, due, requests)
+def _queries(
+    plan: Plan, kind: str, verb: str, due: Array, loads: tuple[Array, Array]
+) -> QueryStream:
+    """Write requests for loads, positions (n, 3) mm and pressures (n,) kPa, answered in binary."""
+    head = [f"POST {scene_path(plan.scene, verb)} HTTP/1.1", f"accept: {BINARY}"]
+    head += [f"host: {split_address(plan.url).netloc}", f"content-type: {JSON}"]
+    head += [f"authorization: Bearer {plan.token}"] if plan.token else []
+    contacts = zip(*(values.tolist() for values in loads), strict=True)
+    bodies = (
+        json.dumps({"contacts": [{"position": at, "pressure": pressure}], "region": plan.region})
+        for at, pressure in contacts
+    )
+    requests = ["\r\n".join([*head, f"content-length: {len(b)}", "", b]).encode() for b in bodies]
+    return QueryStream(kind, due, plan.url, plan.connections, requests)
 
 
 def _schedule(plan: Plan, rate: float, shift: float) -> Array:
@@ -124,32 +142,206 @@ def _schedule(plan: Plan, rate: float, shift: float) -> Array:
     return np.concatenate(due)
 
 
-def _judge(plan: Plan, machine: Machine, streams: list[tuple[str, Stream]]) -> Outcome:
-    every = gather([stream.log for _, stream in streams])
-    kinds = dict.fromkeys(kind for kind, _ in streams)
-    messages = {name: gather([s.log for kind, s in streams if kind == name]) for name in kinds}
+def _judge(plan: Plan, machine: Machine, streams: Sequence[Stream]) -> Outcome:
+    """Summarize what became of the messages of a plan."""
+    every = gather(streams, machine)
+    by_kind: dict[str, list[Stream]] = {}
+    for stream in streams:
+        by_kind.setdefault(stream.kind, []).append(stream)
+    messages = {kind: gather(alike, machine) for kind, alike in by_kind.items()}
     clean = clean_windows(machine, every)
     summaries = {
-        name: report.summarize(
-            messages[name],
-            clean[window_of(machine, messages[name])],
-            [stream.complaint for kind, stream in streams if kind == name],
-        )
-        for name in kinds
-        if name in ("frames", "queries")
+        kind: summarize(found, clean, by_kind[kind])
+        for kind, found in messages.items()
+        if kind in ("frames", "queries")
     }
     summary: dict[str, Any] = {"plan": asdict(plan) | {"token": None}}
-    summary |= summaries.pop(next(iter(kinds))) | summaries
-    summary["machine"] = report.summarize_machine(machine, every)
+    summary |= summaries.pop(next(iter(messages))) | summaries
+    summary["machine"] = summarize_machine(machine, clean, every)
     if plan.echo:
         summary["added"] = {
-            name: report.summarize_added(messages[name], messages[empty])
-            for name, empty in (("frames", "echoes"), ("queries", "checks"))
-            if name in messages
+            kind: summarize_added(messages[kind], messages[empty])
+            for kind, empty in (("frames", "echoes"), ("queries", "checks"))
+            if kind in messages
         }
     if plan.overload > 1.0:
         start, end = LEAD + plan.duration, LEAD + 2.0 * plan.duration
-        summary["overload"] = report.summarize_overload(
-            messages.get("frames", every), machine, start, end
-        )
+        first = messages.get("frames", every)
+        summary["overload"] = summarize_overload(first, machine, start, end)
     return Outcome(summary, machine, clean, messages)
+
+
+def gather(streams: Sequence[Stream], machine: Machine) -> Messages:
+    """Put the messages of several streams in one table, with the windows in which they were due."""
+    messages = np.concatenate([stream.log for stream in streams])
+    messages["window"] = np.searchsorted(machine.borders[1:-1], messages["due"], "right")
+    return messages[np.argsort(messages["due"], kind="stable")].view(np.recarray)
+
+
+def clean_windows(machine: Machine, messages: Messages) -> NDArray[np.bool_]:
+    """Tell in which windows (w,) the host took no time and every message was sent on time."""
+    clean = machine.steal == 0
+    clean[messages.window[~(messages.lateness <= ON_TIME)]] = False  # also of those never sent
+    return clean
+
+
+def quantiles(microseconds: Array) -> dict[str, float | None]:
+    """Tell the `QUANTILES` of those durations that are not NaN; None if there are none."""
+    known = microseconds[np.isfinite(microseconds)]
+    if not len(known):
+        return dict.fromkeys(QUANTILES)
+    values = np.percentile(known, list(QUANTILES.values()), method="inverted_cdf")
+    return dict(zip(QUANTILES, values.tolist(), strict=True))
+
+
+def summarize(
+    messages: Messages, clean: NDArray[np.bool_], streams: Sequence[Stream]
+) -> dict[str, Any]:
+    """Say what became of frames or queries, those of `clean` windows (w,) apart."""
+    outcomes = Counter(messages.outcome.tolist())
+    flags = messages["flags"][messages.outcome == ANSWERED]
+    unhindered = messages[clean[messages.window]]
+    return {
+        "due": len(messages),
+        "answered": outcomes.pop(ANSWERED, 0),
+        "lost": outcomes.pop(LOST, 0),
+        "superseded": outcomes.pop(SUPERSEDED, 0),
+        "dropped": outcomes.pop(DROPPED, 0),
+        "refused": {str(status): number for status, number in sorted(outcomes.items())},
+        "flags": {bit.name: int((flags & bit > 0).sum()) for bit in Flag},
+        "clean": quantiles(unhindered.latency),
+        "all": quantiles(messages.latency),
+        "solve_us": quantiles(messages.solve),
+        "clean_solve_us": quantiles(unhindered.solve),
+        "complaints": sorted({stream.complaint for stream in streams if stream.complaint}),
+    }
+
+
+def summarize_added(messages: Messages, empty: Messages) -> dict[str, float]:
+    """Say what the service adds to a solve, in medians.
+
+    ``added_us`` is the round trip less what the service spent on solving and on recovering fields;
+    ``empty_us`` the round trip of what was only checked or echoed; ``ratio`` the first over the
+    second.
+    """
+    trip, empty_trip = (m.latency - m.lateness for m in (messages, empty))
+    added = float(np.nanmedian(trip - messages.solve - messages.recover))
+    empty_us = float(np.nanmedian(empty_trip))
+    return {"added_us": added, "empty_us": empty_us, "ratio": added / empty_us}
+
+
+def summarize_machine(
+    machine: Machine, clean: NDArray[np.bool_], messages: Messages
+) -> dict[str, Any]:
+    """Say how well machine and generator kept the time."""
+    return {
+        "window_s": WINDOW,
+        "windows": len(clean),
+        "clean_windows": int(clean.sum()),
+        "steal_s": round(float(machine.steal.sum()), 2),
+        "load_average": os.getloadavg()[0],
+        "lateness_us": quantiles(messages.lateness),
+    }
+
+
+def summarize_overload(
+    messages: Messages, machine: Machine, start: float, end: float
+) -> dict[str, Any]:
+    """Describe latencies and answers before, during and after an overload of `start` to `end` (s).
+
+    ``recovered_s`` is from its end to the first window from which on no window's 99th percentile is
+    above twice the worst before; None if that never came, or nothing was well before.
+    """
+    phases = np.searchsorted([start, end], messages.due, "right")
+    report: dict[str, Any] = {}
+    for number, name in enumerate(("before", "during", "after")):
+        of_phase = messages[phases == number]
+        report[name] = {
+            "due": len(of_phase),
+            "answered": int((of_phase.outcome == ANSWERED).sum()),
+            **quantiles(of_phase.latency),
+        }
+    before, after = (np.unique(messages.window[phases == phase]) for phase in (0, 2))
+    bar = 2.0 * max(_worst(messages, w) for w in before)
+    recovered = None
+    for w in after[::-1]:
+        if np.isinf(bar) or _worst(messages, w) > bar:
+            break
+        recovered = max(0.0, round(float(machine.borders[w]) - end, 3))
+    report["recovered_s"] = recovered
+    return report
+
+
+def _worst(messages: Messages, window: int) -> float:
+    """99th percentile of the latencies of a window; infinite if messages got no answer."""
+    latency = messages.latency[(messages.window == window) & (messages.outcome != SUPERSEDED)]
+    known = np.nan_to_num(latency, nan=np.inf, posinf=np.inf)
+    return float(np.percentile(known, 99, method="higher")) if len(known) else np.inf
+
+
+def table(summary: dict[str, Any]) -> str:
+    """Write a summary for people: rows of Markdown per kind of message and of windows."""
+    rows = [
+        "| | answered | lost | superseded | refused | p50 µs | p99 µs | p99.9 µs | max µs |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    kinds = {"frames" if summary["plan"]["sessions"] else "queries": summary}
+    if "queries" in summary:
+        kinds["queries"] = summary["queries"]
+    for name, kind in kinds.items():
+        refused = sum(kind["refused"].values()) + kind["dropped"]
+        counts = f"{kind['answered']} | {kind['lost']} | {kind['superseded']} | {refused}"
+        rows += [
+            f"| {name}, clean windows | | | | | {_row(kind['clean'])} |",
+            f"| {name}, all windows | {counts} | {_row(kind['all'])} |",
+            f"| {name}, solve alone | | | | | {_row(kind['solve_us'])} |",
+        ]
+    rows += [
+        "",
+        "{clean_windows} of {windows} windows clean; steal {steal_s} s; load average "
+        "{load_average:.1f}; generator late by {lateness_us[p50_us]:.1f} µs (p50), "
+        "{lateness_us[p99_us]:.1f} µs (p99)".format(**summary["machine"]),
+    ]
+    for name, added in summary.get("added", {}).items():
+        rows.append(
+            f"the service adds {added['added_us']:.0f} µs to what it spends on {name}: "
+            f"{added['ratio']:.2f} times an empty round trip ({added['empty_us']:.0f} µs)"
+        )
+    if "overload" in summary:
+        recovered = summary["overload"]["recovered_s"]
+        rows.append("not recovered" if recovered is None else f"recovered after {recovered} s")
+    rows += [complaint for kind in kinds.values() for complaint in kind["complaints"]]
+    return "\n".join(rows)
+
+
+def _row(values: dict[str, float | None]) -> str:
+    columns = ("p50_us", "p99_us", "p999_us", "max_us")
+    return " | ".join("" if (v := values[name]) is None else f"{v:.0f}" for name in columns)
+
+
+def draw(outcome: Outcome, path: Path) -> None:
+    """Write a PNG: latencies over time, unclean windows in grey, and their distribution."""
+    import matplotlib  # only this needs it
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context({"font.size": 9}):
+        figure = Figure(figsize=(11, 4.2), layout="constrained")
+        over_time, shares = figure.subplots(1, 2, width_ratios=(3, 2), sharey=True)
+        borders = outcome.machine.borders
+        for start, end, clean in zip(borders, borders[1:], outcome.clean, strict=False):
+            if not clean:
+                over_time.axvspan(start, end, color="0.9", lw=0)
+        for label, colour in (("frames", "C0"), ("queries", "C1")):
+            if (messages := outcome.messages.get(label)) is None:
+                continue
+            milliseconds = messages.latency / 1e3
+            over_time.plot(messages.due, milliseconds, ".", color=colour, ms=1, label=label)
+            known = np.sort(milliseconds[np.isfinite(milliseconds)])
+            longer = 1.0 - np.arange(len(known)) / max(len(known), 1)
+            shares.step(longer, known, color=colour, label=label)
+        over_time.set(yscale="log", xlabel="time [s]", ylabel="latency from when due [ms]")
+        over_time.legend(loc="upper right", markerscale=8)
+        shares.set(xscale="log", xlabel="share of messages that took longer")
+        for axes in (over_time, shares):
+            axes.grid(alpha=0.3)
+        figure.savefig(path, dpi=130)

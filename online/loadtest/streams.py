@@ -1,57 +1,157 @@
-"""Streams of load: a session's frames, and HTTP queries over some connections.
+"""Streams of load, a session's frames and HTTP queries, and the loop that sends them on time.
 
-Frames are on a bare socket and written before the test starts: with a WebSocket library the library
-would be measured too. A query that is due while every connection waits for an answer is sent as
-soon as one is free; its latency counts from when it was due. If that takes longer than a user's
-patience it is dropped.
+Every message has a time at which it is due, whatever became of those before it, and its latency
+counts from then: a service that stalls is charged with all that should have been sent meanwhile
+(no "coordinated omission"). Asyncio's timers tick in milliseconds; this loop never sleeps and looks
+at the clock every few microseconds. How late it sent nevertheless is recorded, as is the time that
+the machine's host took from it. Times are in s from the start.
+
+Frames are written before the test starts. A query that is due while every connection waits for an
+answer is sent as soon as one is free. If that takes longer than a user's patience it is dropped.
 """
 
-import json
+import gc
+import os
 import re
+import select
 import socket
-import struct
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
+from functools import partial
+from operator import itemgetter
+from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
 from httptools import HttpResponseParser
 from numpy.typing import NDArray
+from websockets.frames import Frame, Opcode
+from websockets.protocol import Protocol, Side
 
-from palpate.online.client.connection import connect, split_address
-from palpate.online.loadtest.generator import ANSWERED, DROPPED, SUPERSEDED, Stream
-from palpate.online.serve.wire import BINARY, JSON
+from palpate.online.client.session import connect
 from palpate.online.session.frames import REPLY, Request, encode_request
+
+WINDOW = 0.25
+"""Seconds over which it is judged whether machine and generator were on time."""
+
+DRAIN = 1.5
+"""Seconds that are waited for answers after the last message."""
 
 PATIENCE = 1.0
 """Seconds that a query waits for a free connection."""
 
+CHUNK = 1 << 18
+"""Most bytes taken from a socket at once."""
+
+LOST, DROPPED, SUPERSEDED, ANSWERED = 0, 1, 2, 200
+"""What became of a message; other numbers are HTTP statuses of refusals.
+
+A dropped query never went out; a superseded frame was left by the service for a newer one.
+"""
+
+MESSAGE = np.dtype(
+    [
+        ("due", "f8"),  # s
+        ("lateness", "f8"),  # µs, from when it was due to its turn; NaN if that never came
+        ("latency", "f8"),  # µs, from when it was due to its answer; NaN without one
+        ("solve", "f8"),  # µs, that the service says it took to solve; NaN without an answer
+        ("recover", "f8"),  # µs, the same to recover the fields of a query
+        ("window", "i4"),  # of the machine, in which it was due
+        ("outcome", "i4"),
+        ("flags", "i4"),  # of a frame: `session.frames.Flag`
+    ]
+)
+
 _PHASES = re.compile(rb"\bsolve;dur=([\d.]+), recover;dur=([\d.]+)")
 
-_TEXT, _BINARY, _CLOSE, _PING, _PONG = 1, 2, 8, 9, 10
-_FINAL, _MASKED = 0x80, 0x80
 
-_OFFSETS = {name: int(field[1]) for name, field in (REPLY.fields or {}).items()}
-_SOLVED, _DROPPED = _OFFSETS["solve_time"], _OFFSETS["superseded"]
-_NEWS = struct.Struct(f"<2xHI{_SOLVED - 8}xf{_DROPPED - _SOLVED - 4}xI")
-"""Flags, number, solve_time and superseded of a reply."""
+class Stream(ABC):
+    """Messages of a kind, with open sockets; `complaint` says what went wrong last."""
+
+    def __init__(
+        self, kind: str, due: NDArray[np.float64], sockets: Sequence[socket.socket]
+    ) -> None:
+        self.kind = kind
+        self.log = np.full(len(due), np.array((0, *4 * [np.nan], 0, LOST, 0), MESSAGE))
+        self.log["due"] = due
+        self.sockets = list(sockets)
+        self.complaint = ""
+        for connection in self.sockets:
+            connection.setblocking(False)
+
+    @property
+    @abstractmethod
+    def waiting(self) -> bool:
+        """Whether an answer may still come."""
+
+    @abstractmethod
+    def send(self, number: int, now: float) -> None:
+        """Send a message whose turn it is at `now`."""
+
+    @abstractmethod
+    def take(self, connection: socket.socket, chunk: bytes, now: float) -> None:
+        """Take what has come at `now`."""
+
+    def sent(self, number: int, now: float) -> None:
+        """Note that it was a message's turn."""
+        self.log["lateness"][number] = 1e6 * (now - self.log["due"][number])
+
+    def answered(self, number: int, now: float, solve: float, recover: float) -> None:
+        """Note that a message's answer is whole, and what the service says it spent on it (s)."""
+        log = self.log
+        log["outcome"][number] = ANSWERED
+        log["latency"][number] = 1e6 * (now - log["due"][number])
+        log["solve"][number], log["recover"][number] = 1e6 * solve, 1e6 * recover
+
+    def lose(self, connection: socket.socket, why: str) -> None:
+        """Do without a socket that broke."""
+        self.complaint = why
+        self.sockets.remove(connection)
+        connection.close()
+
+    def receive(self, connection: socket.socket, now: float) -> bool:
+        """Read a socket at `now`; tell whether more may come on it."""
+        try:
+            chunk, why = connection.recv(CHUNK), "the service hung up"
+        except BlockingIOError:
+            return True
+        except OSError as error:
+            chunk, why = b"", f"the connection broke: {error.strerror}"
+        if chunk:
+            self.take(connection, chunk, now)
+        else:
+            self.lose(connection, why)
+        return connection in self.sockets
+
+    def close(self) -> None:
+        """Hang up."""
+        for connection in self.sockets:
+            connection.close()
 
 
 class FrameStream(Stream):
-    """A session or an echo, greeted already, that is sent positions (n, 3) mm when due (s)."""
+    """A session or an echo, greeted already, that is sent positions (n, 3) mm when due."""
 
     def __init__(
         self,
-        connection: socket.socket,
+        kind: str,
         due: NDArray[np.float64],
+        connection: socket.socket,
         positions: NDArray[np.float64],
         outputs: int = 0,
     ) -> None:
-        super().__init__(due, [connection])
-        self._messages = [
-            _message(_BINARY, encode_request(Request(number, time, position, outputs)))
+        super().__init__(kind, due, [connection])
+        requests = (
+            Request(number, time, position, outputs)
             for number, (time, position) in enumerate(zip(due, positions.tolist(), strict=True))
+        )
+        self._messages = [
+            Frame(Opcode.BINARY, encode_request(request)).serialize(mask=True)
+            for request in requests
         ]
-        self._received = self._unsent = b""
+        self._protocol = Protocol(Side.CLIENT, max_size=None)
+        self._unsent = b""
         self._last_sent = self._last_answered = -1
 
     @property
@@ -59,43 +159,34 @@ class FrameStream(Stream):
         """Whether the last frame sent has no answer yet."""
         return bool(self.sockets) and self._last_answered < self._last_sent
 
-    def send(self, number: int, now: int) -> None:
+    def send(self, number: int, now: float) -> None:
         """Send a frame."""
-        if not self.sockets:
-            return
-        self.log.sent[number] = now
-        self._last_sent = number
-        self._push(self._unsent + self._messages[number])
+        if self.sockets:
+            self.sent(number, now)
+            self._last_sent = number
+            self._push(self._unsent + self._messages[number])
 
-    def take(self, connection: socket.socket, chunk: bytes, now: int) -> None:
+    def take(self, connection: socket.socket, chunk: bytes, now: float) -> None:
         """Take replies, and what else the service has to say."""
-        received = self._received + chunk if self._received else chunk
-        start, end = 0, len(received)
-        while (frame := _frame(received, start, end)) is not None:
-            opcode, begin, start = frame
-            payload = b"" if opcode == _BINARY else received[begin:start]
-            if opcode == _BINARY:
-                self._record(received, begin, now)
-            elif opcode == _PING:
-                self._push(self._unsent + _message(_PONG, payload))
-            elif opcode == _TEXT:
-                self.complaint = payload.decode()
-            elif opcode == _CLOSE:
-                self.lose(connection, payload[2:].decode() or "the service ended the session")
-                return
-        self._received = received[start:]
-        if self._unsent:
-            self._push(self._unsent)
+        protocol = self._protocol
+        protocol.receive_data(chunk)
+        for frame in protocol.events_received():
+            if isinstance(frame, Frame) and frame.opcode is Opcode.BINARY:
+                self._take_reply(bytes(frame.data), now)
+            elif isinstance(frame, Frame) and frame.opcode is Opcode.TEXT:
+                self.complaint = bytes(frame.data).decode()
+        if protocol.close_rcvd is not None:
+            self.lose(connection, protocol.close_rcvd.reason or "the service ended the session")
+        elif message := self._unsent + b"".join(protocol.data_to_send()):
+            self._push(message)
 
-    def _record(self, received: bytes, begin: int, now: int) -> None:
-        flags, number, solve_time, superseded = _NEWS.unpack_from(received, begin)
-        log = self.log
-        log.received[number] = now
-        log.outcome[number] = ANSWERED
-        log.flags[number] = flags
-        log.solve[number] = 1e6 * solve_time
-        for dropped in range(max(number - superseded, self._last_answered + 1), number):
-            log.outcome[dropped] = SUPERSEDED
+    def _take_reply(self, frame: bytes, now: float) -> None:
+        reply = np.frombuffer(frame, REPLY, 1)[0]
+        number = int(reply["seq"])
+        self.answered(number, now, reply["solve_time"], 0.0)
+        self.log["flags"][number] = reply["flags"]
+        first = max(number - int(reply["superseded"]), self._last_answered + 1)
+        self.log["outcome"][first:number] = SUPERSEDED
         self._last_answered = number
 
     def _push(self, message: bytes) -> None:
@@ -111,33 +202,24 @@ class FrameStream(Stream):
 
     def close(self) -> None:
         """Hang up, with a close message if there is anybody to hear it."""
-        self._push(self._unsent + _message(_CLOSE, struct.pack("!H", 1000)))
+        if self.sockets:
+            self._protocol.send_close(1000)
+            self._push(self._unsent + b"".join(self._protocol.data_to_send()))
         super().close()
 
 
-def _message(opcode: int, payload: bytes) -> bytes:
-    """Write a short WebSocket frame (RFC 6455, section 5.2); its mask of zeros changes nothing."""
-    return bytes((_FINAL | opcode, _MASKED | len(payload), 0, 0, 0, 0)) + payload
-
-
-def _frame(received: bytes, start: int, end: int) -> tuple[int, int, int] | None:
-    """Find a server's frame: its opcode, where its payload begins and where it ends."""
-    if end - start < 2:
-        return None
-    length, begin = received[start + 1], start + 2
-    if length > 125:  # the length follows, in 2 or 8 bytes
-        begin += 2 if length == 126 else 8
-        length = int.from_bytes(received[start + 2 : begin], "big")
-    return (received[start] & 0x0F, begin, begin + length) if begin + length <= end else None
-
-
 class QueryStream(Stream):
-    """Requests to be sent when they are due, over `connections` to the service at `url`."""
+    """HTTP requests to be sent when they are due, over `connections` to the service at `url`."""
 
     def __init__(
-        self, url: str, connections: int, due: NDArray[np.float64], requests: Sequence[bytes]
+        self,
+        kind: str,
+        due: NDArray[np.float64],
+        url: str,
+        connections: int,
+        requests: Sequence[bytes],
     ) -> None:
-        super().__init__(due, [connect(url, timeout=10.0) for _ in range(connections)])
+        super().__init__(kind, due, [connect(url, timeout=10.0) for _ in range(connections)])
         self._requests = requests
         self._free = deque(self.sockets)
         self._queue: deque[int] = deque()
@@ -148,31 +230,30 @@ class QueryStream(Stream):
         """Whether a query has no answer yet."""
         return bool(self._answers)
 
-    def send(self, number: int, now: int) -> None:
+    def send(self, number: int, now: float) -> None:
         """Send a query, or queue it until a connection is free."""
-        self.log.sent[number] = now
+        self.sent(number, now)
         self._queue.append(number)
         self._go_on(now)
 
-    def take(self, connection: socket.socket, chunk: bytes, now: int) -> None:
+    def take(self, connection: socket.socket, chunk: bytes, now: float) -> None:
         """Take a part of an answer."""
         answer = self._answers[connection]
         answer.parser.feed_data(chunk)
         if answer.whole:
-            log, number = self.log, answer.number
-            log.received[number] = now
-            log.outcome[number] = answer.parser.get_status_code()
-            log.solve[number], log.recover[number] = answer.phases
+            if (status := answer.parser.get_status_code()) == ANSWERED:
+                self.answered(answer.number, now, *answer.phases)
+            self.log["outcome"][answer.number] = status
             del self._answers[connection]
             self._free.append(connection)
             self._go_on(now)
 
-    def _go_on(self, now: int) -> None:
+    def _go_on(self, now: float) -> None:
         """Send queries that have not waited too long, while connections are free."""
         while self._queue and self._free:
             number = self._queue.popleft()
-            if now - self.log.due[number] >= 1e9 * PATIENCE:
-                self.log.outcome[number] = DROPPED
+            if now - self.log["due"][number] >= PATIENCE:
+                self.log["outcome"][number] = DROPPED
                 continue
             connection = self._free.popleft()
             try:
@@ -195,30 +276,66 @@ class _Answer:
     def __init__(self, number: int) -> None:
         self.number = number
         self.parser = HttpResponseParser(self)
-        self.phases = 0.0, 0.0  # solve and recover, µs
+        self.phases = 0.0, 0.0  # solve and recover, s
         self.whole = False
 
     def on_header(self, name: bytes, value: bytes) -> None:
         if name.lower() == b"server-timing" and (found := _PHASES.search(value)):
-            self.phases = 1e3 * float(found[1]), 1e3 * float(found[2])
+            self.phases = 1e-3 * float(found[1]), 1e-3 * float(found[2])
 
     def on_message_complete(self) -> None:
         self.whole = True
 
 
-def write_requests(
-    url: str,
-    path: str,
-    token: str | None,
-    loads: tuple[NDArray[np.float64], NDArray[np.float64]],
-    region: str,
-) -> list[bytes]:
-    """Write requests for loads, positions (n, 3) mm and pressures (n,) kPa, answered in binary."""
-    head = [f"POST {path} HTTP/1.1", f"host: {split_address(url).netloc}", f"accept: {BINARY}"]
-    head += [f"content-type: {JSON}", *([f"authorization: Bearer {token}"] if token else [])]
-    contacts = zip(*(values.tolist() for values in loads), strict=True)
-    bodies = (
-        json.dumps({"contacts": [{"position": at, "pressure": pressure}], "region": region})
-        for at, pressure in contacts
+class Machine(NamedTuple):
+    """How the machine did, window by window."""
+
+    borders: NDArray[np.float64]  # (w + 1,), s
+    steal: NDArray[np.float64]  # (w,), s that the host took from all cores; 0 where nobody tells
+
+
+def drive(streams: Sequence[Stream]) -> Machine:
+    """Send every message of every stream when it is due, and take the answers."""
+    messages = (
+        (due, number, stream.send)
+        for stream in streams
+        for number, due in enumerate(stream.log["due"].tolist())
     )
-    return ["\r\n".join([*head, f"content-length: {len(b)}", "", b]).encode() for b in bodies]
+    timetable = deque(sorted(messages, key=itemgetter(0)))
+    poll = select.poll()
+    receivers = {
+        c.fileno(): partial(stream.receive, c) for stream in streams for c in stream.sockets
+    }
+    for descriptor in receivers:
+        poll.register(descriptor, select.POLLIN)
+    limit = timetable[-1][0] + DRAIN
+    samples = [(0.0, _steal())]
+    gc.collect()
+    gc.disable()
+    try:
+        start = perf_counter()
+        now = 0.0
+        while now < limit and (timetable or any(stream.waiting for stream in streams)):
+            while timetable and timetable[0][0] <= now:
+                _, number, send = timetable.popleft()
+                send(number, now)
+                now = perf_counter() - start
+            for descriptor, _ in poll.poll(0):
+                if not receivers[descriptor](perf_counter() - start):
+                    poll.unregister(descriptor)
+            if now - samples[-1][0] >= WINDOW:
+                samples.append((now, _steal()))
+            now = perf_counter() - start
+    finally:
+        gc.enable()
+    borders, ticks = zip(*samples, (now, _steal()), strict=True)
+    return Machine(np.array(borders), np.diff(ticks) / os.sysconf("SC_CLK_TCK"))
+
+
+def _steal() -> int:
+    """Ticks that the host took from this machine's cores since it started (Linux, proc(5))."""
+    try:
+        with open("/proc/stat", "rb", buffering=0) as file:
+            return int(file.read(256).split(None, 9)[8])
+    except OSError:
+        return 0

@@ -1,4 +1,4 @@
-"""From the bytes of a request to those of its answer: decode, solve, recover, encode.
+"""From a request to the bytes of its answer: solve, recover, encode.
 
 The service's hot path. Nothing here awaits: an answer has the model for itself from its first line
 to its last; the number of steps of a history bounds how long others wait.
@@ -15,8 +15,7 @@ from starlette.responses import Response
 from palpate.online.serve import wire
 from palpate.online.serve.errors import Refusal, check_json_size
 from palpate.online.serve.metrics import PHASES, Metrics
-from palpate.online.serve.schemas import Contact, HistoryRequest, SolveRequest, parse
-from palpate.online.serve.store import ServedModel
+from palpate.online.serve.schemas import Contact, HistoryRequest, SolveRequest
 from palpate.online.serve.wire import JSON
 from palpate.shared.answer import Answer, describe
 from palpate.shared.errors import QueryError
@@ -25,22 +24,19 @@ from palpate.shared.reduced.transfer import REST
 
 
 def answer(
-    served: ServedModel,
-    kind: type[SolveRequest] | type[HistoryRequest],
-    body: bytes,
+    model: ReducedModel,
+    request: SolveRequest | HistoryRequest,
     media_type: str,
-    max_json_numbers: int,
     metrics: Metrics,
+    received: float = 0.0,
+    max_json_numbers: float = math.inf,
 ) -> Response:
-    """Solve a request from rest and write the answer.
+    """Solve a request from rest, whose decoding began when it was `received`; write the answer.
 
     The same request has the same answer, whatever came before it. Sessions are for clients that
-    want a warm start. Raises `Refusal` if the request is malformed, a load is not one the model can
-    be asked about, or it has no equilibrium; or if a history is asked of elastic tissue.
+    want a warm start. Raises `Refusal` if a load is not one the model can be asked about, or it has
+    no equilibrium; or if a history is asked of elastic tissue.
     """
-    received = perf_counter()
-    request = parse(kind, body)
-    model = served.model
     if media_type == JSON:
         nodes = {"none": 0, "surface": len(model.surface_nodes), "all": len(model.nodes)}
         check_json_size(request.outputs, nodes[request.region], max_json_numbers, "region")

@@ -4,16 +4,18 @@ import asyncio
 import gc
 import logging
 import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager, suppress
 from importlib.metadata import version
-from typing import Annotated, Any, NamedTuple
+from time import perf_counter
+from typing import Annotated, Any, get_type_hints
 
 import numpy as np
 import orjson
 from fastapi import APIRouter, FastAPI, Path, Request, Response
 from fastapi.responses import PlainTextResponse
-from pydantic.json_schema import models_json_schema
+from fastapi.routing import APIRoute
+from starlette.middleware.cors import CORSMiddleware
 from starlette.routing import WebSocketRoute
 
 from palpate.online.serve import errors, guard, schemas, wire
@@ -21,8 +23,7 @@ from palpate.online.serve.answer import answer
 from palpate.online.serve.errors import Refusal
 from palpate.online.serve.metrics import CONTENT_TYPE, Metrics
 from palpate.online.serve.schemas import HistoryRequest, MeshRegion, SolveRequest, parse
-from palpate.online.serve.settings import Settings
-from palpate.online.serve.store import ServedModel, Store
+from palpate.online.serve.store import ServedModel, Service, Store
 from palpate.online.serve.wire import BINARY, JSON, MSGPACK, OFFERED, negotiate
 from palpate.online.session import frames, websocket
 from palpate.online.session.protocol import tables
@@ -31,33 +32,22 @@ from palpate.shared.mechanics.footprint import TIP_DEPTH
 
 logger = logging.getLogger(__name__)
 
-
-class Service(NamedTuple):
-    """What endpoints work with, at ``app.state.service``."""
-
-    store: Store
-    settings: Settings
-    metrics: Metrics
+DECODING = "palpate.decoding"
+"""Key in the ASGI scope of when the decoding of the body began, s of `time.perf_counter`."""
 
 
-def create_app(
-    settings: Settings,
-    store: Store | None = None,
-    on_ready: Callable[[Store], None] = lambda store: None,
-    metrics: Metrics | None = None,
-) -> FastAPI:
-    """Make the service.
+def create_app(here: Service, on_ready: Callable[[], None] = lambda: None) -> FastAPI:
+    """Make the application of a service.
 
     It answers at once; the models are loaded and warmed meanwhile, and ``/ready`` says when that
     is done; `on_ready` is then called on the thread that answers. One of several workers leaves
     all clients to the others until it is ready.
     """
-    models, counts = store or Store(settings.artifacts), metrics or Metrics()
-    sessions = Sessions(models, settings, counts)
+    settings, sessions = here.settings, Sessions(here)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        prepared = _prepare(models, sessions, on_ready)
+        prepared = _prepare(here.store, sessions, on_ready)
         if settings.workers > 1:
             await prepared.wait()
         yield
@@ -74,18 +64,26 @@ def create_app(
         # Even unused it looks for a tracer in every request; the service times itself.
         telemetry={"tracing": False, "metrics": False, "logs": False},
     )
-    app.state.service = Service(models, settings, counts)
-    guard.install(app, settings, counts)
+    app.state.service = here
+    app.add_middleware(guard.Guard, settings=settings, metrics=here.metrics)
+    if settings.origins:
+        # outermost: preflights carry no token, and refusals must be readable by the page too
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=settings.origins,
+            allow_methods=["GET", "POST"],
+            allow_headers=["Authorization", "Content-Type"],
+            expose_headers=["Server-Timing", "Retry-After"],
+        )
     # FastAPI's own inclusion of a router makes a request 20 µs slower
-    app.router.routes += [*scenes.routes, *service.routes]
+    app.router.routes += [*queries.routes, *scenes.routes, *service.routes]
     app.router.routes.append(WebSocketRoute("/scenes/{name}/session", sessions))
     if settings.echo:
         app.router.routes.append(WebSocketRoute(websocket.ECHO, websocket.echo))
-    _describe_requests(app)
     return app
 
 
-def _prepare(store: Store, sessions: Sessions, on_ready: Callable[[Store], None]) -> asyncio.Event:
+def _prepare(store: Store, sessions: Sessions, on_ready: Callable[[], None]) -> asyncio.Event:
     """Load and warm the models in a thread; return what is set when that is over."""
     loop, prepared = asyncio.get_running_loop(), asyncio.Event()
 
@@ -93,7 +91,7 @@ def _prepare(store: Store, sessions: Sessions, on_ready: Callable[[Store], None]
         gc.collect()
         gc.freeze()  # the collector need not look at the models again
         store.ready = True
-        on_ready(store)
+        on_ready()
         prepared.set()
 
     def load() -> None:
@@ -113,7 +111,7 @@ def _warm(sessions: Sessions, served: ServedModel) -> None:
     for region in ("none", "surface", "all"):
         body = orjson.dumps({"contacts": [served.example], "region": region})
         for media_type in OFFERED:
-            answer(served, SolveRequest, body, media_type, 10**9, uncounted)
+            answer(served.model, parse(SolveRequest, body), media_type, uncounted)
     models, radius = served.model.models, served.model.scene.endoscope.radius
     tour: list[int] = []
     if models.viscous is not None:  # a history goes from one local model to the next and back
@@ -122,35 +120,37 @@ def _warm(sessions: Sessions, served: ServedModel) -> None:
         contacts = ({"position": at, "pressure": 0.1} for at in models.centres[tour].tolist())
         steps = [{"time": 0.1 * i, "contact": contact} for i, contact in enumerate(contacts)]
         body = orjson.dumps({"steps": steps, "region": "all"})
-        answer(served, HistoryRequest, body, JSON, 10**9, uncounted)
+        answer(served.model, parse(HistoryRequest, body), JSON, uncounted)
     if served.model.has_tip:
         above = [models.centres[k] + 0.9 * radius * models.frames[k, 0] for k in tour]
         sessions.prepare(served, [position.tolist() for position in above])
 
 
-def _describe_requests(app: FastAPI) -> None:
-    """Add the schemas of the request bodies, which are read by hand, to the OpenAPI document."""
-    generate = app.openapi
-
-    def openapi() -> dict[str, Any]:
-        document = generate()
-        _, definitions = models_json_schema(
-            [(kind, "validation") for kind in (SolveRequest, HistoryRequest)],
-            ref_template="#/components/schemas/{model}",
-        )
-        document["components"]["schemas"].update(definitions["$defs"])
-        return document
-
-    app.openapi = openapi  # type: ignore[method-assign]
-
-
 SceneName = Annotated[str, Path(description="Name of a served scene.", examples=["turbinate"])]
-_NAME = {"name": "name", "in": "path", "required": True, "schema": {"type": "string"}} | {
-    "description": "Name of a served scene.",
-    "example": "turbinate",
-}
 
-scenes = APIRouter(prefix="/scenes", tags=["scenes"])  # the hot ones first, as they are tried
+
+class QueryRoute(APIRoute):
+    """Reads path and body of a request itself; FastAPI, which describes them, takes 25 µs longer.
+
+    Endpoints take the request, the name of the scene, and the `load` read from the body.
+    """
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        """Return what answers a request of this route."""
+        kind = get_type_hints(self.endpoint)["load"]
+
+        async def handle(request: Request) -> Response:
+            body = await _read(request, request.app.state.service.settings.max_body)
+            request.scope[DECODING] = perf_counter()
+            load = parse(kind, body)
+            response: Response = await self.endpoint(request, request.path_params["name"], load)
+            return response
+
+        return handle
+
+
+queries = APIRouter(prefix="/scenes", tags=["scenes"], route_class=QueryRoute)
+scenes = APIRouter(prefix="/scenes", tags=["scenes"])
 service = APIRouter(tags=["service"])
 
 
@@ -168,51 +168,36 @@ def _document(model: type, what: str, *codes: int) -> dict[str, Any]:
     return {"response_model": None, "responses": {**answer, **_problems(404, *codes)}}
 
 
-def _by_hand(request: type) -> dict[str, Any]:
-    """Declare path and body by hand; having the framework read them would take 25 µs longer."""
-    reference = {"$ref": f"#/components/schemas/{request.__name__}"}
-    body = {"required": True, "content": {JSON: {"schema": reference}}}
-    return {"openapi_extra": {"parameters": [_NAME], "requestBody": body}}
-
-
-@scenes.post(
-    "/{name}/solve",
-    **_document(schemas.Answer, "How the tissue answers", 406, 413, 415, 422),
-    **_by_hand(SolveRequest),
+@queries.post(
+    "/{name}/solve", **_document(schemas.Answer, "How the tissue answers", 406, 413, 415, 422)
 )
-async def solve(request: Request) -> Response:
+async def solve(request: Request, name: SceneName, load: SolveRequest) -> Response:
     """Press the tissue: force, displacement and stress under a load.
 
     Every request is answered from rest, independently of those before it. The header
     Server-Timing tells the time taken to decode, solve, recover and encode, in ms.
     """
-    return await _answer(request, SolveRequest)
+    return _answer(request, name, load)
 
 
-@scenes.post(
+@queries.post(
     "/{name}/history",
     **_document(schemas.HistoryAnswer, "How the tissue answers, step by step", 406, 413, 415, 422),
-    **_by_hand(HistoryRequest),
 )
-async def history(request: Request) -> Response:
+async def history(request: Request, name: SceneName, load: HistoryRequest) -> Response:
     """Press visco-elastic tissue over time: force and displacement at every step.
 
     Every request starts at rest. Elastic scenes know no time and refuse.
     """
-    return await _answer(request, HistoryRequest)
+    return _answer(request, name, load)
 
 
-@scenes.post(
-    "/{name}/check",
-    response_model=None,
-    responses={200: {"model": schemas.Checked}, **_problems(404, 413, 415, 422)},
-    **_by_hand(SolveRequest),
+@queries.post(
+    "/{name}/check", responses={200: {"model": dict[str, bool]}, **_problems(404, 413, 415, 422)}
 )
-async def check(request: Request) -> Response:
+async def check(request: Request, name: SceneName, load: SolveRequest) -> Response:
     """Check that a solve request is well-formed, without solving it."""
-    here: Service = request.app.state.service
-    here.store.model(request.path_params["name"])
-    parse(SolveRequest, await _read(request, here.settings.max_body))
+    request.app.state.service.store.model(name)
     return Response(b'{"valid":true}', media_type=JSON)
 
 
@@ -231,19 +216,19 @@ async def session(name: SceneName, request: Request) -> Response:
     raise Refusal("upgrade_required", "upgrade", "A session is opened by a WebSocket handshake")
 
 
-@service.get("/health", response_model=schemas.Status)
-async def health() -> Any:
+@service.get("/health")
+async def health() -> dict[str, str]:
     """Tell that the process lives."""
     return {"status": "ok"}
 
 
-@service.get("/ready", response_model=schemas.Status, responses={503: {"model": schemas.Problem}})
-async def ready(request: Request) -> Any:
+@service.get("/ready", responses={503: {"model": schemas.Problem}})
+async def ready(request: Request) -> dict[str, str]:
     """Tell whether every model is loaded and warm."""
     store: Store = request.app.state.service.store
     store.require_ready()
     if not store.models:
-        reasons = "; ".join(refused.reason for refused in store.refused)
+        reasons = "; ".join(refused["reason"] for refused in store.refused)
         raise Refusal("not_ready", "", f"No artifact could be loaded: {reasons}")
     return {"status": "ready"}
 
@@ -340,12 +325,11 @@ async def accessible(name: SceneName, request: Request) -> Response:
     return Response(wire.encode(media_type, {"scene": name}, arrays), media_type=media_type)
 
 
-async def _answer(request: Request, kind: type[SolveRequest] | type[HistoryRequest]) -> Response:
+def _answer(request: Request, name: str, load: SolveRequest | HistoryRequest) -> Response:
     here: Service = request.app.state.service
-    media_type = _media_type(request)
-    served = here.store.model(request.path_params["name"])
-    body = await _read(request, here.settings.max_body)
-    return answer(served, kind, body, media_type, here.settings.max_json_numbers, here.metrics)
+    model, media_type = here.store.model(name).model, _media_type(request)
+    start, limit = request.scope[DECODING], here.settings.max_json_numbers
+    return answer(model, load, media_type, here.metrics, start, limit)
 
 
 def _media_type(request: Request) -> str:

@@ -60,7 +60,7 @@ class Refusal(PalpateError):
         return Response(self.body(), STATUS[self.code], self.headers, "application/json")
 
 
-def check_json_size(outputs: Collection[str], nodes: int, limit: int, field: str) -> None:
+def check_json_size(outputs: Collection[str], nodes: int, limit: float, field: str) -> None:
     """Refuse fields that would keep the event loop busy with writing decimals."""
     numbers = nodes * (3 * ("displacement" in outputs) + ("von_mises" in outputs))
     if numbers > limit:
@@ -91,8 +91,9 @@ def as_refusal(error: Exception) -> Refusal:
     match error:
         case Refusal():
             return error
-        case FrameError():
-            return Refusal(error.code, error.field, error.message)
+        case FrameError(field=field):
+            code = "unknown_version" if field == "version" else "invalid_frame"
+            return Refusal(code, field, error.message)
         case RequestValidationError():  # path and query parameters, all that FastAPI checks here
             return invalid([{**detail, "loc": detail["loc"][1:]} for detail in error.errors()])
         case HTTPException(status_code=405):

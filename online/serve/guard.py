@@ -12,13 +12,11 @@ from functools import lru_cache
 from time import perf_counter
 from urllib.parse import urlsplit
 
-from fastapi import FastAPI
-from starlette.middleware.cors import CORSMiddleware
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from palpate.online.serve.errors import Refusal
 from palpate.online.serve.metrics import Metrics
-from palpate.online.serve.settings import Settings
+from palpate.online.settings import Settings
 
 RECEIVED = "palpate.received"
 """Key in the ASGI scope of when the request was read, s of `time.perf_counter`."""
@@ -29,25 +27,14 @@ PROBES = frozenset({"/health", "/ready"})
 METRICS = "/metrics"
 """Answered also while the service sheds load: it shows that it does."""
 
+LOCAL = "localhost"
+"""Name of this machine for itself."""
+
 BURST = 1.0
 """Seconds of the rate limit that may come at once, but always one request."""
 
 MOST_CLIENTS = 10_000
 """Clients whose rates are remembered; beyond it all are forgiven, so that memory stays bounded."""
-
-
-def install(app: FastAPI, settings: Settings, metrics: Metrics) -> None:
-    """Put `app` behind the guard; browsers learn which origins are allowed, if there are any."""
-    app.add_middleware(Guard, settings=settings, metrics=metrics)
-    if settings.origins:
-        # outermost: preflights carry no token, and refusals must be readable by the page too
-        app.add_middleware(
-            CORSMiddleware,
-            allow_origins=settings.origins,
-            allow_methods=["GET", "POST"],
-            allow_headers=["Authorization", "Content-Type"],
-            expose_headers=["Server-Timing", "Retry-After"],
-        )
 
 
 class Guard:
@@ -56,7 +43,7 @@ class Guard:
     def __init__(self, app: ASGIApp, settings: Settings, metrics: Metrics) -> None:
         self._app, self._metrics = app, metrics
         self._origins = frozenset(origin.encode() for origin in settings.origins)
-        self._hosts = {"localhost", *map(str.lower, settings.hosts)} if settings.hosts else set()
+        self._hosts = {machine_name(host) for host in settings.hosts}
         self._secret = f"Bearer {settings.token}".encode() if settings.token else None
         self._rates = RateLimit(settings.rate_limit) if settings.rate_limit else None
         self._max_wait = settings.max_wait
@@ -116,14 +103,19 @@ class Guard:
             raise Refusal("too_many_requests", "", message, allowed, headers)
 
 
+def machine_name(name: str) -> str:
+    """Return a name or an address as it is compared; addresses of loopback are `LOCAL`."""
+    with suppress(ValueError):
+        return LOCAL if ipaddress.ip_address(name).is_loopback else name
+    return name.lower()
+
+
 @lru_cache(64)
 def _host(header: bytes) -> str:
-    """Read the name or address in a Host header; addresses of loopback are ``localhost``."""
-    name = ""
+    """Read the name or address in a Host header."""
     with suppress(ValueError):
-        name = urlsplit(f"//{header.decode('latin-1')}").hostname or ""
-        return "localhost" if ipaddress.ip_address(name).is_loopback else name
-    return name
+        return machine_name(urlsplit(f"//{header.decode('latin-1')}").hostname or "")
+    return ""
 
 
 class RateLimit:

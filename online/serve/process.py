@@ -6,6 +6,7 @@ to the worker that accepted it and is none of the others' business.
 """
 
 import asyncio
+import ctypes
 import json
 import logging
 import os
@@ -14,10 +15,10 @@ import sys
 import tempfile
 import threading
 from dataclasses import replace
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING
 
 import click
 import uvicorn
@@ -25,17 +26,12 @@ from fastapi import FastAPI
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 from uvicorn.supervisors.multiprocess import Multiprocess
 
-from palpate.online.serve import logs
 from palpate.online.serve.errors import Refusal
-from palpate.online.serve.guard import RECEIVED
+from palpate.online.serve.guard import LOCAL, RECEIVED, machine_name
 from palpate.online.serve.metrics import Metrics, make_table
-from palpate.online.serve.settings import Settings, is_loopback
-from palpate.online.session import realtime
 from palpate.online.session.websocket import OPTIONS
+from palpate.online.settings import Settings
 from palpate.shared.errors import PalpateError
-
-if TYPE_CHECKING:
-    from palpate.online.serve.store import Store
 
 logger = logging.getLogger(__name__)
 
@@ -47,6 +43,11 @@ PATIENCE = 10.0
 
 LAST_WAIT = 4.0
 """Seconds that workers get to end."""
+
+PRIORITY = 10
+"""Of a service in real time: above all ordinary work, below the kernel's own threads (50)."""
+
+_MCL_CURRENT, _MCL_ONFAULT = 1, 4  # Linux: what is in memory, not all that could be
 
 
 def _full() -> bytes:
@@ -103,8 +104,8 @@ class Supervisor(Multiprocess):
         super().join_all()
 
 
-def serve(settings: Settings, host: str, port: int, public: bool) -> None:
-    """Serve until a signal says to end; port 0 takes a free one.
+def serve(settings: Settings) -> None:
+    """Serve until a signal says to end.
 
     Raises `PalpateError` if there is nothing to serve, or no token for other machines.
     """
@@ -113,19 +114,20 @@ def serve(settings: Settings, host: str, port: int, public: bool) -> None:
             f"no artifacts (*.h5) in {settings.artifacts}; make one with: "
             f"palpate train turbinate --out {settings.artifacts / 'turbinate.h5'}"
         )
-    if not settings.token and not public:
-        if not is_loopback(host):
+    host = settings.host
+    if not settings.token and not settings.public:
+        if machine_name(host) != LOCAL:
             raise PalpateError(
                 f"--host {host or '(any)'} lets other machines in: set PALPATE_TOKEN, or say "
                 "--public to serve anybody"
             )
-        settings = replace(settings, hosts=("localhost", host))
-    logs.set_up(settings)
+        settings = replace(settings, hosts=(LOCAL, host))
+    set_up_log(settings)
     config = uvicorn.Config(
         "",  # known once the socket is bound
         factory=True,
         host=host,
-        port=port,
+        port=settings.port,
         workers=settings.workers,
         http=HttpProtocol,
         log_config=None,
@@ -161,21 +163,24 @@ def _work(settings: Settings, url: str, table: Path) -> FastAPI:
     """Make the application of one worker, in its own process."""
     # Not before: the supervisor has no use for the models' code.
     from palpate.online.serve.app import create_app
+    from palpate.online.serve.store import Service
 
-    logs.set_up(settings)
+    set_up_log(settings)
     # Uvicorn tells of every session that opens; that it starts and ends, the supervisor tells.
     logging.getLogger("uvicorn.error").setLevel(logging.WARNING)
     # On systems without file locks there is one worker, which has no use for a table.
     metrics = Metrics(table if settings.workers > 1 else None)
+    service = Service(settings, metrics)
+    store = service.store
 
-    def greet(store: "Store") -> None:
+    def greet() -> None:
         if settings.realtime:
-            logger.info(realtime.enter())
+            logger.info("%s; %s", schedule_in_real_time(), lock_memory())
         logger.info("worker %d is ready", metrics.worker)
         if metrics.worker or metrics.restarted:
             return  # the first worker says it once
         for refused in store.refused:
-            click.echo(f"Refused {refused.reason}")
+            click.echo(f"Refused {refused['reason']}")
         click.echo(f"Serving {', '.join(store.models) or 'nothing'} on {url} (API: {url}/docs)")
         for name, model in list(store.models.items())[:1]:
             click.echo(
@@ -183,4 +188,61 @@ def _work(settings: Settings, url: str, table: Path) -> FastAPI:
                 f"-d '{json.dumps({'contacts': [model.example]})}'"
             )
 
-    return create_app(settings, on_ready=greet, metrics=metrics)
+    return create_app(service, on_ready=greet)
+
+
+class JsonFormatter(logging.Formatter):
+    """Writes a record of the log as a JSON object on one line."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line: time (UTC), level, logger, process, message and any exception."""
+        document = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "process": os.getpid(),
+            "message": record.getMessage(),
+        }
+        if record.exc_info:
+            document["exception"] = self.formatException(record.exc_info)
+        return json.dumps(document, default=str)
+
+
+def set_up_log(settings: Settings) -> None:
+    """Send every record of at least the level of `settings` to stderr, in their format."""
+    text = logging.Formatter("%(levelname)s: %(message)s")
+    handler = logging.StreamHandler()
+    handler.setFormatter(JsonFormatter() if settings.log_format == "json" else text)
+    logging.basicConfig(level=settings.log_level.upper(), handlers=[handler], force=True)
+
+
+def schedule_in_real_time() -> str:
+    """Let this thread run before all ordinary work; return what the system granted.
+
+    On a busy machine the scheduler lets a ready worker wait for milliseconds; with a
+    first-in-first-out priority it runs at once.
+    """
+    if not hasattr(os, "sched_setscheduler"):
+        return "real-time scheduling: not known to this system"
+    try:
+        policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+        os.sched_setscheduler(0, policy, os.sched_param(PRIORITY))
+    except OSError as error:
+        return (
+            f"real-time scheduling: refused ({error.strerror}), running as ordinary work; it takes "
+            f"root, CAP_SYS_NICE or an rtprio limit of {PRIORITY}"
+        )
+    return f"real-time scheduling: on (SCHED_FIFO, priority {PRIORITY})"
+
+
+def lock_memory() -> str:
+    """Keep what is in memory from being swapped out; return what the system granted."""
+    mlockall = getattr(ctypes.CDLL(None, use_errno=True), "mlockall", None)
+    if mlockall is None:
+        return "memory lock: not known to this system"
+    if mlockall(_MCL_CURRENT | _MCL_ONFAULT) != 0:
+        return (
+            f"memory lock: refused ({os.strerror(ctypes.get_errno())}); it takes root, "
+            "CAP_IPC_LOCK or a higher memlock limit"
+        )
+    return "memory lock: on"

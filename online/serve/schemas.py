@@ -10,7 +10,6 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, f
 from pydantic_core import PydanticCustomError
 
 from palpate.online.serve.errors import invalid
-from palpate.online.serve.store import RefusedFile
 
 CONVENTIONS = "Units are mm, mN, kPa and s throughout; forces are those of the tissue on the tool."
 """Of every endpoint and of sessions."""
@@ -24,9 +23,6 @@ Position = Annotated[list[Annotated[float, Field(ge=-1e4, le=1e4)]], _THREE]
 Direction = Annotated[list[Annotated[float, Field(ge=-1e3, le=1e3)]], _THREE]
 Vector = Annotated[list[float], _THREE]
 Triangle = Annotated[list[int], _THREE]
-
-SHORTEST_DIRECTION = 1e-3
-"""Length below which a direction is none."""
 
 MOST_STEPS = 200
 """Largest number of steps of a history: so many keep others waiting for some 50 ms."""
@@ -63,21 +59,12 @@ class Contact(Strict):
     )
     direction: Direction | None = Field(
         None,
-        description="Where the endoscope pushes, [x, y, z] of any length from 0.001 up; less than "
-        "90 degrees from the inward normal. Default: the inward normal.",
+        description="Where the endoscope pushes, [x, y, z] of any length; less than 90 degrees "
+        "from the inward normal. Default: the inward normal.",
     )
     radius: float | None = Field(
         None, ge=1e-2, le=1e3, description="Radius of the footprint, mm. Default: the scene's."
     )
-
-    @field_validator("direction")
-    @classmethod
-    def _has_a_direction(cls, direction: list[float] | None) -> list[float] | None:
-        if direction is not None and sum(c * c for c in direction) < SHORTEST_DIRECTION**2:
-            raise PydanticCustomError(
-                "zero_vector", "Input should not be a zero vector", {"min_norm": SHORTEST_DIRECTION}
-            )
-        return direction
 
 
 class _Asking(Strict):
@@ -165,17 +152,6 @@ class ContactAnswer(BaseModel):
     )
 
 
-class ErrorEstimate(BaseModel):
-    """Relative L2 errors against the full model that 95 % of answers stay within, as fractions.
-
-    Null outside the trained range. In a history: the largest error so far relative to the largest
-    norm so far of the field.
-    """
-
-    displacement: float | None
-    von_mises: float | None
-
-
 class Trust(BaseModel):
     """Whether and how far to believe the answer."""
 
@@ -185,7 +161,11 @@ class Trust(BaseModel):
         description="Whether the load is in the range the model was trained for."
     )
     out_of_range: list[str] = Field(description="The contact's fields that are not.")
-    error_estimate: ErrorEstimate
+    error_estimate: dict[FieldName, float | None] = Field(
+        description="Relative L2 errors against the full model that 95 % of answers stay within, "
+        "as fractions. Null outside the trained range. In a history: the largest error so far "
+        "relative to the largest norm so far of the field."
+    )
     min_jacobian: float = Field(description="Smallest volume ratio met; 1 at rest, 0 is collapse.")
 
 
@@ -196,11 +176,10 @@ class Fields(BaseModel):
     von_mises: list[float] | None = Field(None, description="Cauchy stress, kPa")
 
 
-class Timing(BaseModel):
-    """Where the server's time went, µs."""
-
-    solve_us: float
-    recover_us: float
+Timing = Annotated[
+    dict[Literal["solve_us", "recover_us"], float],
+    Field(description="Where the server's time went, µs."),
+]
 
 
 class _Answer(BaseModel):
@@ -290,7 +269,7 @@ class SceneList(BaseModel):
     """What is served and what could not be."""
 
     scenes: list[SceneEntry]
-    refused: list[RefusedFile]
+    refused: list[dict[Literal["file", "reason"], str]]
 
 
 class Ranges(BaseModel):
@@ -308,35 +287,16 @@ class Ranges(BaseModel):
     reach: float = Field(description="Farthest a position may be from the surface, mm.")
 
 
-class Size(BaseModel):
-    """What the fields of this scene hold."""
-
-    nodes: int
-    dofs: int
-    surface_nodes: int
-    triangles: int
-
-
 class SceneSummary(SceneEntry):
     """One scene: what may be asked and how well it is answered."""
 
     ranges: Ranges
     tolerance: dict[str, float] = Field(description="Relative L2 errors promised, as fractions.")
-    size: Size
+    size: dict[Literal["nodes", "dofs", "surface_nodes", "triangles"], int] = Field(
+        description="What the fields of this scene hold."
+    )
     info: dict[str, Any] = Field(description="Training, validation and provenance.")
     example: dict[str, Any] = Field(description="A request that this scene can answer.")
-
-
-class Status(BaseModel):
-    """The service is up."""
-
-    status: Literal["ok", "ready"]
-
-
-class Checked(BaseModel):
-    """The request is well-formed."""
-
-    valid: Literal[True]
 
 
 class ErrorBody(BaseModel):

@@ -2,19 +2,19 @@
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from palpate.online.serve.errors import Refusal
+from palpate.online.serve.metrics import Metrics
+from palpate.online.settings import Settings
 from palpate.shared.errors import PalpateError
 from palpate.shared.model import ReducedModel
 
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class ServedModel:
+class ServedModel(NamedTuple):
     """A reduced model that is served, and what requests need beside it."""
 
     model: ReducedModel
@@ -22,31 +22,20 @@ class ServedModel:
     tip: list[float]  # mm, a position of the tip's centre at which it presses a little
 
 
-@dataclass(frozen=True)
-class RefusedFile:
-    """An artifact that is not served, and why."""
-
-    file: str
-    reason: str
-
-
 class Store:
-    """All models of the ``*.h5`` of a directory, which `load` reads."""
+    """All models of the ``*.h5`` of a directory."""
 
-    def __init__(
-        self, directory: Path, load: Callable[[Path], ReducedModel] = ReducedModel.load
-    ) -> None:
+    def __init__(self, directory: Path) -> None:
         self.directory = directory
         self.models: dict[str, ServedModel] = {}
-        self.refused: list[RefusedFile] = []
+        self.refused: list[dict[str, str]] = []  # `file` and `reason` of those that are not served
         self.ready = False
-        self._load = load
 
     def open(self, warm: Callable[[ServedModel], Any]) -> None:
         """Load and warm every model; a file that fails is refused and the others still served."""
         for path in sorted(self.directory.glob("*.h5")):
             try:
-                served = _served(self._load(path))
+                served = _served(ReducedModel.load(path))
                 name = served.model.name
                 if name in self.models:
                     raise PalpateError(f"{path}: another file already holds {name!r}")
@@ -62,7 +51,7 @@ class Store:
                 logger.info("serving %s from %s", name, path)
                 continue
             logger.error("refused %s", reason)
-            self.refused.append(RefusedFile(path.name, reason))
+            self.refused.append({"file": path.name, "reason": reason})
 
     def require_ready(self) -> None:
         """Raise `Refusal` while models are being loaded."""
@@ -75,6 +64,14 @@ class Store:
         if name not in self.models:
             raise Refusal("unknown_scene", "name", "No such scene is served", sorted(self.models))
         return self.models[name]
+
+
+class Service:
+    """What endpoints and sessions work with; without `metrics` this is the only worker."""
+
+    def __init__(self, settings: Settings, metrics: Metrics | None = None) -> None:
+        self.settings, self.store = settings, Store(settings.artifacts)
+        self.metrics = metrics or Metrics()
 
 
 def _served(model: ReducedModel) -> ServedModel:

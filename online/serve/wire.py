@@ -25,7 +25,7 @@ each can be viewed in place (``new Float32Array(buffer, 16 + H + offset, n)``).
 import math
 import re
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
 
@@ -50,10 +50,6 @@ _DTYPES = {"float32": "<f4", "int32": "<i4", "uint8": "|u1"}
 
 Head = dict[str, Any]
 Arrays = Mapping[str, NDArray[Any]]
-
-
-class WireError(PalpateError):
-    """Bytes that are not a document of this layout."""
 
 
 def encode(media_type: str, head: Head, arrays: Arrays) -> bytes:
@@ -94,21 +90,24 @@ _WRITERS = {JSON: _encode_json, MSGPACK: _encode_msgpack, BINARY: _encode_binary
 
 
 def decode(body: bytes) -> tuple[Head, dict[str, NDArray[Any]]]:
-    """Read a document of the binary layout: its head, and its arrays as views into `body`."""
+    """Read a document of the binary layout: its head, and its arrays as views into `body`.
+
+    Raises `PalpateError` for bytes that are none.
+    """
     if len(body) < _PREFIX.size:
-        raise WireError(f"{len(body)} bytes are too few for a document")
+        raise PalpateError(f"{len(body)} bytes are too few for a document")
     magic, version, count, head_length, payload_length = _PREFIX.unpack_from(body)
     if magic != MAGIC:
-        raise WireError("not a Palpate document: wrong magic")
+        raise PalpateError("not a Palpate document: wrong magic")
     if version != VERSION:
-        raise WireError(f"layout version {version}; this reader knows version {VERSION}")
+        raise PalpateError(f"layout version {version}; this reader knows version {VERSION}")
     start = _PREFIX.size + head_length
     if len(body) != start + payload_length:
-        raise WireError(f"{len(body)} bytes where the prefix says {start + payload_length}")
+        raise PalpateError(f"{len(body)} bytes where the prefix says {start + payload_length}")
     head = orjson.loads(body[_PREFIX.size : start])
     entries = head.pop("arrays")
     if len(entries) != count:
-        raise WireError(f"{len(entries)} arrays where the prefix says {count}")
+        raise PalpateError(f"{len(entries)} arrays where the prefix says {count}")
     arrays = {}
     for entry in entries:
         size = math.prod(entry["shape"])
@@ -127,26 +126,20 @@ def negotiate(accept: str) -> str:
 
     Of types liked equally the first on offer wins, unless another is named more exactly.
     """
-    ranges = [_parse(part) for part in (accept.strip() or "*/*").split(",")]
-    liked = {offered: _liking(offered, ranges) for offered in OFFERED}
-    best = max(OFFERED, key=liked.__getitem__)
-    if liked[best][0] == 0.0:
-        raise Refusal(
-            "not_acceptable", "accept", "None of the accepted formats is on offer", OFFERED
-        )
+    qualities = {}  # of media ranges; zero where they make no sense
+    for part in (accept.strip() or "*/*").split(","):
+        name, *parameters = (piece.strip().lower() for piece in part.split(";"))
+        quality = next((p[2:] for p in parameters if p.startswith("q=")), "1")
+        qualities[name] = float(quality) if _QUALITY.fullmatch(quality) else 0.0
+
+    def liking(offered: str) -> tuple[float, int]:
+        """Quality of the most exact range that matches, even if it says no; how exact it is."""
+        kinds = ("*/*", offered.split("/")[0] + "/*", offered)
+        exactness = max((i for i, kind in enumerate(kinds) if kind in qualities), default=0)
+        return qualities.get(kinds[exactness], 0.0), exactness
+
+    best = max(OFFERED, key=liking)
+    if liking(best)[0] == 0.0:
+        message = "None of the accepted formats is on offer"
+        raise Refusal("not_acceptable", "accept", message, OFFERED)
     return best
-
-
-def _parse(part: str) -> tuple[str, float]:
-    """Split a media range from its quality, which is zero if it makes no sense."""
-    name, *parameters = (piece.strip().lower() for piece in part.split(";"))
-    quality = next((p[2:] for p in parameters if p.startswith("q=")), "1")
-    return name, float(quality) if _QUALITY.fullmatch(quality) else 0.0
-
-
-def _liking(offered: str, ranges: Sequence[tuple[str, float]]) -> tuple[float, int]:
-    """Quality of the most exact range that matches a type, even if it says no; how exact it is."""
-    kinds = ("*/*", offered.split("/")[0] + "/*", offered)
-    matching = ((kinds.index(name), quality) for name, quality in ranges if name in kinds)
-    exactness, quality = max(matching, default=(0, 0.0))
-    return quality, exactness

@@ -109,6 +109,9 @@ REQUEST_FIELDS = (
 Array = NDArray[Any]
 
 
+_Estimate = Annotated[float, "float32", "", "estimated relative error; infinite: unknown"]
+
+
 class Reply(NamedTuple):
     """A reply frame: of each field its type in the frame, its unit and its meaning.
 
@@ -138,11 +141,9 @@ class Reply(NamedTuple):
     normal: Annotated[Array, "float32", "", "outward, unit, at the contact", (3,)]
     depth: Annotated[float, "float32", "mm", "of the tip below the surface at rest"]
     penetration: Annotated[float, "float32", "mm", "of the tip into the deformed surface"]
-    error_displacement: Annotated[
-        float, "float32", "", "estimated relative error; infinite: unknown"
-    ]
-    error_von_mises: Annotated[float, "float32", "", "estimated relative error; infinite: unknown"]
-    error_force: Annotated[float, "float32", "", "estimated relative error; infinite: unknown"]
+    error_displacement: _Estimate
+    error_von_mises: _Estimate
+    error_force: _Estimate
     min_jacobian: Annotated[float, "float32", "", "smallest volume ratio; 1 at rest, 0 is collapse"]
     max_von_mises: Annotated[float, "float32", "kPa", "largest in the body; 0 if not asked for"]
     p99_von_mises: Annotated[float, "float32", "kPa", "99th percentile of it; 0 if not asked for"]
@@ -198,14 +199,6 @@ _IN_RANGE = int(Flag.IN_RANGE)
 class FrameError(QueryError):
     """A message that is no frame, or asks for nonsense; `field` is the field at fault."""
 
-    code = "invalid_frame"
-
-
-class VersionError(FrameError):
-    """A frame of another layout."""
-
-    code = "unknown_version"
-
 
 class Request(NamedTuple):
     """A request frame; for the fields see `REQUEST_FIELDS`."""
@@ -240,7 +233,7 @@ def decode_request(frame: bytes) -> Request:
 
 def _check_version(frame: bytes) -> None:
     if len(frame) >= 2 and (version := int.from_bytes(frame[:2], "little")) != VERSION:
-        raise VersionError("version", f"is {version}; the layout spoken here is version {VERSION}")
+        raise FrameError("version", f"is {version}; the layout spoken here is version {VERSION}")
 
 
 class Extras(NamedTuple):

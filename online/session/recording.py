@@ -45,18 +45,6 @@ COMMANDS = Field(
 )
 
 
-class Command(NamedTuple):
-    """A snapshot that was taken or restored."""
-
-    replies: int  # number of those that had come before
-    restores: int  # 0 or 1
-    number: int
-
-
-class RecordingError(PalpateError):
-    """A file that is no recording, or one of another scene."""
-
-
 class Recorder:
     """Writes a session with this greeting to a file, which is overwritten, as it goes."""
 
@@ -128,17 +116,17 @@ class Recording(NamedTuple):
     requests: list[Request]  # those that were answered
     replies: NDArray[Any]  # (n,), of `session.frames.REPLY`
     received: NDArray[np.float64]  # (n,), s on the client's clock
-    commands: list[Command]
+    commands: list[tuple[int, int, int]]  # as `COMMANDS`
 
 
 def read_recording(path: Path) -> Recording:
-    """Read a recording; raise `RecordingError` if it is missing, damaged or of another version."""
+    """Read a recording; raise `PalpateError` if it is missing, damaged or of another version."""
     try:
         with h5py.File(path, "r") as file:
             if file.attrs.get("format") != FORMAT:
-                raise RecordingError(f"{path}: not a recording of a session")
+                raise PalpateError(f"{path}: not a recording of a session")
             if (version := file.attrs["format_version"]) != FORMAT_VERSION:
-                raise RecordingError(
+                raise PalpateError(
                     f"{path}: format version {version}; this program reads {FORMAT_VERSION}"
                 )
             replies = np.zeros(len(file["seq"]), REPLY)
@@ -147,8 +135,8 @@ def read_recording(path: Path) -> Recording:
             columns = replies["seq"], replies["client_time"], file["asked_position"][:]
             asked = (column.tolist() for column in (*columns, file["asked_outputs"][:]))
             requests = [Request(*values) for values in zip(*asked, strict=True)]
-            commands = [Command(*values) for values in file["commands"][:].tolist()]
+            commands = [tuple(row) for row in file[COMMANDS.name][:].tolist()]
             scene = str(file.attrs["scene"])
             return Recording(scene, requests, replies, file["received"][:], commands)
     except (OSError, KeyError, ValueError) as error:
-        raise RecordingError(f"{path}: cannot be read: {error}") from error
+        raise PalpateError(f"{path}: cannot be read: {error}") from error

@@ -7,8 +7,9 @@ import numpy as np
 
 from palpate.online.session import frames
 from palpate.online.session.frames import REPLY
-from palpate.online.session.recording import Recording, RecordingError
+from palpate.online.session.recording import Recording
 from palpate.online.session.tracker import Snapshot, ToolTracker, recover
+from palpate.shared.errors import PalpateError
 from palpate.shared.model import ReducedModel
 
 VOLATILE = ("server_received", "server_sent", "solve_time", "superseded")
@@ -28,18 +29,18 @@ def replay(recording: Recording, model: ReducedModel) -> Replay:
     """Answer a recorded session again and compare.
 
     The bits are those of compiled kernels from the cache: a process that has compiled some itself,
-    a server at its very first start, may differ from them in the last ones. Raises `RecordingError`
+    a server at its very first start, may differ from them in the last ones. Raises `PalpateError`
     if the recording is of another scene.
     """
     if model.name != recording.scene:
-        raise RecordingError(
+        raise PalpateError(
             f"the recording is of scene {recording.scene!r}, the artifact of {model.name!r}"
         )
     tracker, commands = ToolTracker(model), list(recording.commands)
     snapshots: dict[int, Snapshot] = {}
     again = np.zeros_like(recording.replies)
     for i, request in enumerate(recording.requests):
-        while commands and commands[0].replies <= i:
+        while commands and commands[0][0] <= i:
             _, restores, number = commands.pop(0)
             if restores:
                 tracker.restore(snapshots[number])

@@ -16,9 +16,7 @@ import orjson
 from starlette.types import Message, Receive, Scope, Send
 
 from palpate.online.serve.errors import Refusal, as_refusal, check_json_size
-from palpate.online.serve.metrics import Metrics
-from palpate.online.serve.settings import Settings
-from palpate.online.serve.store import ServedModel, Store
+from palpate.online.serve.store import ServedModel, Service
 from palpate.online.session import frames, protocol
 from palpate.online.session.frames import Output, Request
 from palpate.online.session.tracker import LONGEST, Snapshot, ToolTracker, recover
@@ -52,35 +50,33 @@ Ending = tuple[int, str] | None
 class Sessions:
     """The ASGI application of every session."""
 
-    def __init__(self, store: Store, settings: Settings, metrics: Metrics) -> None:
-        self.settings = settings
-        self.metrics = metrics
-        self._store = store
+    def __init__(self, service: Service) -> None:
+        self._service = service
         self._open = 0
         # a new tracker takes longer than most solves
         self._spare: dict[str, list[ToolTracker]] = {}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Refuse a session or run it until it ends."""
-        served = self._store.model(scope["path_params"]["name"])
+        served = self._service.store.model(scope["path_params"]["name"])
         if not served.model.has_tip:
             raise Refusal(
                 "no_tip", "name", "This scene was trained without a tip; it only answers loads"
             )
-        most = self.settings.max_sessions
+        most = self._service.settings.max_sessions
         if self._open >= most:
             raise Refusal(
                 "too_many_sessions", "", f"{self._open} sessions are open", {"max_sessions": most}
             )
         self._open += 1
-        self.metrics.count_session(opened=True)
+        self._service.metrics.count_session(opened=True)
         spare = self._spare.setdefault(served.model.name, [])
         tracker = spare.pop() if spare else ToolTracker(served.model)
         try:
-            await Session(self, served, tracker, scope, receive, send).run()
+            await Session(self._service, served, tracker, scope, receive, send).run()
         finally:
             self._open -= 1
-            self.metrics.count_session(opened=False)
+            self._service.metrics.count_session(opened=False)
             tracker.restart()
             spare.append(tracker)
 
@@ -106,14 +102,14 @@ class Session:
 
     def __init__(
         self,
-        sessions: Sessions,
+        service: Service,
         served: ServedModel,
         tracker: ToolTracker,
         scope: Scope,
         receive: Receive,
         send: Send,
     ) -> None:
-        self._sessions, self._tracker = sessions, tracker
+        self._service, self._tracker = service, tracker
         self._served, self._model = served, served.model
         self._receive, self._send = receive, send
         self._connection = scope["extensions"][CONNECTION]
@@ -145,7 +141,7 @@ class Session:
 
     async def _watch(self) -> Ending:
         """Interrupt a session whose client is silent, or does not read; tell how it ends."""
-        idle = self._sessions.settings.session_idle
+        idle = self._service.settings.session_idle
         passed = 0.0
         while passed <= (PATIENCE if self._sending else idle):
             await asyncio.sleep(min(0.25, 0.25 * idle))
@@ -212,7 +208,7 @@ class Session:
             refusal = as_refusal(error)
             if refusal.code == "internal":
                 logger.error("a session failed", exc_info=error)
-            self._sessions.metrics.count_refused_frame()
+            self._service.metrics.count_refused_frame()
             reply["text"] = refusal.body().decode()
             if refusal.code in ENDING:
                 ending = ENDING[refusal.code], refusal.message
@@ -224,7 +220,7 @@ class Session:
             return self._obey(*protocol.read_command(text))
         request = protocol.read_request(text)
         outputs, nodes = protocol.names(Output(request.outputs)), len(self._model.surface_nodes)
-        check_json_size(outputs, nodes, self._sessions.settings.max_json_numbers, "outputs")
+        check_json_size(outputs, nodes, self._service.settings.max_json_numbers, "outputs")
         return protocol.write_reply(self._answer(request, start))
 
     def _answer(self, request: Request, start: float) -> bytes:
@@ -237,7 +233,7 @@ class Session:
         received, dropped, self._superseded = self._received, self._superseded, 0
         frame = frames.encode_reply(request, answer, extras, dropped, received, perf_counter())
         borders = (start, decoded, solved, recovered, perf_counter())
-        self._sessions.metrics.count_frame(start - received, borders, answer.flags, dropped)
+        self._service.metrics.count_frame(start - received, borders, answer.flags, dropped)
         return frame
 
     def _obey(self, command: str, number: int) -> str:
@@ -259,7 +255,7 @@ class Session:
             "tip_radius": model.scene.endoscope.radius,
             "example": {"position": self._served.tip},
             "nodes": len(model.surface_nodes),
-            "idle_timeout": self._sessions.settings.session_idle,
+            "idle_timeout": self._service.settings.session_idle,
             "max_frames_per_second": MOST_FRAMES,
             "longest_step": LONGEST if model.scene.tissue.prony else None,
             "snapshots": protocol.MOST_SNAPSHOTS,

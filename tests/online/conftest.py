@@ -7,20 +7,20 @@ import pytest
 import uvicorn
 from starlette.testclient import TestClient
 
-from palpate.online.client.connection import ServiceError
-from palpate.online.client.session import Session
+from palpate.online.client.session import ServiceError, Session
 from palpate.online.serve.app import create_app
 from palpate.online.serve.process import HttpProtocol
-from palpate.online.serve.settings import Settings
-from palpate.online.serve.store import Store
+from palpate.online.serve.store import Service, Store
 from palpate.online.session.websocket import OPTIONS
+from palpate.online.settings import Settings
 from palpate.shared.errors import PalpateError
+from palpate.shared.model import ReducedModel
 
 from .fake_model import FakeModel
 
 
 @pytest.fixture
-def fake_store(tmp_path):
+def fake_store(tmp_path, monkeypatch):
     """Return a function that makes a store of fake models, one per name.
 
     An exception in place of an model is raised when that file is loaded.
@@ -36,7 +36,8 @@ def fake_store(tmp_path):
                 raise model
             return model
 
-        return Store(tmp_path, load)
+        monkeypatch.setattr(ReducedModel, "load", load)
+        return Store(tmp_path)
 
     return make
 
@@ -47,8 +48,9 @@ def make_app(fake_store, tmp_path):
 
     def make(models, settings):
         models = models or [FakeModel()]
-        store = fake_store(**{getattr(model, "name", "broken"): model for model in models})
-        return create_app(Settings(tmp_path, **settings), store), store
+        fake_store(**{getattr(model, "name", "broken"): model for model in models})
+        service = Service(Settings(tmp_path, **settings))
+        return create_app(service), service.store
 
     return make
 

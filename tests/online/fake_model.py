@@ -92,8 +92,8 @@ class FakeModel:
         if distance > reach:
             raise QueryError("position", f"{distance:.3g} mm from the surface; limit {reach} mm")
         push = -UP if direction is None else np.asarray(direction, float)
-        push = push / np.linalg.norm(push)
-        if push @ UP >= 0:
+        push = push / (np.linalg.norm(push) or 1.0)
+        if push @ UP > -1e-9:
             raise QueryError("direction", "90 degrees or more from the inward normal")
         radius = usual if radius is None else radius
         out_of_range = ("pressure",) * (pressure > self.pressure_max)

@@ -7,12 +7,13 @@ from hypothesis import HealthCheck, settings
 from schemathesis.specs.openapi.checks import positive_data_acceptance
 
 from palpate.online.serve.app import create_app
-from palpate.online.serve.settings import Settings
+from palpate.online.serve.store import Service
+from palpate.online.settings import Settings
 
 
 def description():
     """Return the OpenAPI document, narrowed to the scene there is here."""
-    document = create_app(Settings(Path())).openapi()
+    document = create_app(Service(Settings(Path()))).openapi()
     for path in document["paths"].values():
         for operation in path.values():
             for parameter in operation.get("parameters", []):

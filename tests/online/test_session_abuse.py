@@ -13,8 +13,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from palpate.online.client.connection import SessionClosed
-from palpate.online.client.session import Session
+from palpate.online.client.session import Session, SessionClosed
 from palpate.online.session import frames, websocket
 from palpate.online.session import session as server_session
 from palpate.online.session.frames import Flag, Output, Request

@@ -12,9 +12,10 @@ import pytest
 from click.testing import CliRunner
 from prometheus_client.parser import text_string_to_metric_families
 
-from palpate.online.client.connection import ServiceError, SessionClosed
 from palpate.online.client.http import Client
-from palpate.online.loadtest.run import Plan, run
+from palpate.online.client.session import ServiceError, SessionClosed
+from palpate.online.loadtest.run import run
+from palpate.online.settings import Plan
 from palpate.shared.cli import main
 
 pytestmark = pytest.mark.service

@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 from palpate.online.client.http import Client
-from palpate.online.loadtest.run import Plan, run
+from palpate.online.loadtest.run import run
+from palpate.online.settings import Plan
 
 from ..conftest import PALPATE
 

@@ -9,9 +9,8 @@ import time
 import numpy as np
 import pytest
 
-from palpate.online.client.connection import SessionClosed
 from palpate.online.client.http import Client
-from palpate.online.client.session import Session
+from palpate.online.client.session import Session, SessionClosed
 from palpate.online.session.frames import Output
 
 from ..conftest import PALPATE

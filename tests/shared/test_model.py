@@ -105,7 +105,7 @@ def test_no_pressure_moves_nothing_and_the_length_of_a_direction_means_nothing(a
 NONSENSE = {
     "pressure": (math.nan, math.inf, -1e-9),
     "position": ([math.nan, 0, 0], [0, math.inf, 0], [1.0, 2.0], "here", [5.0, 5.0, 500.0]),
-    "direction": ([0, 0, 0], [0, math.nan, -1], [0.0, -1.0], [0, 0, 1], [1.0, 0.0, 0.0]),
+    "direction": ([0, 0, 0], [0, 0, 1e-200], [0, math.nan, -1], [0, -1], [0, 0, 1], [1, 0, 0]),
     "radius": (0.0, -1.0, 2.001, math.nan),
 }
 

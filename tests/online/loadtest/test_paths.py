@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 
 from palpate.online.client.http import Accessible
-from palpate.online.loadtest.paths import LIFTED, SPEED, Tip, tool_path
+from palpate.online.loadtest.paths import LIFTED, SPEED, tool_path
 
 from ..fake_model import FakeModel
 
-TIP = Tip(radius=2.0, depth=0.8)
+RADIUS, DEPTH = TIP = 2.0, 0.8
 
 
 @pytest.fixture(scope="module")
@@ -17,7 +17,7 @@ def surface():
 
 @pytest.fixture
 def path(surface, rng):
-    return tool_path(surface, TIP, np.arange(0.0, 20.0, 1e-3), rng)
+    return tool_path(surface, *TIP, np.arange(0.0, 20.0, 1e-3), rng)
 
 
 def test_it_moves_as_a_hand_does(path):
@@ -28,21 +28,21 @@ def test_it_moves_as_a_hand_does(path):
 
 
 def test_it_goes_in_and_out_of_contact(path):
-    depth = TIP.radius - (path[:, 2] - 5.0)  # the block's top is at z = 5
-    assert depth.max() == pytest.approx(TIP.depth, abs=0.01)
+    depth = RADIUS - (path[:, 2] - 5.0)  # the block's top is at z = 5
+    assert depth.max() == pytest.approx(DEPTH, abs=0.01)
     assert depth.min() == pytest.approx(-LIFTED, abs=0.01)
     assert np.count_nonzero(np.diff(np.sign(depth))) > 20
 
 
 def test_it_covers_the_surface(surface, path):
-    pressed = path[path[:, 2] < 5.0 + TIP.radius, :2]
+    pressed = path[path[:, 2] < 5.0 + RADIUS, :2]
     distance = [np.linalg.norm(pressed - v, axis=1).min() for v in surface.vertices[:, :2]]
     assert max(distance) < 2.0
 
 
 def test_neither_the_rate_nor_chance_changes_the_path(surface):
     one, same, two = (
-        tool_path(surface, TIP, np.linspace(0.0, 2.0, count), np.random.default_rng(3))
+        tool_path(surface, *TIP, np.linspace(0.0, 2.0, count), np.random.default_rng(3))
         for count in (51, 51, 501)
     )
     np.testing.assert_array_equal(one, same)

@@ -1,8 +1,9 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from palpate.online.loadtest.generator import ANSWERED, DROPPED, LOST, SUPERSEDED, Log, Machine
-from palpate.online.loadtest.report import (
+from palpate.online.loadtest.run import (
     clean_windows,
     gather,
     quantiles,
@@ -10,27 +11,32 @@ from palpate.online.loadtest.report import (
     summarize_added,
     summarize_overload,
 )
+from palpate.online.loadtest.streams import (
+    ANSWERED,
+    DROPPED,
+    LOST,
+    MESSAGE,
+    SUPERSEDED,
+    Machine,
+)
 from palpate.online.session.frames import Flag
 
 
 def log(due, latency_ms=0.2, late_ms=0.0, outcome=ANSWERED):
-    """Return a log of messages due at some times (s), all of one fate or each of its own."""
-    log = Log(np.asarray(due, float))
-    shape = len(log.due)
-    due = np.array(log.due)
-    log.sent = (due + 1e6 * np.broadcast_to(late_ms, shape)).astype(int).tolist()
-    log.received = (due + 1e6 * np.broadcast_to(latency_ms, shape)).astype(int).tolist()
-    log.outcome = np.broadcast_to(outcome, shape).tolist()
-    log.solve = [50.0] * shape
-    log.flags = [int(Flag.CONTACT)] * shape
-    return log
+    """Return messages due at some times (s), all of one fate or each of its own."""
+    found = np.zeros(len(due), MESSAGE).view(np.recarray)
+    found.due, found.latency, found.lateness = due, 1e3 * np.asarray(latency_ms), 1e3 * late_ms
+    found.outcome, found.solve, found["flags"] = outcome, 50.0, Flag.CONTACT
+    found.window = found.due  # those of `machine` have a second
+    found.latency[found.outcome != ANSWERED] = np.nan
+    return found
 
 
 def machine(seconds, steal=()):
     """Return a machine's record in windows of a second."""
     stolen = np.zeros(seconds)
     stolen[list(steal)] = 0.01
-    return Machine((1e9 * np.arange(seconds + 1)).astype(np.int64), stolen)
+    return Machine(np.arange(seconds + 1.0), stolen)
 
 
 def test_quantiles_are_those_of_the_values(rng):
@@ -39,17 +45,18 @@ def test_quantiles_are_those_of_the_values(rng):
     assert quantiles(np.full(3, np.nan))["p50_us"] is None
 
 
-def test_latency_counts_from_when_a_message_was_due_and_streams_are_put_in_one_order():
-    messages = gather([log([0.1, 0.3], 3.0, late_ms=2.0), log([0.2, 0.4], 2.0)])
+def test_streams_are_put_in_one_order():
+    streams = [SimpleNamespace(log=log([0.1, 0.3], 3.0)), SimpleNamespace(log=log([0.2, 0.4], 2.0))]
+    messages = gather(streams, machine(1))
     assert messages.due == pytest.approx([0.1, 0.2, 0.3, 0.4])
     assert messages.latency == pytest.approx([3000.0, 2000.0, 3000.0, 2000.0])
-    assert messages.lateness == pytest.approx([2000.0, 0.0, 2000.0, 0.0])
+    assert not messages.window.any()
 
 
 def test_a_window_is_clean_if_host_and_generator_were_on_time():
     due = np.arange(0.05, 5.0, 0.1)
     late = np.where((due > 2.0) & (due < 2.1), 0.5, 0.01)
-    messages = gather([log(due, late_ms=late)])
+    messages = log(due, late_ms=late)
     assert clean_windows(machine(5, steal=[4]), messages).tolist() == [1, 1, 0, 1, 0]
     messages.lateness[-12] = np.nan  # never sent
     assert clean_windows(machine(5), messages).tolist() == [1, 1, 0, 0, 1]
@@ -57,8 +64,9 @@ def test_a_window_is_clean_if_host_and_generator_were_on_time():
 
 def test_what_became_of_messages_is_told_apart():
     outcome = [ANSWERED, LOST, SUPERSEDED, SUPERSEDED, ANSWERED, 429, 503, DROPPED]
-    messages = gather([log(np.arange(8.0), outcome=outcome)])
-    found = summarize(messages, np.arange(8) < 4, ["", "stop", "stop"])
+    messages = log(np.arange(8.0), outcome=outcome)
+    streams = [SimpleNamespace(complaint=why) for why in ("", "stop", "stop")]
+    found = summarize(messages, np.arange(8) < 4, streams)
     counts = [found[name] for name in ("due", "answered", "lost", "superseded", "dropped")]
     assert counts == [8, 2, 1, 2, 1]
     assert found["refused"] == {"429": 1, "503": 1}
@@ -71,7 +79,7 @@ def test_what_became_of_messages_is_told_apart():
 def test_what_the_service_adds_is_the_round_trip_less_its_work():
     """Both counted from when the message was sent."""
     due = np.arange(5.0)
-    messages, empty = gather([log(due, 0.5, late_ms=0.1)]), gather([log(due, 0.3, late_ms=0.1)])
+    messages, empty = log(due, 0.5, late_ms=0.1), log(due, 0.3, late_ms=0.1)
     messages.recover[:] = 70.0
     messages.latency[0] = np.nan
     found = summarize_added(messages, empty)
@@ -82,7 +90,7 @@ def test_what_the_service_adds_is_the_round_trip_less_its_work():
 def test_recovery_is_when_latencies_are_as_before(slow_until, recovered):
     due = np.arange(0.01, 8.0, 0.01)
     slow = (due > 2.0) & (due < slow_until)
-    messages = gather([log(due, np.where(slow, 50.0, 0.2))])
+    messages = log(due, np.where(slow, 50.0, 0.2))
     found = summarize_overload(messages, machine(8), 2.0, 4.0)
     assert found["recovered_s"] == recovered
     assert found["before"]["p99_us"] == pytest.approx(200.0, rel=1e-3)
@@ -102,5 +110,5 @@ def test_lost_messages_are_no_recovery_and_superseded_ones_do_not_count(
 ):
     due = np.arange(0.01, 6.0, 0.01)
     outcome = np.where((due > begin) & (due < end), fate, ANSWERED)
-    found = summarize_overload(gather([log(due, outcome=outcome)]), machine(6), 2.0, 4.0)
+    found = summarize_overload(log(due, outcome=outcome), machine(6), 2.0, 4.0)
     assert found["recovered_s"] == recovered

@@ -8,9 +8,8 @@ import pytest
 from click.testing import CliRunner
 
 from palpate.online.commands import loadtest
-from palpate.online.loadtest.report import table
-from palpate.online.loadtest.run import Plan, run
-from palpate.online.serve.settings import Settings
+from palpate.online.loadtest.run import run, table
+from palpate.online.settings import Plan, Settings
 from palpate.shared.errors import PalpateError
 
 
@@ -24,7 +23,9 @@ def test_queries_are_all_answered(url, region):
 
 
 def test_no_frame_of_a_session_is_lost(url):
-    plan = Plan(url, "toy", sessions=2, rate=200.0, queries=20.0, duration=0.5, outputs=2)
+    plan = Plan(
+        url, "toy", sessions=2, rate=200.0, queries=20.0, duration=0.5, outputs=("displacement",)
+    )
     outcome = run(plan)
     summary = outcome.summary
     assert (summary["due"], summary["lost"], summary["complaints"]) == (200, 0, [])
@@ -35,9 +36,8 @@ def test_no_frame_of_a_session_is_lost(url):
     assert len(outcome.messages["frames"].due) == 200
     assert len(outcome.messages["queries"].due) == 10
 
-    for (
-        messages
-    ) in outcome.messages.values():  # none before it is due, and latency counts from then
+    # none before it is due, and latency counts from then
+    for messages in outcome.messages.values():
         assert (messages.lateness >= 0).all()
         known = np.isfinite(messages.latency)
         assert (messages.latency > messages.lateness)[known].all()

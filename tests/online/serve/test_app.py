@@ -5,18 +5,19 @@ from starlette.testclient import TestClient
 
 from palpate.online.serve.app import create_app
 from palpate.online.serve.schemas import Accessible, Answer, Mesh, SceneList, SceneSummary
-from palpate.online.serve.settings import Settings
-from palpate.online.serve.store import Store
+from palpate.online.serve.store import Service
 from palpate.online.serve.wire import BINARY, JSON, MSGPACK
+from palpate.online.settings import Settings
 from palpate.shared.errors import PalpateError
+from palpate.shared.model import ReducedModel
 
 from ..conftest import error_of
 from ..fake_model import FakeModel
 
 
 @pytest.fixture
-def slow_store(tmp_path):
-    """Return a store that is loading until the returned event is set."""
+def slow(tmp_path, monkeypatch):
+    """Return a service that is loading until the returned event is set."""
     (tmp_path / "toy.h5").touch()
     loaded = threading.Event()
 
@@ -24,13 +25,14 @@ def slow_store(tmp_path):
         loaded.wait()
         return FakeModel()
 
-    return Store(tmp_path, load), loaded
+    monkeypatch.setattr(ReducedModel, "load", load)
+    return Service(Settings(tmp_path)), loaded
 
 
-def test_it_lives_at_once_and_is_ready_when_warm(slow_store, tmp_path):
-    store, loaded = slow_store
+def test_it_lives_at_once_and_is_ready_when_warm(slow):
+    service, loaded = slow
     ready = threading.Event()
-    app = create_app(Settings(tmp_path), store, on_ready=lambda store: ready.set())
+    app = create_app(service, ready.set)
     with TestClient(app) as client:
         assert client.get("/health").json() == {"status": "ok"}
         for path in ("/ready", "/scenes", "/scenes/toy", "/scenes/toy/mesh"):
@@ -40,11 +42,11 @@ def test_it_lives_at_once_and_is_ready_when_warm(slow_store, tmp_path):
         assert client.get("/ready").json() == {"status": "ready"}
 
 
-def test_a_service_that_is_told_to_stop_does_not_wait_for_its_models(slow_store, tmp_path):
-    store, loaded = slow_store
-    with TestClient(create_app(Settings(tmp_path), store)) as client:
+def test_a_service_that_is_told_to_stop_does_not_wait_for_its_models(slow):
+    service, loaded = slow
+    with TestClient(create_app(service)) as client:
         assert client.get("/ready").status_code == 503
-    assert not store.ready
+    assert not service.store.ready
     assert not loaded.is_set()
     loaded.set()
 

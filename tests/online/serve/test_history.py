@@ -6,7 +6,6 @@ import pytest
 from palpate.online.serve import wire
 from palpate.online.serve.schemas import MOST_STEPS
 from palpate.online.serve.wire import BINARY
-from palpate.shared.model import ReducedModel
 from palpate.shared.reduced.transfer import REST
 
 from ..conftest import error_of
@@ -20,31 +19,28 @@ STEPS = [
 ]
 
 
-@pytest.fixture(scope="module")
-def model(visco_artifact):
-    return ReducedModel.load(visco_artifact)
-
-
 @pytest.fixture
-def ask(serve, model):
+def ask(serve, visco_atlas):
     """Return a function that posts a history to the visco-elastic scene."""
-    with serve(model) as client:
+    with serve(visco_atlas) as client:
 
         def ask(steps=STEPS, accept="application/json", **options):
             document, headers = {"steps": steps, **options}, {"accept": accept}
-            return client.post(f"/scenes/{model.name}/history", json=document, headers=headers)
+            return client.post(
+                f"/scenes/{visco_atlas.name}/history", json=document, headers=headers
+            )
 
         yield ask
 
 
-def test_steps_are_those_of_the_atlas(ask, model):
+def test_steps_are_those_of_the_atlas(ask, visco_atlas):
     answered = ask().json()
-    past, warm = REST, model.new_warm()
-    assert answered["scene"] == model.name
+    past, warm = REST, visco_atlas.new_warm()
+    assert answered["scene"] == visco_atlas.name
     for step, pressure, dt in zip(
         answered["steps"], (2.0, 2.0, 0.0, 0.0), (0.05, 0.45, 0.0, 0.3), strict=True
     ):
-        moment = model.press(CONTACT["position"], pressure, past=past, dt=dt, warm=warm)
+        moment = visco_atlas.press(CONTACT["position"], pressure, past=past, dt=dt, warm=warm)
         past = moment.past
         np.testing.assert_allclose(
             step["contact_displacement"], moment.contact_displacement, rtol=1e-6, atol=1e-9
@@ -57,8 +53,8 @@ def test_steps_are_those_of_the_atlas(ask, model):
     pressed, held, released, rested = (s["contact_displacement"][2] for s in answered["steps"])
     assert held < pressed < released < rested < 0.0
     _, fields = wire.decode(ask(accept=BINARY, region="all").content)  # of the end
-    np.testing.assert_allclose(fields["displacement"], model.displacement(moment), atol=1e-6)
-    assert fields["von_mises"].shape == (len(model.nodes),)
+    np.testing.assert_allclose(fields["displacement"], visco_atlas.displacement(moment), atol=1e-6)
+    assert fields["von_mises"].shape == (len(visco_atlas.nodes),)
 
 
 def changed(number, **values):

@@ -22,7 +22,7 @@ def test_what_fails_is_named_and_the_others_are_served(fake_store, caplog):
     store = fake_store(**models)
     store.open(ignore)
     assert list(store.models) == ["toy"]
-    reasons = {refused.file: refused.reason for refused in store.refused}
+    reasons = {refused["file"]: refused["reason"] for refused in store.refused}
     assert reasons["foreign.h5"] == "foreign.h5: not an artifact"
     assert "KeyError" in reasons["bug.h5"]
     for file in ("foreign.h5", "bug.h5", "toy.h5"):
@@ -32,8 +32,8 @@ def test_what_fails_is_named_and_the_others_are_served(fake_store, caplog):
 def test_a_name_is_served_once(fake_store):
     store = fake_store(first=FakeModel("toy"), second=FakeModel("toy"))
     store.open(ignore)
-    assert [refused.file for refused in store.refused] == ["second.h5"]
-    assert "another file already holds 'toy'" in store.refused[0].reason
+    assert [refused["file"] for refused in store.refused] == ["second.h5"]
+    assert "another file already holds 'toy'" in store.refused[0]["reason"]
 
 
 def test_nothing_is_given_out_before_all_are_ready(fake_store):
@@ -51,4 +51,4 @@ def test_a_model_that_fails_its_first_answers_is_refused(fake_store):
 
     store = fake_store(toy=FakeModel())
     store.open(warm)
-    assert "not finite" in store.refused[0].reason
+    assert "not finite" in store.refused[0]["reason"]

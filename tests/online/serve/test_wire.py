@@ -11,6 +11,7 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from palpate.online.serve import wire
 from palpate.online.serve.errors import Refusal
 from palpate.online.serve.wire import BINARY, JSON, MSGPACK, OFFERED, negotiate
+from palpate.shared.errors import PalpateError
 
 HEAD = {"scene": "toy", "force": [0.0, -1.5, 2.25], "trust": {"converged": True}}
 FIELDS = {
@@ -58,7 +59,7 @@ def test_binary_comes_back_as_it_went(floats, integers, octets, text):
     ],
 )
 def test_damaged_documents_are_refused(damage, message):
-    with pytest.raises(wire.WireError, match=message):
+    with pytest.raises(PalpateError, match=message):
         wire.decode(damage(wire.encode(BINARY, HEAD, FIELDS)))
 
 

@@ -6,8 +6,7 @@ import pytest
 from click.testing import CliRunner
 
 from palpate.online import commands
-from palpate.online.client.connection import ServiceError
-from palpate.online.client.session import Session
+from palpate.online.client.session import ServiceError, Session
 from palpate.online.session.frames import (
     REPLY_FIELDS,
     Flag,
@@ -16,9 +15,10 @@ from palpate.online.session.frames import (
     encode_reply,
     encode_request,
 )
-from palpate.online.session.recording import ASKED, Recorder, RecordingError, read_recording
+from palpate.online.session.recording import ASKED, Recorder, read_recording
 from palpate.online.session.replay import replay
 from palpate.online.session.tracker import LONGEST, ToolTracker
+from palpate.shared.errors import PalpateError
 from palpate.shared.model import ReducedModel
 
 from ..fake_model import FakeModel
@@ -148,7 +148,7 @@ def test_other_files_and_other_scenes_are_refused(recorded, tmp_path):
         (newer, "version 9"),
         (recorded[0], "of scene 'toy', the artifact of 'other'"),
     ):
-        with pytest.raises(RecordingError, match=reason):
+        with pytest.raises(PalpateError, match=reason):
             replay(read_recording(path), FakeModel("other"))
 
 

@@ -5,9 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from palpate.online.client.connection import ServiceError, SessionClosed
 from palpate.online.client.http import Client
-from palpate.online.client.session import Session
+from palpate.online.client.session import ServiceError, Session, SessionClosed
 from palpate.online.session import frames, protocol
 from palpate.online.session.frames import Flag, Output, Reason, Request
 from palpate.shared.errors import PalpateError

@@ -21,6 +21,11 @@ def artifact(visco_artifact):
     return visco_artifact
 
 
+@pytest.fixture(scope="module")
+def atlas(visco_atlas):
+    return visco_atlas
+
+
 def off(a, b):
     return np.linalg.norm(np.subtract(a, b)) / np.linalg.norm(b)
 
