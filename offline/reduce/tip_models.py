@@ -32,11 +32,7 @@ from palpate.shared.local_models import Body, LocalModels, LocalTips
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH
 from palpate.shared.mechanics.viscosity import step_weights
-from palpate.shared.reduced.features import (
-    RESIDUAL_FEATURES,
-    TIP_FEATURES,
-    tip_features,
-)
+from palpate.shared.reduced.features import RESIDUAL_FEATURES, TIP_FEATURES, tip_features
 from palpate.shared.reduced.outcome import TOUCH_FEATURES
 from palpate.shared.reduced.past import Elastic, Remembering, opened, remembering
 from palpate.shared.reduced.points import SYMMETRIC, predict_points
