@@ -162,9 +162,9 @@ class Pipeline:
         size, training = self.scene.training.size, {"mesh": mesh_quality(self.problem.mesh)}
         if size is None:
             scene, attempt = self.scene, partial(self._trial, limits)
-            choice = choose(ladder(scene.tissue), scene.tolerance, scene.budget, attempt)
-            size, training["choice"] = choice.size, choice.document
-            tqdm.write(f"size: {size}\n{choice.why}", file=sys.stderr)
+            sizes = ladder(scene.tissue)
+            size, training["choice"] = choose(sizes, scene.tolerance, scene.budget, attempt)
+            tqdm.write(f"size: {size}\n{training['choice']['why']}", file=sys.stderr)
         if mesh_choice is not None:
             training["mesh_choice"] = mesh_choice
         layout = Layout(self.scene, self.surface, limits, size)
