@@ -34,29 +34,13 @@ from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.footprint_models import compile_query, train_patch
 from palpate.offline.reduce.join import join
 from palpate.offline.reduce.layout import Layout
-from palpate.offline.reduce.load_range import (
-    GIVING_WAY,
-    SLIPPING_OFF,
-    Rows,
-    ask,
-    bearable_shares,
-    load_range,
-    untested,
-)
+from palpate.offline.reduce.load_range import SEARCHES, ask, bearable_shares, load_range, untested
 from palpate.offline.reduce.ritz import region
 from palpate.offline.reduce.sampling import fewer, spacing_count, spread_points, triangle_areas
 from palpate.offline.reduce.size import Trial, choose, ladder, try_patch
 from palpate.offline.run.forecast import forecast
 from palpate.offline.run.streams import Stage, stream
-from palpate.offline.run.workers import (
-    Checkpoint,
-    Tasks,
-    content_key,
-    open_scene,
-    resume,
-    run,
-    worker_pool,
-)
+from palpate.offline.run.workers import Checkpoint, Tasks, content_key, open_scene, run, worker_pool
 from palpate.offline.run.writing import provenance, write_model
 from palpate.offline.scenes import default_artifact, find_scene
 from palpate.offline.validate.against_full import reference_task, write_rows
@@ -230,7 +214,9 @@ class Pipeline:
         """Load range that ends before the tissue gives way, or slips off the tip."""
         asking = partial(self._ask, self.checkpoint.store("models", (models, limits)))
         model, lowered = untested(self.problem, models, limits), limits.copy()
-        for search in (GIVING_WAY, SLIPPING_OFF) if model.has_tip else (GIVING_WAY,):
+        for search in SEARCHES:
+            if search.field == TIP_DEPTH and not model.has_tip:
+                continue
             shares = bearable_shares(search, model, asking, stream(self.scene.seed, search.stage))
             lowered[:, search.field] *= shares
             tqdm.write(
@@ -240,13 +226,13 @@ class Pipeline:
             )
         return lowered
 
-    def _ask(self, path: Path, title: str, function: Callable[..., float], rows: Rows) -> Array:
+    def _ask(self, path: Path, title: str, function: Callable[..., float], at: list[Any]) -> Array:
         """Values (k,) of a function of the reduced model; see ``load_range.ask``."""
         tasks = {
-            f"ask-{self.asked + i}": (ask, path, function, rows[i : i + PLACES])
-            for i in range(0, len(rows), PLACES)
+            f"ask-{self.asked + i}": (ask, path, function, at[i : i + PLACES])
+            for i in range(0, len(at), PLACES)
         }
-        self.asked += len(rows)
+        self.asked += len(at)
         return np.concatenate(self._stage(title, tasks))
 
     def _validate(self, kind: Kind, model: ReducedModel) -> tuple[Estimator, list[Row]]:
@@ -275,7 +261,7 @@ class Pipeline:
     def _stage(self, title: str, tasks: Tasks) -> list[Any]:
         """Run the tasks that are not in the checkpoint yet; return all results in their order."""
         started = time.perf_counter()
-        results = resume(title, self.executor, self.checkpoint, tasks)
+        results = self.checkpoint.resume(title, self.executor, tasks)
         seconds = self.seconds.get(title, 0.0) + time.perf_counter() - started
         self.seconds[title] = round(seconds, 2)
         return list(results.values())

@@ -24,7 +24,7 @@ from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.laws import AnyTissue, law_of
 from palpate.shared.mechanics.tensors import SYMMETRIC
 from palpate.shared.mechanics.viscosity import step_weights
-from palpate.shared.scene import ElementName, Scene
+from palpate.shared.scene import ElementName
 
 Array = NDArray[np.float64]
 
@@ -77,11 +77,6 @@ class FullModel:
     element: ElementName
     tissue: AnyTissue
     terms: tuple[Term, ...] = ()  # of the tissue beside its elasticity, whatever the load
-
-    @classmethod
-    def of(cls, scene: Scene, mesh: Mesh) -> FullModel:
-        """Full model of a scene on its mesh."""
-        return cls(mesh, scene.geometry.element, scene.tissue)
 
     def __post_init__(self) -> None:
         mesh = self.mesh

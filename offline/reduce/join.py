@@ -27,8 +27,8 @@ def with_points(
     tables: Tables, points: NDArray[np.integer[Any]], weights: Array, **others: Any
 ) -> Tables:
     """One local model with other cubature points."""
-    own = replace(tables, points=points.astype(np.int32), weights=weights, **others)
-    return replace(own, point_from=np.array([0, len(points)]))
+    own = {"points": points.astype(np.int32), "weights": weights, **others}
+    return replace(tables, point_from=np.array([0, len(points)]), **own)
 
 
 def half(values: Array) -> Field:

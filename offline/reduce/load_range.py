@@ -81,8 +81,8 @@ WAYS, FAR, STRIDE = 4, 1.5, 0.5
 SAME = 0.1
 """Difference of answers, relative to them, that is not one of equilibria."""
 
-Rows = list[tuple[Any, ...]]
-Ask = Callable[[str, Callable[..., float], Rows], Iterable[float]]
+Places = list[tuple[Any, ...]]
+Ask = Callable[[str, Callable[..., float], Places], Iterable[float]]
 """Values of a function of the reduced model at places, its further arguments; under a title."""
 
 
@@ -232,13 +232,13 @@ def _pickled(problem: FullProblem, path: Path) -> ReducedModel:
 
 
 def ask(
-    problem: FullProblem, path: Path, function: Callable[..., float], rows: Rows
+    problem: FullProblem, path: Path, function: Callable[..., float], places: Places
 ) -> list[float]:
     """Values of a function of a reduced model and of further arguments; for ``run.workers``.
 
     ``path`` is a pickle of the local models and their load range.
     """
-    return [function(_pickled(problem, path), *row) for row in rows]
+    return [function(_pickled(problem, path), *place) for place in places]
 
 
 def limit_load_share(model: ReducedModel, x: Array, direction: Array, limit: float) -> float:
@@ -336,3 +336,5 @@ SLIPPING_OFF = Search(
     "slipping off", TIP_DEPTH, Stage.SLIPPING_OFF, _contact, path_independent_share,
     first=2, closer=4, reach=1.0,
 )  # fmt: skip
+
+SEARCHES = GIVING_WAY, SLIPPING_OFF

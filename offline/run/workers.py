@@ -147,16 +147,15 @@ class Checkpoint:
             os.fsync(file.fileno())
         return temporary.replace(path)
 
+    def resume(self, title: str, executor: Executor, tasks: Tasks) -> dict[str, Any]:
+        """Results of tasks by name; those that are not there yet are run, with a bar."""
+        missing = [name for name in tasks if name not in self]
+        with tqdm(total=len(tasks), initial=len(tasks) - len(missing), desc=title) as bar:
+            for name, result in completed(executor, tasks, missing):
+                self.store(name, result)
+                bar.update()
+        return {name: self.load(name) for name in tasks}
+
     def remove(self) -> None:
         """Forget everything: the artifact is written."""
         shutil.rmtree(self._parent)
-
-
-def resume(title: str, executor: Executor, checkpoint: Checkpoint, tasks: Tasks) -> dict[str, Any]:
-    """Results of tasks by name; those that are not in the checkpoint yet are run, with a bar."""
-    missing = [name for name in tasks if name not in checkpoint]
-    with tqdm(total=len(tasks), initial=len(tasks) - len(missing), desc=title) as bar:
-        for name, result in completed(executor, tasks, missing):
-            checkpoint.store(name, result)
-            bar.update()
-    return {name: checkpoint.load(name) for name in tasks}

@@ -131,7 +131,7 @@ def body(name, element, divisions):
     scene = find_scene(name)
     geometry = scene.geometry.model_copy(update={"element": element, "divisions": divisions})
     scene = scene.model_copy(update={"geometry": geometry})
-    return FullModel.of(scene, build_mesh(scene))
+    return FullModel(build_mesh(scene), scene.geometry.element, scene.tissue)
 
 
 def pressed(model, position, pressure, tilt):
