@@ -29,7 +29,6 @@ from tqdm import tqdm
 
 from palpate.offline.fem.choose_mesh import with_mesh
 from palpate.offline.fem.mesh import mesh_quality
-from palpate.offline.fem.model import POINTWISE
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.footprint_models import compile_query, train_patch
 from palpate.offline.reduce.join import join
@@ -51,7 +50,7 @@ from palpate.shared.artifact import ArtifactError, read_artifact
 from palpate.shared.local_models import Estimator, LocalModels
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.model import ReducedModel
-from palpate.shared.scene import Scene, SceneError, Size
+from palpate.shared.scene import Scene, Size
 
 Array = NDArray[np.float64]
 
@@ -83,18 +82,8 @@ def train(
         Processes; one per core if absent.
     force : bool
         Train although the artifact is of this very scene and of this code.
-
-    Raises
-    ------
-    SceneError
-        If the scene's element cannot be reduced.
     """
     started, untrained = time.perf_counter(), find_scene(scene)
-    if untrained.geometry.element not in POINTWISE:
-        raise SceneError(
-            f"geometry.element: points of {untrained.geometry.element} share a dilatation, which "
-            f"no cubature samples; train with {' or '.join(POINTWISE)} (hex20 does not lock)"
-        )
     path, key = out or default_artifact(untrained), content_key(untrained)
     if not force and is_of(path, key):
         tqdm.write(f"{path}: up to date; --force trains it again", file=sys.stderr)

@@ -33,13 +33,8 @@ from palpate.shared.errors import PalpateError
 from palpate.shared.mechanics.laws import AnyTissue
 from palpate.shared.part import Fraction, Part, Positive
 
-ElementName = Literal["hex8", "hex8-mean-dilatation", "hex8-fbar", "hex20"]
-Element = Annotated[
-    ElementName,
-    Field(
-        description="hex20 or hex8, which locks; full model only: hex8-mean-dilatation, hex8-fbar"
-    ),
-]
+ElementName = Literal["hex8", "hex20"]
+Element = Annotated[ElementName, Field(description="hex20, or hex8, which locks")]
 
 Division = Annotated[int, Field(ge=1, le=500)]
 Divisions = tuple[Division, Division, Division]

@@ -62,7 +62,7 @@ class FullProblem:
     def __init__(self, scene: Scene, mesh: Mesh | None = None) -> None:
         self.scene = scene
         self.mesh = build_mesh(scene) if mesh is None else mesh
-        self.model = FullModel(self.mesh, scene.geometry.element, scene.tissue)
+        self.model = FullModel(self.mesh, scene.tissue)
         self.surface: Surface = accessible_surface(self.mesh)
         self._nodal = np.zeros(len(self.mesh.nodes))
 
