@@ -27,7 +27,8 @@ from scipy.interpolate import RBFInterpolator
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
-from palpate.offline.fem.choose_mesh import with_mesh
+from palpate.offline.choose.mesh import with_mesh
+from palpate.offline.choose.size import Trial, choose, ladder, try_patch
 from palpate.offline.fem.mesh import mesh_quality
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.footprint_models import compile_query, train_patch
@@ -36,7 +37,6 @@ from palpate.offline.reduce.layout import Layout
 from palpate.offline.reduce.load_range import SEARCHES, ask, bearable_shares, load_range, untested
 from palpate.offline.reduce.ritz import region
 from palpate.offline.reduce.sampling import fewer, spacing_count, spread_points, triangle_areas
-from palpate.offline.reduce.size import Trial, choose, ladder, try_patch
 from palpate.offline.run.forecast import forecast
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.workers import Checkpoint, Tasks, content_key, open_scene, run, worker_pool

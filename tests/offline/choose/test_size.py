@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from palpate.offline.reduce.sampling import fewer
-from palpate.offline.reduce.size import (
+from palpate.offline.choose.size import (
     LADDER,
     MARGIN,
     RUNG,
@@ -14,6 +13,7 @@ from palpate.offline.reduce.size import (
     choose,
     ladder,
 )
+from palpate.offline.reduce.sampling import fewer
 from palpate.shared.mechanics.neo_hookean import NeoHookeanTissue
 from palpate.shared.scene import Budget, Size, Tolerance
 
