@@ -131,10 +131,9 @@ class LocalTrainer:
         press(own.solver, load.pressure, self._radius)
         if own.outcome.status.item() != newton.CONVERGED:
             return None
-        scratch = own.scratch
-        found = own.warm.q[0], scratch.load, own.warm.inverse[0]
-        features = scratch.features, scratch.tangent_features
-        return Sample(*(values.copy() for values in (*found, *features)))
+        warm, scratch = own.warm, own.scratch
+        found = warm.q[0], scratch.load, warm.inverse[0], scratch.features, scratch.tangent_features
+        return Sample(*map(np.copy, found))
 
     def answers(self, draw: Callable[[], Load], count: int) -> list[Sample]:
         """Answers to drawn loads; those that it does not solve are left out."""

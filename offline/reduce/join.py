@@ -75,9 +75,8 @@ def _joined(parts: Sequence[Tables], **own: Any) -> Tables:
 
 def neighbours(models: LocalModels, reach: float) -> NDArray[np.int32]:
     """Pairs (n, 2) of patches whose centres are at most ``reach`` mm apart, the smaller first."""
-    pairs = cKDTree(models.centres).query_pairs(reach, output_type="ndarray")
-    pairs = np.sort(pairs, axis=1)[np.lexsort((pairs.max(axis=1), pairs.min(axis=1)))]
-    return pairs.astype(np.int32)
+    pairs = sorted(cKDTree(models.centres).query_pairs(reach))
+    return np.array(pairs, np.int32).reshape(-1, 2)
 
 
 def overlaps(
