@@ -13,10 +13,7 @@ MAKERS = {"reduce/footprint_models.py", "run/streams.py"}
 FOLDER = Path(palpate.offline.__file__).parent
 SOURCES = {
     path.relative_to(FOLDER).as_posix(): path.read_text()
-    for part in (
-        "train.py",
-        *(f"{name}/*.py" for name in ("choose", "fem", "reduce", "run", "validate")),
-    )
+    for part in ("train.py", "choose/*.py", "fem/*.py", "reduce/*.py", "run/*.py", "validate/*.py")
     for path in FOLDER.glob(part)
 }
 """Text of all that takes part in training."""
