@@ -14,11 +14,11 @@ from scipy.sparse import csr_matrix
 
 from palpate.offline.fem import assembly
 from palpate.offline.fem.linear_solver import SparseSolver, sparse_solver
-from palpate.offline.fem.mesh import Mesh
 from palpate.offline.fem.potential import Potential
 from palpate.offline.fem.terms import AppliedLoad, DeadLoad, Past, PastStress, Term, advanced
 from palpate.shared.errors import PalpateError
 from palpate.shared.geometry.quadrature import volume_quadrature
+from palpate.shared.local_models import Mesh
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.laws import AnyTissue, law_of
 from palpate.shared.mechanics.tensors import SYMMETRIC
