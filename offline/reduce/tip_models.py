@@ -78,7 +78,7 @@ class TipTrainer:
     """One local model of the tip that solves training positions by the compiled query.
 
     The points of ``tangent``, of the same modes, serve the tangent if given.  With the deviatoric
-    part (1, m, m) of the rest stiffness in the modes the tissue remembers.
+    part of the rest stiffness the tissue remembers.
     """
 
     def __init__(
@@ -87,15 +87,14 @@ class TipTrainer:
         models: LocalModels,
         tips: LocalTips,
         tangent: LocalTips | None = None,
-        deviatoric: NDArray[np.float32] | None = None,
     ) -> None:
         self._prony = problem.model.prony
         self.models = touch_models(problem.body, models, tips, tangent)
         self.radius = problem.body.tip.radius
         self.past: Elastic | Remembering = Elastic()
-        if deviatoric is not None:
+        if tips.deviatoric is not None:
             points = self.models.points.weights.shape[1]
-            self.past = remembering(deviatoric, len(self._prony), points)
+            self.past = remembering(tips.deviatoric, len(self._prony), points)
             self._memory = opened(
                 self.past.records[0], len(self._prony), tips.modes.shape[2], points
             )
@@ -212,11 +211,10 @@ def train_tip(
     count, most, nodal = SIZES_IN_TIME if model.prony else SIZES
     space = _generous(problem.body, models, orthonormal, nodal)
     everywhere = _untrained(space, weights)
-    trainer = TipTrainer(
-        problem, models, everywhere,
-        with_points(everywhere, models.points, models.weights),
-        deviatoric_of(model, models, space) if model.prony else None,
-    )  # fmt: skip
+    if model.prony:
+        everywhere = replace(everywhere, deviatoric=deviatoric_of(model, models, space))
+    tangent = with_points(everywhere, models.points, models.weights)
+    trainer = TipTrainer(problem, models, everywhere, tangent)
     pressed = _press(trainer, patch, rng)
     if not pressed:
         raise NoEquilibrium("endoscope.tip: no equilibrium found under it; is the load too large?")
@@ -256,7 +254,8 @@ def compile_tip_query(problem: FullProblem, models: LocalModels) -> None:
     over = surface.vertices[0] + 0.9 * problem.body.tip.radius * surface.normals[0]
     TipTrainer(problem, models, tips).solve(over)
     if problem.model.prony:
-        TipTrainer(problem, models, tips, None, np.zeros((1, 4, 4), np.float32)).solve(over)
+        soft = np.zeros((1, 4, 4), np.float32)
+        TipTrainer(problem, models, replace(tips, deviatoric=soft)).solve(over)
 
 
 def _untrained(modes: NDArray[np.floating[Any]], weights: Array) -> LocalTips:
