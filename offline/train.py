@@ -4,7 +4,7 @@
 2. Regions: nonlinear Ritz vectors of many footprints and a common basis for them.
 3. Patches: modes, cubature and first guess of every local model.
 4. The reduced model, pressed everywhere, lowers the range where the tissue gives way.
-5. Full solutions of random loads, which calibrate the error estimate, and others, which validate.
+5. Full solutions of random queries, each half of which validates the error estimate of the other.
 
 Every finished task is on disk before it counts; see ``run.workers``.
 """
@@ -14,7 +14,7 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
@@ -25,61 +25,35 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 from scipy.spatial import cKDTree
-from scipy.special import betaincinv
 from tqdm import tqdm
 
-from palpate.offline.fem.choose_mesh import (
-    MOST_DOFS_REFINED,
-    mesh_error,
-    mesh_error_document,
-    with_mesh,
-)
+from palpate.offline.choose.mesh import with_mesh
+from palpate.offline.choose.size import Trial, choose, ladder, try_patch
 from palpate.offline.fem.mesh import mesh_quality
-from palpate.offline.fem.model import POINTWISE
-from palpate.offline.fem.problem import FullProblem, Load
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.footprint_models import compile_query, train_patch
 from palpate.offline.reduce.join import join
 from palpate.offline.reduce.layout import Layout
-from palpate.offline.reduce.limit_points import (
-    Rows,
-    ask,
-    lowered_depths,
-    lowered_limits,
-    untested,
-)
-from palpate.offline.reduce.load_range import load_range
+from palpate.offline.reduce.load_range import SEARCHES, ask, bearable_shares, load_range, untested
 from palpate.offline.reduce.ritz import region
 from palpate.offline.reduce.sampling import fewer, spacing_count, spread_points, triangle_areas
-from palpate.offline.reduce.size import Trial, choose, ladder, try_patch
 from palpate.offline.run.forecast import forecast
 from palpate.offline.run.streams import Stage, stream
-from palpate.offline.run.workers import (
-    Checkpoint,
-    Tasks,
-    content_key,
-    open_scene,
-    resume,
-    run,
-    worker_pool,
-)
+from palpate.offline.run.workers import Checkpoint, Tasks, content_key, open_scene, run, worker_pool
 from palpate.offline.run.writing import provenance, write_model
 from palpate.offline.scenes import default_artifact, find_scene
 from palpate.offline.validate.against_full import reference_task, write_rows
 from palpate.offline.validate.calibrate import calibrate, calibrate_by_halves
 from palpate.offline.validate.compare import Row, compare, summarise
-from palpate.offline.validate.kinds import KINDS, LOADS, Kind
+from palpate.offline.validate.kinds import KINDS, Kind
 from palpate.shared.artifact import ArtifactError, read_artifact
 from palpate.shared.local_models import Estimator, LocalModels
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.model import ReducedModel
-from palpate.shared.scene import Scene, SceneError, Size
+from palpate.shared.scene import Scene, Size
 
 Array = NDArray[np.float64]
 
-
-BATCH, LEAST = 60, 300
-"""Full solutions between two looks at whether they suffice, and the least that calibrate at the
-usual tolerance."""
 
 TRIAL_PATCHES = 8
 
@@ -91,8 +65,6 @@ TIP_SAMPLES = 300
 
 MOST_HISTORIES = 48
 """Full histories of each kind that validate and calibrate, a quarter of ``samples`` at most."""
-
-REFINED_LOADS = 4
 
 
 def train(
@@ -110,18 +82,8 @@ def train(
         Processes; one per core if absent.
     force : bool
         Train although the artifact is of this very scene and of this code.
-
-    Raises
-    ------
-    SceneError
-        If the scene's element cannot be reduced.
     """
     started, untrained = time.perf_counter(), find_scene(scene)
-    if untrained.geometry.element not in POINTWISE:
-        raise SceneError(
-            f"geometry.element: points of {untrained.geometry.element} share a dilatation, which "
-            f"no cubature samples; train with {' or '.join(POINTWISE)} (hex20 does not lock)"
-        )
     path, key = out or default_artifact(untrained), content_key(untrained)
     if not force and is_of(path, key):
         tqdm.write(f"{path}: up to date; --force trains it again", file=sys.stderr)
@@ -173,12 +135,12 @@ class Pipeline:
         size, training = self.scene.training.size, {"mesh": mesh_quality(self.problem.mesh)}
         if size is None:
             scene, attempt = self.scene, partial(self._trial, limits)
-            choice = choose(ladder(scene.tissue), scene.tolerance, scene.budget, attempt)
-            size, training["choice"] = choice.size, choice.document
-            tqdm.write(f"size: {size}\n{choice.why}", file=sys.stderr)
+            sizes = ladder(scene.tissue)
+            size, training["choice"] = choose(sizes, scene.tolerance, scene.budget, attempt)
+            tqdm.write(f"size: {size}\n{training['choice']['why']}", file=sys.stderr)
         if mesh_choice is not None:
             training["mesh_choice"] = mesh_choice
-        layout = Layout.of(self.scene, self.surface, limits, size)
+        layout = Layout(self.scene, self.surface, limits, size)
         models = self._local_models(layout)
         limits = self._lowered(models, limits)
         model = untested(self.problem, models, limits)
@@ -189,8 +151,6 @@ class Pipeline:
             if not kind.lacks(models):
                 estimators[kind.name], tables[kind] = self._validate(kind, model)
                 documents[kind.document] = summarise(kind, tables[kind])
-        if self.problem.mesh.nodes.size <= MOST_DOFS_REFINED:
-            documents["mesh_error"] = self._mesh_error(limits)
         training |= {"seconds": self.seconds, "layout": self._describe(layout, models)}
         self.provenance["wall_seconds"] = round(time.perf_counter() - self.started, 1)
         write_model(path, model, estimators, documents)
@@ -214,7 +174,7 @@ class Pipeline:
 
     def _trial(self, limits: Array, size: Size) -> Trial:
         """Try a size on patches spread over the surface."""
-        layout = Layout.of(self.scene, self.surface, limits, size)
+        layout = Layout(self.scene, self.surface, limits, size)
         rng = stream(self.scene.seed, Stage.TRIAL_PATCHES)
         places = spread_points(self.surface, min(TRIAL_PATCHES, len(layout.centres)), rng)
         chosen = np.unique(cKDTree(layout.centres).query(places)[1])
@@ -242,22 +202,26 @@ class Pipeline:
     def _lowered(self, models: LocalModels, limits: Array) -> Array:
         """Load range that ends before the tissue gives way, or slips off the tip."""
         asking = partial(self._ask, self.checkpoint.store("models", (models, limits)))
-        model = untested(self.problem, models, limits)
-        lowered = lowered_limits(model, asking, stream(self.scene.seed, Stage.GIVING_WAY))
-        _tell("giving way", lowered[:, 0] / limits[:, 0])
-        if models.tips is not None:
-            rng = stream(self.scene.seed, Stage.SLIPPING_OFF)
-            lowered[:, TIP_DEPTH] = lowered_depths(model, asking, rng)[:, TIP_DEPTH]
-            _tell("slipping off", lowered[:, TIP_DEPTH] / limits[:, TIP_DEPTH])
+        model, lowered = untested(self.problem, models, limits), limits.copy()
+        for search in SEARCHES:
+            if search.field == TIP_DEPTH and not model.has_tip:
+                continue
+            shares = bearable_shares(search, model, asking, stream(self.scene.seed, search.stage))
+            lowered[:, search.field] *= shares
+            tqdm.write(
+                f"{search.title}: load range lowered on {np.mean(shares < 1):.1%} of the surface, "
+                f"to {shares.min():.0%} of what it was",
+                file=sys.stderr,
+            )
         return lowered
 
-    def _ask(self, path: Path, title: str, function: Callable[..., float], rows: Rows) -> Array:
-        """Values (k,) of a function of the reduced model; see ``limit_points.ask``."""
+    def _ask(self, path: Path, title: str, function: Callable[..., float], at: list[Any]) -> Array:
+        """Values (k,) of a function of the reduced model; see ``load_range.ask``."""
         tasks = {
-            f"ask-{self.asked + i}": (ask, path, function, rows[i : i + PLACES])
-            for i in range(0, len(rows), PLACES)
+            f"ask-{self.asked + i}": (ask, path, function, at[i : i + PLACES])
+            for i in range(0, len(at), PLACES)
         }
-        self.asked += len(rows)
+        self.asked += len(at)
         return np.concatenate(self._stage(title, tasks))
 
     def _validate(self, kind: Kind, model: ReducedModel) -> tuple[Estimator, list[Row]]:
@@ -265,59 +229,28 @@ class Pipeline:
 
         What validation says of the estimate is of one calibrated on the other half of the queries.
         """
-        count = TIP_SAMPLES if kind.tip else self.scene.training.samples
+        samples = self.scene.training.samples
+        count = TIP_SAMPLES if kind.tip else fewer(samples, self.scene.tolerance)
         if kind.in_time:
-            count = min(MOST_HISTORIES, self.scene.training.samples // 4)
+            count = min(MOST_HISTORIES, samples // 4)
         queries = kind.random(model, count, stream(self.scene.seed, kind.stage))
-        rows: list[Row] = []
-        size = BATCH if kind is LOADS else len(queries)
-        for start in range(0, len(queries), size):
-            batch = queries[start:][:size]
-            tasks = {
-                f"{kind.name}-{start + i}": reference_task(model, query)
-                for i, query in enumerate(batch)
-            }
-            rows += [
-                compare(kind, self.problem, model, query, found)
-                for query, found in zip(batch, self._stage(kind.title, tasks), strict=True)
-                if found is not None
-            ]
-            if kind is LOADS and self._suffice(rows):
-                break
+        tasks = {
+            f"{kind.name}-{i}": reference_task(model, query) for i, query in enumerate(queries)
+        }
+        rows = [
+            compare(kind, self.problem, model, query, found)
+            for query, found in zip(queries, self._stage(kind.title, tasks), strict=True)
+            if found is not None
+        ]
         fit = partial(calibrate, share=kind.coverage, damping=kind.damping)
         return calibrate_by_halves([row.known for row in rows], fit), rows
-
-    def _suffice(self, rows: Sequence[Row]) -> bool:
-        """Whether 95 % of all loads are within tolerance, with as much confidence.
-
-        The bound on the share of others is that of Clopper and Pearson.
-        """
-        tolerance = self.scene.tolerance
-        missed = sum(
-            not row.table["converged"]
-            or row.table["displacement"] > tolerance.displacement
-            or row.table["von_mises"] > tolerance.von_mises
-            for row in rows
-        )
-        enough = len(rows) >= fewer(LEAST, tolerance)
-        return bool(enough and betaincinv(missed + 1, len(rows) - missed, 0.95) <= 0.05)
-
-    def _mesh_error(self, limits: Array) -> dict[str, Any]:
-        """Press at half the range on finer and other meshes."""
-        rng = stream(self.scene.seed, Stage.MESH_ERROR)
-        tasks = {}
-        count = fewer(REFINED_LOADS, self.scene.tolerance)
-        for i, point in enumerate(spread_points(self.surface, count, rng)):
-            x, normal, _, fields = self.surface.locate(point, limits)
-            tasks[f"mesh-{i}"] = mesh_error, Load(x, -normal, float(fields[0]) / 2)
-        return mesh_error_document(self._stage("mesh error", tasks))
 
     # --- pieces --------------------------------------------------------------------------------
 
     def _stage(self, title: str, tasks: Tasks) -> list[Any]:
         """Run the tasks that are not in the checkpoint yet; return all results in their order."""
         started = time.perf_counter()
-        results = resume(title, self.executor, self.checkpoint, tasks)
+        results = self.checkpoint.resume(title, self.executor, tasks)
         seconds = self.seconds.get(title, 0.0) + time.perf_counter() - started
         self.seconds[title] = round(seconds, 2)
         return list(results.values())
@@ -335,12 +268,3 @@ class Pipeline:
             "cubature_points_max": int(points.max()),
             "quadrature_points": self.problem.model.weights.size,
         }
-
-
-def _tell(title: str, share: Array) -> None:
-    """Say where a search has lowered limits, and to which share of what they were."""
-    tqdm.write(
-        f"{title}: load range lowered on {np.mean(share < 1):.1%} of the surface, "
-        f"to {share.min():.0%} of what it was",
-        file=sys.stderr,
-    )

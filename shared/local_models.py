@@ -30,14 +30,20 @@ Numbers = NDArray[np.int32]
 
 
 @dataclass(frozen=True)
-class Body:
-    """Mesh and tissue of a scene, as both sides see them."""
+class Mesh:
+    """A body of n nodes, e elements and f boundary faces, outward by the right-hand rule."""
 
     nodes: Annotated[Array, "nodes", "mm", "nodes (n, 3), dof = 3 node + axis"]
     elements: Annotated[Numbers, "elements", "1", "nodes of hexahedra (e, 8 or 20), VTK order"]
     faces: Annotated[Numbers, "faces", "1", "nodes of boundary faces (f, 4 or 8), VTK"]
     clamped: Annotated[NDArray[np.bool_], "clamped", "1", "nodes held fixed (n,)"]
     accessible: Annotated[NDArray[np.bool_], "accessible", "1", "faces an endoscope can touch (f,)"]
+
+
+@dataclass(frozen=True)
+class Body(Mesh):
+    """Mesh and tissue of a scene, as both sides see them."""
+
     law: Law  # parameters of the elements (e,)
     tip: Tip
 

@@ -33,13 +33,8 @@ from palpate.shared.errors import PalpateError
 from palpate.shared.mechanics.laws import AnyTissue
 from palpate.shared.part import Fraction, Part, Positive
 
-ElementName = Literal["hex8", "hex8-mean-dilatation", "hex8-fbar", "hex20"]
-Element = Annotated[
-    ElementName,
-    Field(
-        description="hex20 or hex8, which locks; full model only: hex8-mean-dilatation, hex8-fbar"
-    ),
-]
+ElementName = Literal["hex8", "hex20"]
+Element = Annotated[ElementName, Field(description="hex20, or hex8, which locks")]
 
 Division = Annotated[int, Field(ge=1, le=500)]
 Divisions = tuple[Division, Division, Division]
@@ -186,6 +181,16 @@ class Size(Part):
     )
     region_modes: int = Field(ge=4, le=2000, description="number of modes of a region")
 
+    @field_validator("region_modes")
+    @classmethod
+    def _hold_those_of_local_models(cls, region_modes: int, info: ValidationInfo) -> int:
+        modes = info.data.get("modes", 0)
+        if region_modes < modes:
+            raise PydanticCustomError(
+                "modes", "must be at least the {modes} of modes", {"modes": modes}
+            )
+        return region_modes
+
 
 class Training(Part):
     """How the reduced model is trained."""
@@ -196,7 +201,7 @@ class Training(Part):
     region_spacing: Positive = _in_radii(3.75, "distance of the regions that share a basis, mm")
     blend: Positive = _in_radii(0.1, "width over which neighbouring local models blend, mm")
     samples: int = Field(
-        360, ge=60, description="most full solutions to validate by; fewer if they suffice"
+        300, ge=60, description="full solutions to validate by; fewer for a looser tolerance"
     )
     size: Size | None = _chosen(
         "the smallest that meets the tolerance", "how large the reduced model is"

@@ -6,8 +6,6 @@ Nodes, elements and faces are numbered by the lattice, first index slowest; degr
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,6 +20,7 @@ from palpate.shared.geometry.elements import (
     shape,
 )
 from palpate.shared.geometry.surface import Surface
+from palpate.shared.local_models import Mesh
 from palpate.shared.scene import Extrusion, Patch, Scene, SceneError, divisions_of
 
 Floats = NDArray[np.float64]
@@ -33,17 +32,6 @@ HEX_FACES = ((0, 4, 7, 3), (1, 2, 6, 5), (0, 1, 5, 4), (3, 7, 6, 2), (0, 3, 2, 1
 
 SUBDIVISIONS = {4: 2, 8: 4}
 """Squares per face edge: a straight face needs few, a curved one enough to be smooth to 0.01 mm."""
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """A body of n nodes, e elements and f boundary faces."""
-
-    nodes: Floats  # (n, 3) mm
-    elements: Ints  # (e, 8) VTK hexahedra or (e, 20) quadratic hexahedra
-    faces: Ints  # (f, 4) VTK quads or (f, 8) quadratic quads, outward by the right-hand rule
-    clamped: NDArray[np.bool_]  # (n,) nodes held fixed
-    accessible: NDArray[np.bool_]  # (f,) faces an endoscope can touch
 
 
 def build_mesh(scene: Scene) -> Mesh:

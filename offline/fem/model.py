@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,22 +14,17 @@ from scipy.sparse import csr_matrix
 
 from palpate.offline.fem import assembly
 from palpate.offline.fem.linear_solver import SparseSolver, sparse_solver
-from palpate.offline.fem.mesh import Mesh
 from palpate.offline.fem.potential import Potential
 from palpate.offline.fem.terms import AppliedLoad, DeadLoad, Past, PastStress, Term, advanced
 from palpate.shared.errors import PalpateError
 from palpate.shared.geometry.quadrature import volume_quadrature
+from palpate.shared.local_models import Mesh
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.laws import AnyTissue, law_of
 from palpate.shared.mechanics.tensors import SYMMETRIC
 from palpate.shared.mechanics.viscosity import step_weights
-from palpate.shared.scene import ElementName, Scene
 
 Array = NDArray[np.float64]
-
-POINTWISE: tuple[ElementName, ...] = ("hex8", "hex20")
-"""Elements whose points stand alone. Where they share a dilatation, a cubature cannot sample them
-one by one, so only the full model has those."""
 
 TOLERANCE = 1e-9
 """Residual of an equilibrium relative to the load or to the force of the past, whichever is larger,
@@ -74,14 +68,8 @@ class FullModel:
     """Full model of one mesh and tissue."""
 
     mesh: Mesh
-    element: ElementName
     tissue: AnyTissue
     terms: tuple[Term, ...] = ()  # of the tissue beside its elasticity, whatever the load
-
-    @classmethod
-    def of(cls, scene: Scene, mesh: Mesh) -> FullModel:
-        """Full model of a scene on its mesh."""
-        return cls(mesh, scene.geometry.element, scene.tissue)
 
     def __post_init__(self) -> None:
         mesh = self.mesh
@@ -89,6 +77,7 @@ class FullModel:
         self.gradients, self.weights = volume_quadrature(mesh.nodes, mesh.elements, 2)
         self.connectivity = np.ascontiguousarray(mesh.elements, dtype=np.int32)
         self.law = law_of(self.tissue, len(mesh.elements))
+        self._elements = self.connectivity, self.gradients, self.weights, self.law
         self.prony = self.tissue.prony
         self.slots, self.pattern = self._sparsity()
         self.solver = sparse_solver(self.pattern)
@@ -109,15 +98,6 @@ class FullModel:
             np.zeros((len(self.mesh.nodes), 3)),
             np.zeros((len(self.prony) + 1, *self.weights.shape, SYMMETRIC)),
         )
-
-    @cached_property
-    def _theta(self) -> tuple[Array, Array]:
-        """Gradients and weights of the points whose J make up an element's dilatation."""
-        weights = self.weights / self.weights.sum(axis=1, keepdims=True)
-        if self.element == "hex8-mean-dilatation":
-            return self.gradients, weights
-        mean = np.einsum("eq,eqai->eai", weights, self.gradients)
-        return np.ascontiguousarray(mean[:, None]), np.ones((len(mean), 1))
 
     def _dofs(self, nodes: NDArray[np.int32]) -> NDArray[np.int64]:
         """Places (p, 3 k) among the free dofs of those of nodes (p, k); -1 is clamped."""
@@ -149,15 +129,6 @@ class FullModel:
         slots = np.searchsorted(filled, rows * n + cols)
         return np.where((rows >= 0) & (cols >= 0), slots, -1).astype(np.int32)
 
-    @property
-    def _elasticity(self) -> tuple[Any, Any, tuple[Any, ...]]:
-        """Loops of ``assembly`` over the elements, for force and stiffness; what both need."""
-        mesh = self.connectivity, self.gradients, self.weights
-        if self.element in POINTWISE:
-            return assembly.standard_residual, assembly.standard_tangent, (*mesh, self.law)
-        own = *mesh, *self._theta, self.law
-        return assembly.dilatation_residual, assembly.dilatation_tangent, own
-
     def internal(self, displacement: Array, force: Array) -> tuple[float, float]:
         """Write the internal force (3 nodes,) mN of a displacement (3 nodes,) mm.
 
@@ -167,8 +138,7 @@ class FullModel:
             Stored energy (mN mm) and smallest det F.
         """
         force[:] = 0.0
-        loop, _, elements = self._elasticity
-        energy, smallest = loop(*elements, displacement, force)
+        energy, smallest = assembly.elastic_residual(*self._elements, displacement, force)
         if smallest > 0.0:
             energy += sum(term.add_force(displacement, force) for term in self.terms)
         return energy, smallest
@@ -206,8 +176,7 @@ class FullModel:
 
     def add_stiffness(self, displacement: Array, data: Array) -> None:
         """Add the tangent stiffness of the tissue; see ``terms.DeadLoad``."""
-        _, loop, elements = self._elasticity
-        loop(*elements, displacement, self.slots, data)
+        assembly.elastic_tangent(*self._elements, displacement, self.slots, data)
         for term in self.terms:
             term.add_stiffness(displacement, data, False)
 

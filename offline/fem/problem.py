@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.fem.mesh import Mesh, accessible_surface, build_mesh
+from palpate.offline.fem.mesh import accessible_surface, build_mesh
 from palpate.offline.fem.model import Equilibrium, FullModel, NoEquilibrium
 from palpate.offline.fem.terms import DeadLoad, Past, TipContact, TipLoad
-from palpate.shared.artifact import Artifact
+from palpate.shared.artifact import Artifact, values_of
 from palpate.shared.geometry.quadrature import stress_recovery
 from palpate.shared.geometry.surface import Surface
-from palpate.shared.local_models import Body
+from palpate.shared.local_models import Body, Mesh
 from palpate.shared.mechanics.footprint import footprint
 from palpate.shared.mechanics.sphere import tip_of, tip_surface
 from palpate.shared.mechanics.stress import StressRecovery, nodal_von_mises
@@ -62,24 +62,20 @@ class FullProblem:
     def __init__(self, scene: Scene, mesh: Mesh | None = None) -> None:
         self.scene = scene
         self.mesh = build_mesh(scene) if mesh is None else mesh
-        self.model = FullModel.of(scene, self.mesh)
+        self.model = FullModel(self.mesh, scene.tissue)
         self.surface: Surface = accessible_surface(self.mesh)
         self._nodal = np.zeros(len(self.mesh.nodes))
 
     @classmethod
     def of_artifact(cls, artifact: Artifact) -> FullProblem:
         """Full model on the very mesh that an artifact was trained on."""
-        return cls(
-            parse_scene(artifact.scene),
-            Mesh(**{part.name: artifact.arrays[part.name] for part in fields(Mesh)}),
-        )
+        return cls(parse_scene(artifact.scene), Mesh(**values_of(Mesh, artifact.arrays)))
 
     @cached_property
     def body(self) -> Body:
         """Mesh and tissue as the reduced model sees them."""
-        parts = {part.name: getattr(self.mesh, part.name) for part in fields(Mesh)}
         tip = tip_of(self.scene.endoscope.radius, self.scene.tissue.young)
-        return Body(**parts, law=self.model.law, tip=tip)
+        return Body(**vars(self.mesh), law=self.model.law, tip=tip)
 
     @cached_property
     def beyond_clamped_layer(self) -> NDArray[np.bool_]:

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from palpate.offline.fem.model import POINTWISE, FullModel
+from palpate.offline.fem.model import FullModel
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.terms import Past
 from palpate.offline.methods.method import Answer, Case, Method
@@ -165,11 +165,6 @@ class Galerkin(Method):
         Every quadrature point if absent, which in time it must be.
     accurate : float
         See ``TOLERANCE``.
-
-    Raises
-    ------
-    ValueError
-        If the points of an element cannot be summed one by one.
     """
 
     def __init__(
@@ -181,8 +176,6 @@ class Galerkin(Method):
         accurate: float = TOLERANCE,
     ) -> None:
         model, m = problem.model, basis.shape[1]
-        if model.element not in POINTWISE:
-            raise ValueError(f"{model.element}: its points share a dilatation")
         cubature = cubature or Cubature.full(model)
         self.points, self._accurate = cubature.points, accurate
         super().__init__(problem, m, f"{m} modes, {len(self.points)} points")

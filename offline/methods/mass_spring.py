@@ -104,7 +104,7 @@ class MassSpring(Fitted):
     def __init__(self, problem: FullProblem, factor: float) -> None:
         super().__init__(problem, factor)
         elastic = self.other.scene.tissue.model_copy(update={"prony": ()})
-        self.network = Springs(self.other.mesh, "hex8", elastic)
+        self.network = Springs(self.other.mesh, elastic)
         self.label = f"{len(self.network.ends)} springs"
         self.fit()
 

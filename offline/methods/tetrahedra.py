@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix
 
 from palpate.offline.fem.linear_solver import sparse_solver
-from palpate.offline.fem.mesh import Mesh
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.methods.full import Remeshed, lattice
 from palpate.offline.methods.method import Answer, Case
 from palpate.offline.reduce.sampling import random_points
 from palpate.shared.errors import PalpateError
+from palpate.shared.local_models import Mesh
 from palpate.shared.mechanics.tissue import lame
 
 Array = NDArray[np.float64]

@@ -10,24 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.offline.fem.problem import FullProblem, Load
-from palpate.offline.reduce.cubature import (
-    by_point,
-    compress,
-    damped_fit,
-    fit_residual,
-    nonlinear_forces,
-    nonnegative,
-    points_alone,
-    training_forces,
-)
+from palpate.offline.reduce import cubature
 from palpate.offline.reduce.join import deviatoric_of, half, nodal_modes, with_points
 from palpate.offline.reduce.layout import Patch
 from palpate.offline.reduce.ritz import RITZ_VECTORS, Footprint, Region, local_modes, whole_numbers
 from palpate.offline.reduce.sampling import cone, fewer, tangents
-from palpate.offline.reduce.tip_models import compile_tip_query, train_tip
+from palpate.offline.reduce.tip_models import compile_tip_query, endless, train_tip
 from palpate.shared.local_models import LocalModels, ViscousModels
 from palpate.shared.mechanics import newton
-from palpate.shared.mechanics.footprint import LIMIT_FIELDS, pressure_limit
+from palpate.shared.mechanics.footprint import pressure_limit
 from palpate.shared.reduced.features import (
     CHANGES,
     CHANGING,
@@ -74,9 +65,6 @@ GUESS_LOADS, GUESS_DAMPING = 500, 1e-2
 TANGENT_LOADS = 100
 """Equilibria that the first guess is fitted to, and those of them at which the tangent is looked
 at; the damping of both fits."""
-
-NO_LIMIT = 1e100
-"""Largest pressure, kPa, that a local model in training answers for."""
 
 EQUATIONS = 300
 """Combinations of the reduced internal force that cubature is fitted to.
@@ -128,14 +116,11 @@ class LocalTrainer:
     """One local model by itself, which solves training loads by the compiled query."""
 
     def __init__(self, problem: FullProblem, models: LocalModels) -> None:
-        scene, surface = problem.scene, problem.surface
-        tables = press_models(problem.body, models, scene)
-        self.rows, self.law = points_alone(tables.points)
-        self._radius = scene.endoscope.radius
-        no_limit = np.tile(np.eye(LIMIT_FIELDS)[1:4].sum(0), (len(surface.vertices), 1))
-        no_limit[:, 0] = NO_LIMIT
+        tables = press_models(problem.body, models, problem.scene)
+        self.rows, self.law = cubature.points_alone(tables.points)
+        self._radius = problem.scene.endoscope.radius
         self._workspace = Workspace(
-            tables, surface.ground(no_limit), np.zeros((2, PRESS_FEATURES)), Elastic()
+            tables, endless(problem.surface), np.zeros((2, PRESS_FEATURES)), Elastic()
         )
 
     def solve(self, load: Load) -> Sample | None:
@@ -146,15 +131,13 @@ class LocalTrainer:
         press(own.solver, load.pressure, self._radius)
         if own.outcome.status.item() != newton.CONVERGED:
             return None
-        scratch = own.scratch
-        found = own.warm.q[0], scratch.load, own.warm.inverse[0]
-        features = scratch.features, scratch.tangent_features
-        return Sample(*(values.copy() for values in (*found, *features)))
+        warm, scratch = own.warm, own.scratch
+        found = warm.q[0], scratch.load, warm.inverse[0], scratch.features, scratch.tangent_features
+        return Sample(*map(np.copy, found))
 
     def answers(self, draw: Callable[[], Load], count: int) -> list[Sample]:
         """Answers to drawn loads; those that it does not solve are left out."""
-        samples = [self.solve(draw()) for _ in range(count)]
-        return [sample for sample in samples if sample is not None]
+        return [sample for _ in range(count) if (sample := self.solve(draw())) is not None]
 
     def tangent_changes(self, states: Array) -> Array:
         """Tangents in states (k, r) less that at rest, (k, r, r)."""
@@ -200,7 +183,7 @@ def train_patch(
     most = patch.size.cubature_points
     forces = _training_forces(galerkin, loads)[: len(weights)]
     equations = max(most, fewer(EQUATIONS, scene.tolerance))
-    points, chosen = nonnegative(*compress(forces, equations, rng), most)
+    points, chosen = cubature.nonnegative(*cubature.compress(forces, equations, rng), most)
     models = with_points(models, points, chosen * weights[points])
     defect = _fit_defect(galerkin, LocalTrainer(problem, models), loads)
     models = replace(models, defect=half(defect))
@@ -283,8 +266,8 @@ def _training_forces(trainer: LocalTrainer, loads: RandomLoads) -> NDArray[np.fl
     """
     samples = trainer.answers(loads.training, fewer(LOADS, loads.scene.tolerance))
     states = [(s.q, np.linalg.cholesky(s.compliance) / np.linalg.norm(s.q), None) for s in samples]
-    return training_forces(
-        by_point(trainer.rows), trainer.law, states, SKETCH, RESPONSES, loads.rng
+    return cubature.training_forces(
+        cubature.by_point(trainer.rows), trainer.law, states, SKETCH, RESPONSES, loads.rng
     )
 
 
@@ -292,10 +275,12 @@ def _fit_defect(galerkin: LocalTrainer, reduced: LocalTrainer, loads: RandomLoad
     """Force (LOAD_FEATURES, r) that the cubature misses in equilibrium, relative to the answer."""
     samples = reduced.answers(loads.training, DEFECT_LOADS)
     states, rows = np.array([s.q for s in samples]), np.array([s.features for s in samples])
-    exact, found = (nonlinear_forces(t.rows, *t.law, states) for t in (galerkin, reduced))
+    exact, found = (cubature.nonlinear_forces(t.rows, *t.law, states) for t in (galerkin, reduced))
     scale = 1.0 / np.linalg.norm(states, axis=1, keepdims=True)
     kept = np.isfinite(exact - found).all(axis=1)
-    return damped_fit((scale * rows)[kept], (scale * (exact - found))[kept], DEFECT_DAMPING)
+    return cubature.damped_fit(
+        (scale * rows)[kept], (scale * (exact - found))[kept], DEFECT_DAMPING
+    )
 
 
 def _fit_guess(samples: Sequence[Sample]) -> Array:
@@ -303,7 +288,7 @@ def _fit_guess(samples: Sequence[Sample]) -> Array:
     scale = np.array([[1.0 / np.linalg.norm(s.load)] for s in samples])
     rows = np.array([s.features for s in samples])
     added = np.array([s.q - s.load for s in samples])
-    return damped_fit(scale * rows, scale * added, GUESS_DAMPING)
+    return cubature.damped_fit(scale * rows, scale * added, GUESS_DAMPING)
 
 
 def _fit_tangent(reduced: LocalTrainer, samples: Sequence[Sample]) -> tuple[Array, Array]:
@@ -316,7 +301,7 @@ def _fit_tangent(reduced: LocalTrainer, samples: Sequence[Sample]) -> tuple[Arra
     rows, columns = np.tril_indices(CHANGING)
     seen = (U.T @ changes @ U)[:, rows, columns]
     features = np.array([s.tangent_features for s in samples])
-    return U.T, damped_fit(features, seen, GUESS_DAMPING)
+    return U.T, cubature.damped_fit(features, seen, GUESS_DAMPING)
 
 
 def _fit_residual(
@@ -331,4 +316,4 @@ def _fit_residual(
         if sample is not None:
             known.append((load, load.direction, share, sample.q))
     nodal = nodal_modes(models, models.modes[0])
-    return fit_residual(problem, models.frames[0], models.centres[0], nodal, known)
+    return cubature.fit_residual(problem, models.frames[0], models.centres[0], nodal, known)

@@ -27,8 +27,8 @@ def with_points(
     tables: Tables, points: NDArray[np.integer[Any]], weights: Array, **others: Any
 ) -> Tables:
     """One local model with other cubature points."""
-    own = replace(tables, points=points.astype(np.int32), weights=weights, **others)
-    return replace(own, point_from=np.array([0, len(points)]))
+    own = {"points": points.astype(np.int32), "weights": weights, **others}
+    return replace(tables, point_from=np.array([0, len(points)]), **own)
 
 
 def half(values: Array) -> Field:
@@ -75,9 +75,8 @@ def _joined(parts: Sequence[Tables], **own: Any) -> Tables:
 
 def neighbours(models: LocalModels, reach: float) -> NDArray[np.int32]:
     """Pairs (n, 2) of patches whose centres are at most ``reach`` mm apart, the smaller first."""
-    pairs = cKDTree(models.centres).query_pairs(reach, output_type="ndarray")
-    pairs = np.sort(pairs, axis=1)[np.lexsort((pairs.max(axis=1), pairs.min(axis=1)))]
-    return pairs.astype(np.int32)
+    pairs = sorted(cKDTree(models.centres).query_pairs(reach))
+    return np.array(pairs, np.int32).reshape(-1, 2)
 
 
 def overlaps(

@@ -9,13 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from palpate.offline.reduce.ritz import Footprint
-from palpate.offline.reduce.sampling import (
-    centred_points,
-    neighbours,
-    random_points,
-    spacing_count,
-    spread_points,
-)
+from palpate.offline.reduce.sampling import random_points, spacing_count, spread_points
 from palpate.offline.run.streams import Stage, stream
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.scene import Scene, Size
@@ -29,6 +23,8 @@ RITZ_REACH = 0.8
 """How far from its centre a local model learns from footprints, in units of the patch spacing."""
 
 CONTACTS_PER_PATCH = 400
+
+LLOYD_SAMPLE, LLOYD_STEPS = 100, 40
 
 
 @dataclass(frozen=True)
@@ -45,68 +41,81 @@ class Patch:
     seed: int
 
 
-@dataclass(frozen=True)
 class Layout:
-    """Local models of a size spread over the surface."""
+    """Local models of a size spread over the surface.
 
-    scene: Scene
-    surface: Surface
-    limits: Array  # (v, LIMIT_FIELDS), load range at the vertices
-    size: Size
-    centres: Array  # (p, 3) mm
-    region: NDArray[np.int32]  # (p,)
-    footprints: list[Footprint]
-    learns_from: list[NDArray[np.int64]]  # footprints of each local model, ascending
-    contacts: Array  # (c, 3) mm
-    answers: list[NDArray[np.int64]]  # contacts of each local model
-    extent: float  # mm
+    Parameters
+    ----------
+    scene : Scene
+    surface : Surface
+    limits : ndarray, shape (v, LIMIT_FIELDS)
+        Load range at the vertices.
+    size : Size
+    """
 
-    @classmethod
-    def of(cls, scene: Scene, surface: Surface, limits: Array, size: Size) -> Layout:
-        """Lay out a scene."""
+    def __init__(self, scene: Scene, surface: Surface, limits: Array, size: Size) -> None:
         rng, blend = stream(scene.seed, Stage.LAYOUT), scene.training.blend
-        centres = centred_points(surface, spacing_count(surface, size.patch_spacing), rng)
+        self._scene, self._surface, self._limits, self.size = scene, surface, limits, size
+        count = spacing_count(surface, size.patch_spacing)
+        self.centres = _centred_points(surface, count, rng)  # (p, 3) mm
         count = spacing_count(surface, scene.training.region_spacing)
-        region = cKDTree(centred_points(surface, count, rng)).query(centres)[1]
+        region = cKDTree(_centred_points(surface, count, rng)).query(self.centres)[1]
+        self.region = np.unique(region, return_inverse=True)[1].astype(np.int32)  # (p,)
         count = spacing_count(surface, RITZ_SPACING * size.patch_spacing)
         ritz = spread_points(surface, count, rng)
-        contacts = np.vstack(
-            [surface.vertices, random_points(surface, CONTACTS_PER_PATCH * len(centres), rng)]
-        )
-        near, _ = cKDTree(centres).query(contacts)
-        reached = neighbours(contacts, centres, near.max() + blend)
-        return cls(
-            scene, surface, limits, size,
-            centres=centres,
-            region=np.unique(region, return_inverse=True)[1].astype(np.int32),
-            footprints=[Footprint.of(surface, x, limits) for x in ritz],
-            learns_from=neighbours(ritz, centres, RITZ_REACH * size.patch_spacing),
-            contacts=contacts,
-            answers=[
-                hits[np.linalg.norm(contacts[hits] - x, axis=1) < near[hits] + blend]
-                for x, hits in zip(centres, reached, strict=True)
-            ],
-            extent=1.02 * near.max() + blend,
-        )  # fmt: skip
+        self.footprints = [Footprint.of(surface, x, limits) for x in ritz]
+        # footprints of each local model, ascending
+        self.learns_from = _within(RITZ_REACH * size.patch_spacing, self.centres, ritz)
+        count = CONTACTS_PER_PATCH * len(self.centres)
+        contacts = np.vstack([surface.vertices, random_points(surface, count, rng)])
+        near, _ = cKDTree(self.centres).query(contacts)
+        self._extent = 1.02 * near.max() + blend
+        reached = _within(near.max() + blend, self.centres, contacts)
+        # contacts (c, 3) mm of each local model
+        self._contacts = [
+            contacts[hits][np.linalg.norm(contacts[hits] - x, axis=1) < near[hits] + blend]
+            for x, hits in zip(self.centres, reached, strict=True)
+        ]
 
     def patch(self, k: int) -> Patch:
         """What local model k is trained from."""
-        contacts = self.contacts[self.answers[k]]
-        _, normals, _, ranges = zip(
-            *(self.surface.locate(x, self.limits) for x in contacts), strict=True
-        )
+        contacts = self._contacts[k]
+        located = [self._surface.locate(x, self._limits) for x in contacts]
+        _, normals, _, ranges = zip(*located, strict=True)
         return Patch(
-            at=Footprint.of(self.surface, self.centres[k], self.limits),
+            at=Footprint.of(self._surface, self.centres[k], self._limits),
             footprints=[self.footprints[i] for i in self.learns_from[k]],
             contacts=contacts,
             normals=np.array(normals),
             ranges=np.array(ranges),
-            extent=self.extent,
+            extent=self._extent,
             size=self.size,
-            seed=self.scene.seed + k,
+            seed=self._scene.seed + k,
         )
 
     def footprints_of(self, region: int) -> NDArray[np.int64]:
         """Indices of the footprints that the local models of a region learn from, ascending."""
         own = np.flatnonzero(self.region == region)
         return np.unique(np.concatenate([self.learns_from[k] for k in own]))
+
+
+def _centred_points(surface: Surface, count: int, rng: np.random.Generator) -> Array:
+    """Points whose cells on the surface are as compact as can be, (count, 3) mm.
+
+    Lloyd's relaxation of evenly spread points; unlike those, none is left on the rim.
+    """
+    points = spread_points(surface, count, rng)
+    sample = random_points(surface, LLOYD_SAMPLE * count, rng)
+    for _ in range(LLOYD_STEPS):
+        _, nearest = cKDTree(points).query(sample)
+        members = np.bincount(nearest, minlength=count)
+        sums = np.stack([np.bincount(nearest, x, minlength=count) for x in sample.T], axis=1)
+        points = np.where(members[:, None] > 0, sums / np.maximum(members, 1)[:, None], points)
+        points = np.array([surface.project(x)[0] for x in points])
+    return points
+
+
+def _within(radius: float, at: Array, points: Array) -> list[NDArray[np.int64]]:
+    """Indices of ``points`` within ``radius`` of each row of ``at``, ascending."""
+    found = cKDTree(points).query_ball_point(at, radius, return_sorted=True)
+    return [np.array(rows, dtype=np.int64) for rows in found]

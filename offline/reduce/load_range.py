@@ -1,17 +1,34 @@
-"""The range of loads: the pressure at which the tissue moves as far as the scene allows.
+"""The range of loads: as far as the scene allows, and no further than the tissue bears it.
 
-The equilibrium path under ``p f`` starts along ``u_1 = K_0^-1 f`` and bends along its second and
-third derivative at rest.  Galerkin's solution in these three vectors is within some percent of the
-path as far as a scene goes, and costs a fraction of one full solution: it says where the full one
-starts.
+At first the range ends at the pressure at which the tissue of the full model moves as far as the
+scene says.  The equilibrium path under ``p f`` starts along ``u_1 = K_0^-1 f`` and bends along its
+second and third derivative at rest.  Galerkin's solution in these three vectors is within some
+percent of the path as far as a scene goes, and costs a fraction of one full solution: it says where
+the full one starts.
+
+Near a fold of the load path a small error of the force is a large one of the displacement, and
+between the folds of the full and of the reduced model the two lie on different branches: the one
+kind of answer that is converged, in range and wrong.  The reduced model is quick enough to be
+pressed everywhere, in all directions and a little beyond the range, and shows where its own path
+turns; the full model's does so close by.  The range is lowered to end before that.
+
+Under the rigid tip a free edge can lie on either side of it, and slips off to the other as the tip
+slides on.  There one position has several answers, and which is the right one hangs on the way that
+the tip came: reduced and full model need not part from the same one at the same step.  The reduced
+model is asked everywhere whether its answers depend on the way, and depths are lowered likewise.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import pickle
+from collections.abc import Callable, Iterable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from palpate.offline.fem.mesh import local_thickness
 from palpate.offline.fem.model import FullModel, NoEquilibrium
@@ -19,7 +36,14 @@ from palpate.offline.fem.potential import Projected
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.terms import DeadLoad
 from palpate.offline.reduce.ritz import energy_pod, ritz_vectors
+from palpate.offline.reduce.sampling import cone, random_points_and_rim, tangents
+from palpate.offline.run.streams import Stage
+from palpate.shared.answer import Answer
+from palpate.shared.errors import QueryError
+from palpate.shared.local_models import Estimators, LocalModels
 from palpate.shared.mechanics import newton
+from palpate.shared.mechanics.footprint import TIP_DEPTH, pressure_limit
+from palpate.shared.model import ReducedModel
 
 Array = NDArray[np.float64]
 
@@ -36,6 +60,30 @@ DEEPEST = 0.8
 
 SHALLOWEST = 0.02
 """Millimetres that the range of depths has at least."""
+
+SHARES = np.linspace(0.6, 1.1, 11)
+"""Of the limit at which each path is solved."""
+
+SUDDEN = 1.0
+"""Growth of the exponent of displacement over pressure from one step to the next: softening tissue
+has up to .6, a jump by 5 % of the displacement 1."""
+
+MARGIN = 1.1
+"""Limit at which the reduced model gives way over the one it gets: the full one may do so before
+that."""
+
+DEPTH_SHARES = np.linspace(1.0, 0.1, 7)
+"""Of the depth limit that are tried, until one has the same answer by all ways."""
+
+WAYS, FAR, STRIDE = 4, 1.5, 0.5
+"""Ways that the tip comes sliding, their length and steps (mm)."""
+
+SAME = 0.1
+"""Difference of answers, relative to them, that is not one of equilibria."""
+
+Places = list[tuple[Any, ...]]
+Ask = Callable[[str, Callable[..., float], Places], Iterable[float]]
+"""Values of a function of the reduced model at places, its further arguments; under a title."""
 
 
 class LoadPath:
@@ -133,3 +181,160 @@ def load_range(problem: FullProblem, position: Array) -> Array:
     depth = 0.0 if moved is None else -float(nodal @ moved @ normal) / nodal.sum()
     depth = min(max(depth, SHALLOWEST), DEEPEST * problem.scene.endoscope.radius)
     return np.array([limit, *np.diag(C), C[0, 1], C[0, 2], C[1, 2], depth])
+
+
+class Search(NamedTuple):
+    """What to ask the reduced model all over the surface: how much of its range it bears."""
+
+    title: str
+    field: int  # of the load range, which is lowered
+    stage: Stage  # whose random numbers are drawn
+    draw: Callable[..., tuple[Any, ...]]  # makes a place, its point first, of a point
+    share: Callable[..., float]  # of the range that the model bears at a place
+    first: int  # places for each local model
+    closer: int  # more of them near each where it does not bear all
+    reach: float  # mm from there up to which the range is lowered
+
+
+def bearable_shares(
+    search: Search, model: ReducedModel, ask: Ask, rng: np.random.Generator
+) -> Array:
+    """Shares of the range at the vertices (v,) that the reduced model bears, at most 1."""
+    surface, vertices = model.surface, cKDTree(model.surface.vertices)
+
+    def lacking(points: Iterable[Array]) -> list[tuple[Array, float]]:
+        places = [search.draw(model, i, point, rng) for i, point in enumerate(points)]
+        shares = zip(places, ask(search.title, search.share, places), strict=True)
+        return [(x, share) for (x, *_), share in shares if share < 1.0]
+
+    found = lacking(random_points_and_rim(surface, search.first * len(model.models.centres), rng))
+    near = [rng.choice(vertices.query_ball_point(x, search.reach), search.closer) for x, _ in found]
+    if near:
+        found += lacking(surface.vertices[np.concatenate(near)])
+    shares = np.ones(len(surface.vertices))
+    for x, share in found:
+        lowered = vertices.query_ball_point(x, search.reach)
+        shares[lowered] = np.minimum(shares[lowered], share)
+    return shares
+
+
+def untested(problem: FullProblem, models: LocalModels, limits: Array) -> ReducedModel:
+    """Reduced model of local models and a load range, without error estimates."""
+    scene = problem.scene
+    return ReducedModel(
+        scene.name, scene, {}, problem.body, problem.surface, limits, models, Estimators()
+    )
+
+
+@lru_cache(maxsize=1)
+def _pickled(problem: FullProblem, path: Path) -> ReducedModel:
+    return untested(problem, *pickle.loads(path.read_bytes()))
+
+
+def ask(
+    problem: FullProblem, path: Path, function: Callable[..., float], places: Places
+) -> list[float]:
+    """Values of a function of a reduced model and of further arguments; for ``run.workers``.
+
+    ``path`` is a pickle of the local models and their load range.
+    """
+    return [function(_pickled(problem, path), *place) for place in places]
+
+
+def limit_load_share(model: ReducedModel, x: Array, direction: Array, limit: float) -> float:
+    """Share of a pressure (kPa) up to which tissue yields gradually, with ``MARGIN``; at most 1."""
+    moved = np.full(len(SHARES), np.nan)  # where it does not converge an answer says so itself
+    for i, share in enumerate(SHARES):
+        answer = model.press(x, share * limit, direction)
+        if answer.converged:
+            moved[i] = sum(weight * np.linalg.norm(q) for _, weight, q in answer.parts)
+    exponents = np.diff(np.log(moved)) / np.diff(np.log(SHARES))
+    sudden = np.flatnonzero(np.diff(exponents) > SUDDEN)
+    return float(SHARES[sudden[0] + 1]) / MARGIN if len(sudden) else 1.0
+
+
+def path_independent_share(model: ReducedModel, x: Array, turn: float = 0.0) -> float:
+    """Share of the depth limit at a contact up to which the tip's way there does not matter.
+
+    ``turn`` is the angle (rad) of the ways about the normal.
+    """
+    for share in DEPTH_SHARES:
+        if not _depends_on_way(model, x, share, turn):
+            return float(share) if share == 1.0 else float(share) / MARGIN
+    return float(DEPTH_SHARES[-1]) / MARGIN
+
+
+def _depends_on_way(model: ReducedModel, x: Array, share: float, turn: float) -> bool:
+    """Whether a tip that comes sliding finds another equilibrium than one pressed in."""
+    pressed = model.touch(_over(model, x, share))
+    state = model.new_warm()
+    for angle in turn + 2.0 * np.pi * np.arange(WAYS) / WAYS:
+        state.forget()
+        slid = None
+        for place in reversed(_way(model, x, angle)):
+            try:
+                slid = model.touch(_over(model, place, share), warm=state)
+            except QueryError:  # in a fold the tip's centre can be below the other side
+                continue
+        if slid is not None and _apart(pressed, slid):
+            return True
+    return False
+
+
+def _over(model: ReducedModel, x: Array, share: float) -> Array:
+    """Centre of a tip pressed in at a point of the surface by a share of the depth limit."""
+    x, normal, _, fields = model.surface.locate(x, model.limits)
+    return x + (model.scene.endoscope.radius - share * fields[TIP_DEPTH]) * normal
+
+
+def _way(model: ReducedModel, x: Array, angle: float) -> list[Array]:
+    """Points of the surface from one point on, as far as it goes."""
+    places, normal = [x], model.surface.project(x)[1]
+    heading = np.array([np.cos(angle), np.sin(angle)]) @ np.array(tangents(normal))
+    for _ in range(round(FAR / STRIDE)):
+        on, normal = model.surface.project(places[-1] + STRIDE * heading)[:2]
+        heading = heading - heading @ normal * normal
+        size = float(np.linalg.norm(heading))
+        if size < 1e-6 or np.linalg.norm(on - places[-1]) < 0.3 * STRIDE:
+            break
+        heading /= size
+        places.append(on)
+    return places
+
+
+def _apart(one: Answer, other: Answer) -> bool:
+    """Whether answers to the same position are different equilibria, as far as they are known."""
+    if not (one.converged and other.converged):
+        return False
+    known = {k: q for k, _, q in other.parts}
+    both = [(weight, q, known[k]) for k, weight, q in one.parts if k in known]
+    away = sum(weight * np.linalg.norm(p - q) for weight, p, q in both)
+    return bool(away > SAME * sum(weight * np.linalg.norm(p) for weight, p, _ in both))
+
+
+def _largest_load(
+    model: ReducedModel, i: int, point: Array, rng: np.random.Generator
+) -> tuple[Array, Array, float]:
+    """Contact, direction and largest pressure of a load, every other one at the largest tilt."""
+    x, normal, _, fields = model.surface.locate(point, model.limits)
+    direction = cone(normal, model.scene.endoscope.max_tilt, 1, rng, border=i % 2 == 0)[0]
+    return x, direction, pressure_limit(fields, normal, direction)
+
+
+def _contact(
+    model: ReducedModel, i: int, point: Array, rng: np.random.Generator
+) -> tuple[Array, float]:
+    """Contact of the tip, and the angle of the ways there."""
+    return model.surface.project(point)[0], rng.uniform(0.0, 2.0 * np.pi)
+
+
+GIVING_WAY = Search(
+    "giving way", 0, Stage.GIVING_WAY, _largest_load, limit_load_share,
+    first=16, closer=24, reach=2.0,
+)  # fmt: skip
+SLIPPING_OFF = Search(
+    "slipping off", TIP_DEPTH, Stage.SLIPPING_OFF, _contact, path_independent_share,
+    first=2, closer=4, reach=1.0,
+)  # fmt: skip
+
+SEARCHES = GIVING_WAY, SLIPPING_OFF

@@ -29,6 +29,7 @@ from palpate.offline.fem.model import FullModel
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.sampling import tangents
 from palpate.shared.geometry.surface import Surface
+from palpate.shared.scene import SceneError
 
 Array = NDArray[np.float64]
 
@@ -173,7 +174,17 @@ def local_modes(coefficients: Array, size: int) -> Array:
     """Leading directions (M, size) of vectors given by coefficients (M, k) in an orthonormal basis.
 
     Where the vectors run out, the leading modes of the basis fill up.
+
+    Raises
+    ------
+    SceneError
+        If the basis has fewer modes than that.
     """
+    if size > len(coefficients):
+        raise SceneError(
+            f"training.size.modes: at most {len(coefficients)} here, which is what the Ritz "
+            f"vectors of a region have to give, not {size}"
+        )
     gram = coefficients @ coefficients.T
     filled = np.arange(size)
     gram[filled, filled] += FILL * np.trace(gram)

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.scene import Tolerance
@@ -16,8 +15,6 @@ Array = NDArray[np.float64]
 
 CANDIDATES = 20
 """Random candidates per point wanted, from which the farthest are taken."""
-
-LLOYD_SAMPLE, LLOYD_STEPS = 100, 40
 
 
 def triangle_areas(surface: Surface) -> Array:
@@ -63,22 +60,6 @@ def farthest(points: Array, count: int) -> list[int]:
     return chosen
 
 
-def centred_points(surface: Surface, count: int, rng: np.random.Generator) -> Array:
-    """Points whose cells on the surface are as compact as can be, (count, 3) mm.
-
-    Lloyd's relaxation of evenly spread points; unlike those, none is left on the rim.
-    """
-    points = spread_points(surface, count, rng)
-    sample = random_points(surface, LLOYD_SAMPLE * count, rng)
-    for _ in range(LLOYD_STEPS):
-        _, nearest = cKDTree(points).query(sample)
-        members = np.bincount(nearest, minlength=count)
-        sums = np.stack([np.bincount(nearest, x, minlength=count) for x in sample.T], axis=1)
-        points = np.where(members[:, None] > 0, sums / np.maximum(members, 1)[:, None], points)
-        points = np.array([surface.project(x)[0] for x in points])
-    return points
-
-
 def fewer(count: int, tolerance: Tolerance) -> int:
     """Samples to learn from, of ``count`` for the usual tolerance.
 
@@ -91,12 +72,6 @@ def fewer(count: int, tolerance: Tolerance) -> int:
 def spacing_count(surface: Surface, spacing: float) -> int:
     """How many points have the given mean spacing (mm) on the surface (hexagonal packing)."""
     return max(1, round(triangle_areas(surface).sum() * 2 / (math.sqrt(3) * spacing**2)))
-
-
-def neighbours(points: Array, at: Array, radius: float) -> list[NDArray[np.int64]]:
-    """Indices of ``points`` within ``radius`` of each row of ``at``."""
-    found = cKDTree(points).query_ball_point(at, radius)
-    return [np.sort(np.array(rows, dtype=np.int64)) for rows in found]
 
 
 def cone(

@@ -16,27 +16,16 @@ from numpy.typing import NDArray
 
 from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.problem import FullProblem, TipPosition
-from palpate.offline.reduce.cubature import (
-    Past,
-    by_point,
-    damped_fit,
-    fit_residual,
-    nonnegative,
-    points_alone,
-    training_forces,
-)
+from palpate.offline.reduce import cubature
 from palpate.offline.reduce.join import deviatoric_of, half, nodal_modes, with_points
 from palpate.offline.reduce.layout import Patch
 from palpate.offline.reduce.sampling import farthest
+from palpate.shared.geometry.surface import Surface, SurfaceIndex
 from palpate.shared.local_models import Body, LocalModels, LocalTips
 from palpate.shared.mechanics import newton
-from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH
+from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.mechanics.viscosity import step_weights
-from palpate.shared.reduced.features import (
-    RESIDUAL_FEATURES,
-    TIP_FEATURES,
-    tip_features,
-)
+from palpate.shared.reduced.features import RESIDUAL_FEATURES, TIP_FEATURES, tip_features
 from palpate.shared.reduced.outcome import TOUCH_FEATURES
 from palpate.shared.reduced.past import Elastic, Remembering, opened, remembering
 from palpate.shared.reduced.points import SYMMETRIC, predict_points
@@ -54,7 +43,7 @@ NODES = 0.6
 """Distance beyond the patch's extent within which nodes count, in radii of the tip."""
 
 NO_LIMIT = 1e9
-"""Millimetres: in training any depth is in range."""
+"""Kilopascals and millimetres: in training any pressure and depth is in range."""
 
 PRESSED, DEPTHS = 12, 3
 """Contacts that a patch learns from, and depths at each."""
@@ -79,11 +68,17 @@ ANSWERS = 48
 fitted to; they tell the residual in the full model, too."""
 
 
+def endless(surface: Surface) -> SurfaceIndex:
+    """The surface with a load range without end: see ``mechanics.footprint.pressure_limit``."""
+    fields = [NO_LIMIT, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, NO_LIMIT]
+    return surface.ground(np.tile(fields, (len(surface.vertices), 1)))
+
+
 class TipTrainer:
     """One local model of the tip that solves training positions by the compiled query.
 
     The points of ``tangent``, of the same modes, serve the tangent if given.  With the deviatoric
-    part (1, m, m) of the rest stiffness in the modes the tissue remembers.
+    part of the rest stiffness the tissue remembers.
     """
 
     def __init__(
@@ -92,21 +87,19 @@ class TipTrainer:
         models: LocalModels,
         tips: LocalTips,
         tangent: LocalTips | None = None,
-        deviatoric: NDArray[np.float32] | None = None,
     ) -> None:
-        surface, self._prony = problem.surface, problem.model.prony
+        self._prony = problem.model.prony
         self.models = touch_models(problem.body, models, tips, tangent)
         self.radius = problem.body.tip.radius
         self.past: Elastic | Remembering = Elastic()
-        if deviatoric is not None:
+        if tips.deviatoric is not None:
             points = self.models.points.weights.shape[1]
-            self.past = remembering(deviatoric, len(self._prony), points)
+            self.past = remembering(tips.deviatoric, len(self._prony), points)
             self._memory = opened(
                 self.past.records[0], len(self._prony), tips.modes.shape[2], points
             )
-        no_limit = np.full((len(surface.vertices), LIMIT_FIELDS), NO_LIMIT)
         self._workspace = Workspace(
-            self.models, surface.ground(no_limit), np.zeros((3, TOUCH_FEATURES)), self.past
+            self.models, endless(problem.surface), np.zeros((3, TOUCH_FEATURES)), self.past
         )
         self.rest()
 
@@ -147,7 +140,7 @@ class TipTrainer:
             most=self._most,
         )
 
-    def _remembered(self) -> Past:
+    def _remembered(self) -> cubature.Past:
         """What the points remember now."""
         points, now = self.models.points, step_weights(self._prony, 0.0)
         B, S = np.zeros((2, SYMMETRIC * points.weights.shape[1]), np.float32)
@@ -166,7 +159,7 @@ class _State:
     factor: Array  # (m, m)
     coupling: Array  # (m, 3)
     force: Array  # (3,)
-    past: Past | None  # of tissue that remembers, see ``cubature.point_forces``
+    past: cubature.Past | None  # of tissue that remembers, see ``cubature.point_forces``
     most: tuple[float, float]  # largest size and force (mN) of its history
 
     def within(self, V: Array) -> _State:
@@ -217,39 +210,37 @@ def train_tip(
     count, most, nodal = SIZES_IN_TIME if model.prony else SIZES
     space = _generous(problem.body, models, orthonormal, nodal)
     everywhere = _untrained(space, weights)
-    trainer = TipTrainer(
-        problem, models, everywhere,
-        with_points(everywhere, models.points, models.weights),
-        deviatoric_of(model, models, space) if model.prony else None,
-    )  # fmt: skip
+    if model.prony:
+        everywhere = replace(everywhere, deviatoric=deviatoric_of(model, models, space))
+    tangent = with_points(everywhere, models.points, models.weights)
+    trainer = TipTrainer(problem, models, everywhere, tangent)
     pressed = _press(trainer, patch, rng)
     if not pressed:
         raise NoEquilibrium("endoscope.tip: no equilibrium found under it; is the load too large?")
     V = _modes(pressed, count)
     states = [state.within(V) for state in pressed]
-    rows, law = points_alone(trainer.models.points)
-    forces = training_forces(
-        by_point(rows) @ V.astype(np.float32), law,
+    rows, law = cubature.points_alone(trainer.models.points)
+    forces = cubature.training_forces(
+        cubature.by_point(rows) @ V.astype(np.float32), law,
         [(state.q, state.looks, state.past) for state in states],
         EQUATIONS // (2 * len(states)), RESPONSES, rng,
     )  # fmt: skip
     A = np.ascontiguousarray(forces[: len(weights)].T)
-    points, chosen = nonnegative(A, A.sum(axis=1, dtype=float), most)
+    points, chosen = cubature.nonnegative(A, A.sum(axis=1, dtype=float), most)
     # a first guess by what is known so far spares the answers that refine it half their iterations
     guess = _fit_guess(trainer.models, states)[None].astype(np.float32)
     tips = with_points(
         _untrained(space @ V, weights), points, chosen * weights[points], guess=guess
     )
-    shares, answers = _answers(TipTrainer(problem, models, tips), patch, rng)
+    answers = _answers(TipTrainer(problem, models, tips), patch, rng)
     known = [
-        (TipPosition(state.position), -state.normal, share, state.q)
-        for share, state in zip(shares, answers, strict=True)
+        (TipPosition(answer.position), -answer.normal, share, answer.q) for share, answer in answers
     ]
     placed, nodes = trainer.models, nodal_modes(models, tips.modes[0])
-    residual = fit_residual(problem, placed.frames[0], placed.centres[:, 0], nodes, known)
+    residual = cubature.fit_residual(problem, placed.frames[0], placed.centres[:, 0], nodes, known)
     return replace(
         tips,
-        guess=half(_fit_guess(placed, answers)),
+        guess=half(_fit_guess(placed, [answer for _, answer in answers])),
         residuals=residual[None],
         deviatoric=deviatoric_of(model, models, tips.modes[0]) if model.prony else None,
     )
@@ -262,7 +253,8 @@ def compile_tip_query(problem: FullProblem, models: LocalModels) -> None:
     over = surface.vertices[0] + 0.9 * problem.body.tip.radius * surface.normals[0]
     TipTrainer(problem, models, tips).solve(over)
     if problem.model.prony:
-        TipTrainer(problem, models, tips, None, np.zeros((1, 4, 4), np.float32)).solve(over)
+        soft = np.zeros((1, 4, 4), np.float32)
+        TipTrainer(problem, models, replace(tips, deviatoric=soft)).solve(over)
 
 
 def _untrained(modes: NDArray[np.floating[Any]], weights: Array) -> LocalTips:
@@ -351,19 +343,18 @@ def _fit_guess(models: TouchModels, states: list[_State]) -> Array:
             tip_features(*place, max(depth, 0.0), features)
             rows.append(features)
             answers.append(state.q + state.slope @ shift)
-    return damped_fit(np.array(rows), np.array(answers))
+    return cubature.damped_fit(np.array(rows), np.array(answers))
 
 
 def _answers(
     trained: TipTrainer, patch: Patch, rng: np.random.Generator
-) -> tuple[list[float], list[_State]]:
-    """Answers of a trained model all over its range, and their shares of the largest depth."""
-    shares, answers = [], []
+) -> list[tuple[float, _State]]:
+    """Shares of the largest depth all over the range, and answers of a trained model there."""
+    answers = []
     for i in rng.integers(len(patch.contacts), size=ANSWERS):
         share = np.sqrt(rng.random())
         trained.rest()
         answer = trained.solve(_centre(trained, patch, i, share))
         if answer is not None:
-            shares.append(share)
-            answers.append(answer)
-    return shares, answers
+            answers.append((share, answer))
+    return answers

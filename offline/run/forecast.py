@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from palpate.offline.choose.size import first_place, ladder
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.info import duration
 from palpate.offline.reduce.sampling import spacing_count
-from palpate.offline.reduce.size import first_place, ladder
 from palpate.shared.scene import divisions_of
 
 MODEL, MODEL_AND_DOF = 0.35, 1.75e-4

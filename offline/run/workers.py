@@ -17,7 +17,7 @@ import os
 import pickle
 import shutil
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
@@ -84,13 +84,9 @@ def worker_pool(
     )
 
 
-def completed(
-    executor: Executor, tasks: Tasks, names: Iterable[str] | None = None
-) -> Iterator[tuple[str, Any]]:
-    """Run tasks, all or those named; yield name and result of each as soon as it is done."""
-    futures = {
-        executor.submit(run, *tasks[name]): name for name in (tasks if names is None else names)
-    }
+def completed(executor: Executor, tasks: Tasks) -> Iterator[tuple[str, Any]]:
+    """Run tasks; yield name and result of each as soon as it is done."""
+    futures = {executor.submit(run, *task): name for name, task in tasks.items()}
     try:
         for future in as_completed(futures):
             yield futures[future], future.result()
@@ -147,16 +143,15 @@ class Checkpoint:
             os.fsync(file.fileno())
         return temporary.replace(path)
 
+    def resume(self, title: str, executor: Executor, tasks: Tasks) -> dict[str, Any]:
+        """Results of tasks by name; those that are not there yet are run, with a bar."""
+        missing = {name: task for name, task in tasks.items() if name not in self}
+        with tqdm(total=len(tasks), initial=len(tasks) - len(missing), desc=title) as bar:
+            for name, result in completed(executor, missing):
+                self.store(name, result)
+                bar.update()
+        return {name: self.load(name) for name in tasks}
+
     def remove(self) -> None:
         """Forget everything: the artifact is written."""
         shutil.rmtree(self._parent)
-
-
-def resume(title: str, executor: Executor, checkpoint: Checkpoint, tasks: Tasks) -> dict[str, Any]:
-    """Results of tasks by name; those that are not in the checkpoint yet are run, with a bar."""
-    missing = [name for name in tasks if name not in checkpoint]
-    with tqdm(total=len(tasks), initial=len(tasks) - len(missing), desc=title) as bar:
-        for name, result in completed(executor, tasks, missing):
-            checkpoint.store(name, result)
-            bar.update()
-    return {name: checkpoint.load(name) for name in tasks}

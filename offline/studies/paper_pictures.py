@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.fem.mesh import Mesh
 from palpate.offline.methods.galerkin import TOLERANCE
 from palpate.offline.pictures import INK, body, new_plotter, ring, save
+from palpate.shared.local_models import Mesh
 
 Array = NDArray[np.float64]
 

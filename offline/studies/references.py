@@ -16,13 +16,7 @@ from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import FullProblem, Load, TipPosition
 from palpate.offline.methods.full import Remeshed
 from palpate.offline.methods.method import Case, Method, Snapshots, Steps
-from palpate.offline.run.workers import (
-    Checkpoint,
-    content_key,
-    open_artifact,
-    resume,
-    worker_pool,
-)
+from palpate.offline.run.workers import Checkpoint, content_key, open_artifact, worker_pool
 from palpate.offline.validate.queries import random_histories, random_loads
 from palpate.shared.artifact import read_artifact
 from palpate.shared.errors import PalpateError, QueryError
@@ -96,7 +90,7 @@ def in_parallel(
     """Results of the tasks of each kind (``run.workers``), from worker processes or kept ones."""
     named = {f"{kind} {i}": task for kind, own in tasks.items() for i, task in enumerate(own)}
     with worker_pool(open_artifact, artifact) as pool:
-        found = resume(title, pool, checkpoint, named)
+        found = checkpoint.resume(title, pool, named)
     return {kind: [found[f"{kind} {i}"] for i in range(len(own))] for kind, own in tasks.items()}
 
 

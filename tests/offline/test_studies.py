@@ -25,15 +25,16 @@ def test_mesh_error_is_tabled(tmp_path, monkeypatch):
     hex8 = Discretisation("hex8", (8, 2, 5), 1.7)
     monkeypatch.setattr(mesh_error, "REFERENCE", fine)
     monkeypatch.setattr(mesh_error, "PROBE", coarse)
-    monkeypatch.setattr(mesh_error, "SECOND_OPINIONS", ())
-    monkeypatch.setattr(mesh_error, "CANDIDATES", (coarse, hex8))
+    monkeypatch.setattr(mesh_error, "SECOND_OPINION", coarse)
+    monkeypatch.setattr(mesh_error, "CANDIDATES", (hex8,))
     monkeypatch.setattr(mesh_error, "POINTS", 2)
     monkeypatch.setattr(mesh_error, "INDENTATION", 0.05)
     result = mesh_error.mesh_error(tmp_path / "report")
     assert list(result) == [str(fine), str(coarse), str(hex8)]
     assert result[str(fine)]["largest_greatest"] == 0.0
     assert result[str(hex8)]["under_footprint_least"] < -0.1  # stiff
-    assert [row["values"] for row in table(tmp_path / "report" / "mesh_error.csv")] == 3 * ["9"]
+    rows = table(tmp_path / "report" / "mesh_error.csv")
+    assert [row["mesh"] for row in rows] == list(result)
 
 
 def test_the_tissue_moves_by_the_share_of_its_thickness_that_is_asked_for(monkeypatch):

@@ -11,12 +11,11 @@ import pytest
 
 from palpate.offline.reduce.footprint_models import compile_query
 from palpate.offline.run.workers import content_key
-from palpate.offline.scenes import filled, find_scene
+from palpate.offline.scenes import find_scene
 from palpate.offline.train import is_of, train
 from palpate.shared.artifact import read_artifact
 from palpate.shared.model import ReducedModel
 from palpate.shared.reduced import press, touch
-from palpate.shared.scene import SceneError
 
 from ..conftest import PALPATE
 
@@ -139,21 +138,3 @@ def test_one_compilation_serves_training_and_queries(atlas, problem):
     )  # fmt: skip
     other.press(atlas.surface.vertices[0], 0.1)
     assert [len(query.signatures) for query in queries] == known
-
-
-def test_the_mesh_error_is_that_of_other_meshes(atlas):
-    report = atlas.info["mesh_error"]
-    own, other = report["elements"]["hex20"], report["elements"]["hex8-mean-dilatation"]
-    assert report["reference_dofs"] >= 5 * own["dofs"]
-    assert other["dofs"] == pytest.approx(own["dofs"], rel=0.3)
-    for errors in (own, other):
-        assert -0.2 < errors["least"] <= errors["mean"] <= errors["greatest"] < 0.2
-    assert abs(own["mean"]) < abs(other["mean"])
-
-
-def test_an_element_that_cannot_be_reduced_is_refused_at_once(tmp_path):
-    scene = tmp_path / "locked.toml"
-    scene.write_text(filled(find_scene("quick")).replace('"hex20"', '"hex8-mean-dilatation"'))
-    with pytest.raises(SceneError, match=r"geometry\.element.*train with hex8 or hex20"):
-        train(scene, tmp_path / "locked.h5")
-    assert list(tmp_path.iterdir()) == [scene]

@@ -114,6 +114,11 @@ def test_a_tolerance_is_as_loose_as_the_stricter_of_its_parts() -> None:
         ('"slab"', '"../slab"', r"name = '../slab'"),
         ("max_tilt = 30.0", "max_tilt = 90.0", r"endoscope.max_tilt = 90.0: .*less than 90"),
         ("samples = 60", "samples = 6", r"training.samples = 6: .*greater than or equal to 60"),
+        (
+            "samples = 60",
+            "size = {patch_spacing = 2, modes = 40, cubature_points = 64, region_modes = 36}",
+            r"training.size.region_modes = 36: must be at least the 40 of modes",
+        ),
     ],
 )
 def test_what_is_wrong_is_named(old: str, new: str, message: str) -> None:

@@ -10,7 +10,7 @@ from palpate.shared.mechanics.neo_hookean import NeoHookeanTissue
 from palpate.shared.mechanics.sphere import tip_of, tip_surface
 
 YOUNG, POISSON = 15.0, 0.45
-ELEMENTS = ("hex8", "hex8-mean-dilatation", "hex8-fbar", "hex20")
+ELEMENTS = ("hex8", "hex20")
 
 
 def tissue_of(poisson=POISSON, prony=()):
@@ -24,7 +24,7 @@ def body(element, divisions, size, poisson=POISSON, prony=()):
         update={"element": element, "divisions": divisions, "size": size}
     )
     mesh = build_mesh(scene.model_copy(update={"geometry": geometry}))
-    return FullModel(mesh, element, tissue_of(poisson, prony))
+    return FullModel(mesh, tissue_of(poisson, prony))
 
 
 def tip_contact(model, radius):

@@ -48,7 +48,7 @@ def loose(model, rng, by=0.2):
         ends = mesh.elements[:, np.array(HEX_EDGES)]
         nodes[mesh.elements[:, 8:]] = nodes[ends].mean(axis=2)
     mesh = replace(mesh, nodes=nodes, clamped=np.zeros_like(mesh.clamped))
-    return FullModel(mesh, model.element, model.tissue)
+    return FullModel(mesh, model.tissue)
 
 
 def internal_force(model, displacement):
@@ -109,7 +109,7 @@ def test_patch_test(element, rng):
 def test_force_and_symmetric_tangent_are_derivatives_of_the_energy(bent, relaxed, rng):
     model, u = bent
     if relaxed:
-        model = FullModel(model.mesh, model.element, tissue_of(prony=PRONY)).relaxed
+        model = FullModel(model.mesh, tissue_of(prony=PRONY)).relaxed
     _, force = internal_force(model, u)
     K = model.stiffness(u.ravel())
     assert np.abs((K - K.T).toarray()).max() <= 1e-13 * np.abs(K.data).max()

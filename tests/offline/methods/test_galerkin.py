@@ -1,11 +1,8 @@
 """Compiled Galerkin models: the full model's equilibrium in the span of a basis."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
-from palpate.offline.fem.model import FullModel
 from palpate.offline.fem.potential import Projected
 from palpate.offline.fem.problem import Load
 from palpate.offline.fem.terms import DeadLoad
@@ -64,9 +61,3 @@ def test_no_load_moves_nothing(problem, queries):
     answer = method.solve(case)
     assert answer.converged
     assert not method.displacement(answer.state).any()
-
-
-def test_points_that_share_a_dilatation_are_refused(problem):
-    other = FullModel(problem.mesh, "hex8-mean-dilatation", problem.scene.tissue)
-    with pytest.raises(ValueError, match="dilatation"):
-        Galerkin(SimpleNamespace(model=other), np.zeros((len(other.free), 4)))

@@ -1,10 +1,32 @@
-"""The pressure that moves the tissue as far as wanted, and where to look for it."""
+"""The pressure that moves the tissue as far as wanted, and where tissue gives way before.
+
+The latter on a plate whose answer to a load is known.
+"""
+
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from palpate.offline.fem.model import NoEquilibrium
-from palpate.offline.reduce.load_range import LoadPath, load_range, pressure_that_moves
+from palpate.offline.reduce.load_range import (
+    FAR,
+    GIVING_WAY,
+    MARGIN,
+    SLIPPING_OFF,
+    LoadPath,
+    bearable_shares,
+    limit_load_share,
+    load_range,
+    path_independent_share,
+    pressure_that_moves,
+)
+from palpate.shared.errors import QueryError
+from palpate.shared.geometry.surface import Surface
+from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH
+
+LIMIT = RADIUS = 2.0
+EDGE = 5.0
 
 
 def spring(law, limit=np.inf):
@@ -64,3 +86,116 @@ def test_the_limit_moves_the_tissue_by_the_indentation_in_the_end(request, name)
     u = problem.model.relaxed.solve(-limit * nodal[:, None] * normal).displacement
     wanted = problem.scene.load.max_indentation * problem.scene.geometry.size[2]
     assert np.linalg.norm(u, axis=1).max() == pytest.approx(wanted, rel=0.01)
+
+
+class Plate:
+    """Softening tissue of a flat surface, 10 mm wide, that snaps at a pressure near one corner."""
+
+    lost = np.inf, np.inf
+    """Between these pressures no equilibrium is found."""
+
+    def __init__(self, snap):
+        x = np.linspace(0.0, 10.0, 21)
+        a = np.add.outer(21 * np.arange(20), np.arange(20)).ravel()  # corners of squares
+        triangles = np.vstack([np.stack([a, a + 21, a + 22], 1), np.stack([a, a + 22, a + 1], 1)])
+        vertices = np.stack([*np.meshgrid(x, x, indexing="ij"), np.zeros((21, 21))], axis=2)
+        normals = np.tile([0.0, 0.0, 1.0], (21 * 21, 1))
+        self.surface = Surface(vertices.reshape(-1, 3), triangles.astype(np.int32), normals)
+        self.limits = np.tile(np.eye(LIMIT_FIELDS)[1:4].sum(axis=0), (21 * 21, 1))
+        self.limits[:, 0] = LIMIT
+        self.models = SimpleNamespace(centres=np.zeros((40, 3)))
+        self.scene = SimpleNamespace(endoscope=SimpleNamespace(max_tilt=30.0))
+        self.snap = snap
+
+    def press(self, position, pressure, direction):
+        moved = pressure**1.8
+        if pressure > self.snap and np.hypot(*position[:2]) < 2.0:
+            moved *= 1.2
+        found = not self.lost[0] < pressure < self.lost[1]
+        return SimpleNamespace(
+            converged=found, parts=((0, 1.0, np.array([moved if found else np.inf])),)
+        )
+
+
+def borne(search, atlas, rng):
+    """Shares of the range that a plate or an atlas bears at the vertices."""
+
+    def ask(_, function, rows):
+        return [function(atlas, *row) for row in rows]
+
+    return bearable_shares(search, atlas, ask, rng)
+
+
+@pytest.mark.parametrize("snap", [0.78, 0.98, 1.03])
+def test_the_range_ends_before_the_tissue_gives_way_and_only_there(snap, rng):
+    plate = Plate(snap * LIMIT)
+    shares = borne(GIVING_WAY, plate, rng)
+    lowered = shares < 1.0
+    away = np.linalg.norm(plate.surface.vertices, axis=1)
+    assert lowered[away < 2.0].all()
+    assert not lowered[away > 2.0 + GIVING_WAY.reach].any()
+    assert (shares[lowered] <= snap / MARGIN).all()
+
+
+def test_tissue_that_only_softens_and_slips_off_nowhere_keeps_its_range(rng):
+    assert (borne(GIVING_WAY, Plate(np.inf), rng) == 1.0).all()
+    assert (borne(SLIPPING_OFF, Edge(slip=np.inf), rng) == 1.0).all()
+
+
+def test_a_trained_slab_hardly_gives_way_in_its_range_and_nothing_slips_off(atlas, rng):
+    assert (borne(GIVING_WAY, atlas, rng) >= 0.7).all()
+    assert (borne(SLIPPING_OFF, atlas, rng) == 1.0).all()
+
+
+class Side:
+    """On which side of the edge the tissue lies."""
+
+    side = None
+
+    def forget(self):
+        self.side = None
+
+
+class Edge(Plate):
+    """Tissue with an edge across it that a deep tip carries along, 1 mm at most."""
+
+    blind = False
+    """Whether no way leads to an answer on the near side."""
+
+    def __init__(self, slip):
+        super().__init__(np.inf)
+        self.limits[:, TIP_DEPTH] = 1.0
+        self.models = SimpleNamespace(centres=np.zeros((100, 3)))
+        self.scene = SimpleNamespace(endoscope=SimpleNamespace(radius=RADIUS))
+        self.slip = slip
+
+    def new_warm(self):
+        return Side()
+
+    def touch(self, position, warm=None):
+        if self.blind and warm is not None and position[0] < EDGE:
+            raise QueryError("position", "below the surface")
+        depth, beyond = RADIUS - position[2], position[0] - EDGE
+        side = np.sign(beyond) or 1.0
+        if warm is not None:
+            carried = warm.side is not None and depth > self.slip and abs(beyond) < 1.0
+            side = warm.side = warm.side if carried else side
+        return SimpleNamespace(converged=True, parts=((3, 1.0, np.array([depth, side])),))
+
+
+def test_the_depth_ends_where_the_way_to_a_contact_matters_and_only_there(rng):
+    plate = Edge(slip=0.5)
+    shares = borne(SLIPPING_OFF, plate, rng)
+    lowered = shares < 1.0
+    away = np.abs(plate.surface.vertices[:, 0] - EDGE)
+    assert lowered[away < 0.5].mean() > 0.9
+    assert not lowered[away > FAR + SLIPPING_OFF.reach].any()
+    assert (shares[lowered] <= 0.5).all()
+    assert (shares[lowered] > 0.3).all()
+
+
+def test_what_has_no_answer_is_no_jump_and_tells_nothing_of_the_way():
+    plate, edge, down = Plate(np.inf), Edge(slip=0.5), np.array([0.0, 0.0, -1.0])
+    plate.lost, edge.blind = (0.9 * LIMIT, 0.97 * LIMIT), True
+    assert limit_load_share(plate, np.zeros(3), down, LIMIT) == 1.0
+    assert path_independent_share(edge, np.array([EDGE + 0.1, 5.0, 0.0])) == 1.0

@@ -7,9 +7,11 @@ from palpate.offline.reduce.ritz import (
     RITZ_VECTORS,
     Footprint,
     energy_pod,
+    local_modes,
     ritz_vectors,
     whole_numbers,
 )
+from palpate.shared.scene import SceneError
 
 PRESSURE = 2.0
 
@@ -58,6 +60,11 @@ def test_vectors_with_no_more_to_give_make_fewer_modes(problem, pressed):
     twice = np.hstack([vectors[:, :4], 2 * vectors[:, :4]])
     assert energy_pod(problem.model, twice, 8)[0].shape[1] == 4
     assert energy_pod(problem.model, vectors, 5)[0].shape[1] == 5
+
+
+def test_more_modes_than_a_region_has_are_refused():
+    with pytest.raises(SceneError, match=r"training\.size\.modes: at most 4 here.*not 5"):
+        local_modes(np.eye(4), 5)
 
 
 def test_modes_in_whole_numbers_stay_orthonormal(rng):

@@ -7,13 +7,13 @@ from pathlib import Path
 import palpate.offline
 from palpate.offline.run.streams import Stage, stream
 
-MAKERS = {"footprint_models.py", "streams.py"}
+MAKERS = {"reduce/footprint_models.py", "run/streams.py"}
 """Sources that may make random numbers: of a scene's or a local model's seed alone."""
 
 FOLDER = Path(palpate.offline.__file__).parent
 SOURCES = {
-    path.name: path.read_text()
-    for part in ("train.py", "fem/*.py", "reduce/*.py", "run/*.py", "validate/*.py")
+    path.relative_to(FOLDER).as_posix(): path.read_text()
+    for part in ("train.py", "choose/*.py", "fem/*.py", "reduce/*.py", "run/*.py", "validate/*.py")
     for path in FOLDER.glob(part)
 }
 """Text of all that takes part in training."""

@@ -83,7 +83,7 @@ class Twins:
         geometry = scene.geometry.model_copy(update=size)
         self.mesh = mesh = build_mesh(scene.model_copy(update={"geometry": geometry}))
         tissue = tissue.model_copy(update={"prony": PRONY if in_time else ()})
-        self.model = model = FullModel(mesh, "hex8", tissue)
+        self.model = model = FullModel(mesh, tissue)
         self.in_time, self.history, self.q = in_time, model.at_rest, np.zeros(modes)
         values, vectors = np.linalg.eigh(model.rest_stiffness.toarray())
         nodal = np.zeros((3 * len(mesh.nodes), modes), np.float32)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 import sys
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -17,18 +16,10 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from palpate.offline.fem.mesh import build_mesh
-from palpate.offline.fem.problem import FullProblem, Load
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.sampling import spread_points
 from palpate.offline.run.streams import Stage, stream
-from palpate.shared.scene import (
-    Block,
-    Divisions,
-    ElementName,
-    Scene,
-    SceneError,
-    divisions_of,
-    parse_scene,
-)
+from palpate.shared.scene import Block, Divisions, Scene, SceneError, divisions_of, parse_scene
 
 Array = NDArray[np.float64]
 
@@ -42,12 +33,6 @@ MOST_DOFS = 40_000
 """Of a mesh that is tried; its reference has more than six times as many."""
 
 PLACES = 12
-
-MOST_DOFS_REFINED = 15_000
-"""Of a scene whose refinement training can afford."""
-
-LINEAR_PER_QUADRATIC = 1.62
-"""Linear elements per quadratic one along each axis, for as many degrees of freedom."""
 
 
 def with_mesh(scene: Scene) -> tuple[Scene, dict[str, Any] | None]:
@@ -90,8 +75,7 @@ def _divided(scene: Scene, divisions: Divisions) -> Scene:
 def _candidates(scene: Scene) -> list[Divisions]:
     """Divisions whose elements are about as long as wide, from coarse to fine."""
     probe = np.array([8, 8, 8])
-    geometry = scene.geometry.model_copy(update={"element": "hex8", "divisions": tuple(probe)})
-    mesh = build_mesh(scene.model_copy(update={"geometry": geometry}))
+    mesh = build_mesh(_changed(scene, element="hex8", divisions=tuple(probe)))
     corners = mesh.nodes[mesh.elements]
     # the lattice's axes: of a block x, y, z; of an extrusion along the section, y, through it
     edges = [np.linalg.norm(corners[:, i] - corners[:, 0], axis=1).mean() for i in (1, 3, 4)]
@@ -112,7 +96,8 @@ def _try(scene: Scene) -> tuple[int, float]:
 
     They are relative to a mesh of more than six times its degrees of freedom.
     """
-    problem, reference = FullProblem(scene), _remeshed(scene, scene.geometry.element, 2.0)
+    finer = tuple(2 * n for n in divisions_of(scene.geometry))
+    problem, reference = FullProblem(scene), FullProblem(_changed(scene, divisions=finer))
     rng = stream(scene.seed, Stage.MESH_CHOICE)
     errors = []
     for point in spread_points(problem.surface, PLACES, rng):
@@ -130,53 +115,6 @@ def _moved(problem: FullProblem, x: Array, normal: Array) -> float:
     return float(load @ u) / float(nodal.sum())
 
 
-def _remeshed(scene: Scene, element: ElementName, factor: float) -> FullProblem:
-    """The scene in another element, with so many times as many of them along every axis."""
-    divisions = tuple(max(1, round(factor * n)) for n in divisions_of(scene.geometry))
-    geometry = scene.geometry.model_copy(update={"element": element, "divisions": divisions})
-    return FullProblem(scene.model_copy(update={"geometry": geometry}))
-
-
-@lru_cache(maxsize=1)
-def _others(problem: FullProblem) -> list[FullProblem]:
-    """The scene with as many degrees of freedom in the other element that does not lock; finer."""
-    scene, element = problem.scene, problem.scene.geometry.element
-    if element == "hex20":
-        other = _remeshed(scene, "hex8-mean-dilatation", LINEAR_PER_QUADRATIC)
-    else:
-        other = _remeshed(scene, "hex20", 1 / LINEAR_PER_QUADRATIC)
-    return [other, _remeshed(scene, element, 2.0)]
-
-
-def mesh_error(problem: FullProblem, load: Load) -> list[tuple[str, int, float]]:
-    """Element, degrees of freedom and mean displacement (mm) under a footprint on three meshes.
-
-    They are the scene's, one of another element, and a finer one.
-    """
-    x, normal, _ = problem.surface.project(load.position)
-    traction = load.pressure * load.direction
-    problems = [problem, *_others(problem)]
-    moved = [np.linalg.norm(own.press_at(x, normal, traction)[1]) for own in problems]
-    return [
-        (own.scene.geometry.element, own.mesh.nodes.size, float(u))
-        for own, u in zip(problems, moved, strict=True)
-    ]
-
-
-def mesh_error_document(found: list[list[tuple[str, int, float]]]) -> dict[str, Any]:
-    """What an artifact keeps of ``mesh_error`` for some loads, relative to the finer mesh."""
-    moved = np.array([[u for *_, u in meshes] for meshes in found])
-    errors, (*meshes, (_, reference_dofs, _)) = moved[:, :2] / moved[:, 2:] - 1, found[0]
-    return {
-        "loads": len(found),
-        "reference_dofs": reference_dofs,
-        "elements": {
-            element: {
-                "dofs": dofs,
-                "mean": float(own.mean()),
-                "least": float(own.min()),
-                "greatest": float(own.max()),
-            }
-            for (element, dofs, _), own in zip(meshes, errors.T, strict=True)
-        },
-    }
+def _changed(scene: Scene, **geometry: object) -> Scene:
+    """The same scene with other values in its geometry, but not in its text."""
+    return scene.model_copy(update={"geometry": scene.geometry.model_copy(update=geometry)})

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from palpate.offline.fem.choose_mesh import SHARE, with_mesh
+from palpate.offline.choose.mesh import SHARE, with_mesh
 from palpate.offline.fem.mesh import build_mesh
 from palpate.offline.scenes import find_scene
 from palpate.shared.scene import SceneError, parse_scene

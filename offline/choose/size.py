@@ -119,10 +119,6 @@ class Trial:
         loads = len(displacement)
         return cls(size, statistics(displacement), von_mises, loads, round(1e6 * seconds, 1))
 
-    def meets(self, tolerance: Tolerance) -> bool:
-        """Whether errors are within tolerance, with a margin."""
-        return self.over(tolerance) <= 1.0
-
     def over(self, tolerance: Tolerance) -> float:
         """Largest ratio of an error to what it may be, less the margin."""
         return max(
@@ -134,30 +130,11 @@ class Trial:
             for key, share in (("p95", MARGIN), ("max", WORST))
         )
 
-    def rungs_to(self, tolerance: Tolerance) -> int:
-        """How many sizes further up a tolerance may just be met, by the fall of the error."""
-        over = self.over(tolerance)
-        return math.ceil(math.log(over) / -math.log(RUNG)) if 0 < over < math.inf else 1
-
     def __str__(self) -> str:
         return (
             f"95th percentile of errors on {self.loads} trial loads "
             f"{self.displacement['p95']:.2%} displacement, {self.von_mises['p95']:.2%} von Mises"
         )
-
-
-class Choice(NamedTuple):
-    """A chosen size, the trials from the smallest to the largest, and why in words."""
-
-    size: Size
-    trials: list[Trial]
-    why: str
-
-    @property
-    def document(self) -> dict[str, Any]:
-        """What an artifact keeps of it."""
-        tried = [vars(trial) | {"size": trial.size.model_dump()} for trial in self.trials]
-        return {"why": self.why, "tried": tried}
 
 
 def ladder(tissue: AnyTissue) -> tuple[Size, ...]:
@@ -183,10 +160,17 @@ def first_place(tolerance: Tolerance) -> int:
 
 def choose(
     sizes: Sequence[Size], tolerance: Tolerance, budget: Budget, attempt: Callable[[Size], Trial]
-) -> Choice:
+) -> tuple[Size, dict[str, Any]]:
     """Find the smallest of sizes in ascending order that meets the tolerance.
 
     A size over the budget is chosen all the same, and the reason says so.
+
+    Returns
+    -------
+    size : Size
+    document : dict
+        What an artifact keeps of the choice: ``why`` in words, and all that was ``tried``, the
+        smallest first.
     """
     trials: dict[int, Trial] = {}
     low, high = 0, len(sizes) - 1
@@ -194,22 +178,25 @@ def choose(
     while low < high:
         place = min(max(guess, low), high - 1)
         trials[place] = attempt(sizes[place])
-        if trials[place].meets(tolerance):
+        over = trials[place].over(tolerance)
+        if over <= 1.0:
             high = place
         else:
             low = place + 1
-        guess = place + trials[place].rungs_to(tolerance)
+        rungs = math.log(over) / -math.log(RUNG) if 0 < over < math.inf else 1
+        guess = place + math.ceil(rungs)
     if low not in trials:  # the largest: nothing smaller will do
         trials[low] = attempt(sizes[low])
     tried = [trials[i] for i in sorted(trials)]
-    reason = _reason(tolerance, budget, trials[low], tried, len(sizes))
-    return Choice(sizes[low], tried, reason)
+    why = _reason(tolerance, budget, trials[low], tried, len(sizes))
+    said = [vars(trial) | {"size": trial.size.model_dump()} for trial in tried]
+    return sizes[low], {"why": why, "tried": said}
 
 
 def _reason(
     tolerance: Tolerance, budget: Budget, chosen: Trial, tried: list[Trial], sizes: int
 ) -> str:
-    if chosen.meets(tolerance):
+    if chosen.over(tolerance) <= 1.0:
         why = f"the smallest of {sizes} sizes that meets the tolerance: {chosen}"
     else:
         why = (

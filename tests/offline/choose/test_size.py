@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from palpate.offline.reduce.sampling import fewer
-from palpate.offline.reduce.size import (
+from palpate.offline.choose.size import (
     LADDER,
     MARGIN,
     RUNG,
@@ -14,8 +13,9 @@ from palpate.offline.reduce.size import (
     choose,
     ladder,
 )
+from palpate.offline.reduce.sampling import fewer
 from palpate.shared.mechanics.neo_hookean import NeoHookeanTissue
-from palpate.shared.scene import Budget, Tolerance
+from palpate.shared.scene import Budget, Size, Tolerance
 
 BUDGET = Budget(query=150e-6)
 TOLERANCE = Tolerance(displacement=0.01, von_mises=0.02)
@@ -45,48 +45,50 @@ def chosen(errors, tolerance=TOLERANCE, slower=0.0):
     ],
 )
 def test_the_smallest_size_that_is_good_enough(smallest, errors, most):
-    choice, tried = chosen([errors(i - smallest) for i in PLACES])
-    assert choice.size == LADDER[smallest]
+    (size, document), tried = chosen([errors(i - smallest) for i in PLACES])
+    assert size == LADDER[smallest]
     assert len(tried) == len(set(tried)) <= most
-    assert choice.why.startswith("the smallest")
-    assert [LADDER.index(trial.size) for trial in choice.trials] == sorted(tried)
+    assert document["why"].startswith("the smallest")
+    assert [Size(**trial["size"]) for trial in document["tried"]] == [
+        LADDER[place] for place in sorted(tried)
+    ]
 
 
 @pytest.mark.parametrize(("allowed", "place"), [(0.01, 3), (0.02, 1), (0.05, 0)])
 def test_a_looser_tolerance_takes_a_smaller_model(allowed, place):
     tolerance = Tolerance(displacement=allowed, von_mises=2 * allowed)
-    assert chosen([0.03, 0.015, 0.01, 0.006, 0.004], tolerance)[0].size == LADDER[place]
+    assert chosen([0.03, 0.015, 0.01, 0.006, 0.004], tolerance)[0][0] == LADDER[place]
     if place == 0:  # and pays for no trial of a large one
         assert chosen([0.03 * RUNG**i for i in PLACES], tolerance)[1] == [0]
 
 
 def test_a_tolerance_out_of_reach_is_said_plainly():
-    choice, _ = chosen([0.5, 0.4, 0.3, 0.2, 0.1])
-    assert choice.size == LADDER[-1]
-    assert "no size meets the tolerance of 1.00%" in choice.why
-    assert "10.00% displacement, 20.00% von Mises" in choice.why
+    (size, document), _ = chosen([0.5, 0.4, 0.3, 0.2, 0.1])
+    assert size == LADDER[-1]
+    assert "no size meets the tolerance of 1.00%" in document["why"]
+    assert "10.00% displacement, 20.00% von Mises" in document["why"]
 
 
 def test_a_budget_exceeded_names_the_best_within_it():
-    choice, _ = chosen([0.5, 0.4, 0.3, 0.005, 0.004], slower=45e-6)
-    assert choice.size == LADDER[3]
-    assert "185 µs to solve, over the budget of 150 µs" in choice.why
-    assert "the best within it" in choice.why
-    assert "30.00% displacement, 60.00% von Mises" in choice.why
+    (size, document), _ = chosen([0.5, 0.4, 0.3, 0.005, 0.004], slower=45e-6)
+    assert size == LADDER[3]
+    assert "185 µs to solve, over the budget of 150 µs" in document["why"]
+    assert "the best within it" in document["why"]
+    assert "30.00% displacement, 60.00% von Mises" in document["why"]
 
 
 def test_a_single_wild_error_is_not_outweighed_by_many_good_ones():
     error = np.full(99, 0.5 * MARGIN * 0.01)
     good = Trial.of(LADDER[0], [TrialResult(error, error, 1e-4)])
     wild = np.append(error, 1.01 * WORST * 0.01)
-    assert good.meets(TOLERANCE)
-    assert not Trial.of(LADDER[0], [TrialResult(wild, error, 1e-4)]).meets(TOLERANCE)
+    assert good.over(TOLERANCE) <= 1.0
+    assert Trial.of(LADDER[0], [TrialResult(wild, error, 1e-4)]).over(TOLERANCE) > 1.0
 
 
 def test_one_patch_may_lie_where_tissue_gives_way_and_two_may_not():
     good, wild = (TrialResult(error, error, 1e-4) for error in np.outer([0.004, 0.2], np.ones(9)))
-    assert Trial.of(LADDER[0], [good, good, wild]).meets(TOLERANCE)
-    assert not Trial.of(LADDER[0], [good, wild, wild]).meets(TOLERANCE)
+    assert Trial.of(LADDER[0], [good, good, wild]).over(TOLERANCE) <= 1.0
+    assert Trial.of(LADDER[0], [good, wild, wild]).over(TOLERANCE) > 1.0
 
 
 def test_a_looser_tolerance_is_served_by_fewer_samples():
