@@ -53,14 +53,14 @@ class Shipped(Method):
         except QueryError:
             return Answer(state, False, refused=True)
         if not found.converged:
-            return Answer(state, False, found.iterations)
+            return Answer(state, False)
         tolerance = self._atlas.scene.tolerance
         doubted = not (
             found.in_range
             and found.error_displacement <= tolerance.displacement
             and found.error_von_mises <= tolerance.von_mises
         )
-        return Answer(found, True, found.iterations, doubted)
+        return Answer(found, doubted=doubted)
 
     def _ask(self, state: Found | None, case: Case, dt: float) -> Found:
         """Put a case of one contact to the reduced model."""

@@ -112,7 +112,7 @@ def chart(
     """
     in_time = scene is None
     layout = drawing.IN_TIME if in_time else drawing.OF_LOADS
-    atlas, problem = full.opened(artifact, scene, in_time)
+    atlas, problem = full.opened(artifact, scene)
     plan = plan or (PLAN_IN_TIME if in_time else PLAN)
     if not in_time:
         plan = {**plan, "pod": sorted({*plan["pod"], Shipped(problem, atlas).unknowns})}

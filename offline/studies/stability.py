@@ -116,17 +116,19 @@ def stability(
         has no answer to.
     """
     in_time = scene is None
-    atlas, problem = opened(artifact, scene, in_time)
+    atlas, problem = opened(artifact, scene)
     title, rows, stage, most = (
         ("stability_in_time", METHODS_IN_TIME, Stage.STABILITY_IN_TIME_SNAPSHOTS, SNAPSHOTS_IN_TIME)
         if in_time
         else ("stability", METHODS, Stage.STABILITY_SNAPSHOTS, SNAPSHOTS)
     )
     wanted = [name for name in methods or rows if name != TIP or atlas.models.viscous_tips]
-    if in_time:
-        asked = _histories(atlas, problem, [False, True][: 1 + (TIP in wanted)], cases, seed, many)
-    else:
+    asked: dict[str, list[HardCase]] = {}
+    if not in_time:
         asked = hard_cases.HardLoads(atlas, problem, cases, seed).cases()
+    for tip in [False, True][: (1 + (TIP in wanted)) * in_time]:
+        for kind, own in histories(atlas, problem, tip, cases, seed, many).items():
+            asked.setdefault(kind, []).extend(own)
     asked = {kind: asked[kind] for kind in kinds or asked}
     poissons = sorted({case.poisson for own in asked.values() for case in own})
     random = stream(atlas.scene.seed, stage)
@@ -147,17 +149,16 @@ def stability(
         own_tissue = hard_cases.tissue(problem, poisson)
         training = Training(own_tissue, snapshots(pairs), atlas, in_time=in_time)
         for name in tqdm(wanted, f"methods, Poisson {poisson:g}"):
-            own = {
+            put = {
                 kind: [q for q in every if _applies(name, q.case, poisson, atlas)]
                 for kind, every in questions.items()
             }
             label = f"answers {name} {poisson:g}"
             if label not in checkpoint:
-                checkpoint.store(
-                    label, _answers(name, rows[name], training, [*chain(*own.values())])
-                )
+                found = _answers(name, rows[name], training, [*chain(*put.values())])
+                checkpoint.store(label, found)
             results = iter(checkpoint.load(label))
-            table[name] |= {kind: [next(results) for _ in x] for kind, x in own.items() if x}
+            table[name] |= {kind: [next(results) for _ in x] for kind, x in put.items() if x}
     noun = "histories (one of those of many steps)" if in_time else "loads"
     kept = [kind for kind, own in questions.items() if own]
     outcomes.publish(artifact.parent / atlas.name / "report", title, table, kept, noun)
@@ -166,17 +167,6 @@ def stability(
     return outcomes.summaries(table) | {
         "without_equilibrium": {kind: count for kind, count in missing.items() if count}
     }
-
-
-def _histories(
-    atlas: ReducedModel, problem: FullProblem, tips: Sequence[bool], *settings: int
-) -> dict[str, list[HardCase]]:
-    """Hard histories of footprints, and of the rigid tip if that is wanted."""
-    cases: dict[str, list[HardCase]] = {}
-    for tip in tips:
-        for kind, own in histories(atlas, problem, tip, *settings).items():
-            cases.setdefault(kind, []).extend(own)
-    return cases
 
 
 def _applies(method: str, case: HardCase, poisson: float, atlas: ReducedModel) -> bool:

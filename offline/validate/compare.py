@@ -1,4 +1,4 @@
-"""Answers of the reduced model beside full solutions, query by query.
+"""The reduced against the full model, query by query, on queries that training has not seen.
 
 A query is a list of time steps; without time its length is one.
 """
@@ -6,16 +6,22 @@ A query is a list of time steps; without time its length is one.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from palpate.offline.fem.norms import relative, statistics
 from palpate.offline.fem.problem import FullProblem, Load, Reference, Step
+from palpate.offline.run.tables import write_csv
+from palpate.offline.run.workers import completed, open_artifact, worker_pool
 from palpate.offline.validate.calibrate import KnownAnswer, coverage
-from palpate.offline.validate.kinds import LOADS, Kind
+from palpate.offline.validate.queries import LOADS, Kind, held_out
 from palpate.shared.answer import Answer
+from palpate.shared.artifact import read_artifact
+from palpate.shared.errors import PalpateError, QueryError
 from palpate.shared.model import ReducedModel
 from palpate.shared.reduced.transfer import REST
 
@@ -207,3 +213,72 @@ def summarise(kind: Kind, rows: Sequence[Row]) -> dict[str, Any]:
         summary[name] = statistics([row[name] for row in counted])
     medians = dict(zip(kind.quantities, ratios.tolist(), strict=True))
     return summary | {"estimate_over_error_median": medians}
+
+
+def write_rows(path: Path, kind: Kind, rows: Sequence[Row]) -> None:
+    """Write tables of queries, one line each; single answers with their estimated errors."""
+    names = [] if kind.in_time else [f"estimated_{name}" for name in kind.quantities]
+    estimated = [dict(zip(names, row.known[0].estimated.tolist(), strict=False)) for row in rows]
+    write_csv(path, [row.table | own for row, own in zip(rows, estimated, strict=True)])
+
+
+def opened(artifact: Path, *kinds: Kind) -> tuple[ReducedModel, FullProblem]:
+    """Reduced and full model of an artifact.
+
+    Raises
+    ------
+    QueryError
+        If the artifact has no answers to queries of one of the kinds.
+    """
+    model = ReducedModel.load(artifact)
+    for kind in kinds:
+        if lack := kind.lacks(model.models):
+            raise QueryError("scene", f"{model.name!r} {lack}")
+    return model, FullProblem.of_artifact(read_artifact(artifact))
+
+
+def against_full(
+    artifact: Path, kind: Kind, count: int, seed: int, csv: Path | None = None
+) -> dict[str, Any]:
+    """Compare an artifact with its full model on new random queries, written one by one to a CSV.
+
+    Returns
+    -------
+    dict
+        As ``summarise``, and ``without_equilibrium``: queries that the full model had no answer to,
+        and which count in nothing else.
+
+    Raises
+    ------
+    PalpateError
+        If the full model has no answer to any of them.
+    QueryError
+        If the artifact has none to this kind.
+    """
+    model, problem = opened(artifact, kind)
+    queries = kind.random(model, count, held_out(model, seed))
+    tasks = {str(i): reference_task(model, query) for i, query in enumerate(queries)}
+    rows = {}
+    with worker_pool(open_artifact, artifact) as pool:
+        for name, full in tqdm(completed(pool, tasks), "full solutions", count):
+            if full is not None:
+                rows[int(name)] = compare(kind, problem, model, queries[int(name)], full)
+    if not rows:
+        raise PalpateError(f"{artifact}: the full model has no equilibrium under any of the loads")
+    ordered = [rows[i] for i in sorted(rows)]
+    if csv:
+        write_rows(csv, kind, ordered)
+    return summarise(kind, ordered) | {"without_equilibrium": count - len(ordered)}
+
+
+def reference_task(model: ReducedModel, query: Sequence[Step]) -> tuple[Any, ...]:
+    """Task of a query's full solutions.
+
+    Under the tip a single one is sought near the reduced answer: a free edge can rest on either
+    side of it.
+    """
+    (*_, last) = query
+    if len(query) > 1 or isinstance(last, Load):
+        return FullProblem.reference, query
+    (answer,) = play(model, query)
+    return FullProblem.reference, query, model.displacement(answer)
