@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.problem import Load
-from palpate.offline.reduce.sampling import tangents
+from palpate.offline.reduce.sampling import random_tangent
 from palpate.offline.validate.compare import opened
 from palpate.offline.validate.queries import Place, held_out_loads
 from palpate.shared.answer import Answer
@@ -106,13 +106,13 @@ def walk(
     place = Place.at(atlas, start.position)
     share = start.pressure / place.limit(start.direction)
     cosine = min(1.0, -float(start.direction @ place.normal))
-    heading, turns = _random_tangent(place.normal, rng), 0
+    heading, turns = random_tangent(place.normal, rng), 0
     loads: list[Load] = []
     while len(loads) < count:
         reached = Place.at(atlas, place.position + step * heading)
         moved = np.linalg.norm(reached.position - place.position)
         if moved < 0.9 * step and turns < TURNS:
-            heading, turns = _random_tangent(place.normal, rng), turns + 1
+            heading, turns = random_tangent(place.normal, rng), turns + 1
             continue
         place, turns = reached, 0
         heading = heading - (heading @ place.normal) * place.normal
@@ -120,9 +120,3 @@ def walk(
         direction = math.sqrt(1 - cosine**2) * heading - cosine * place.normal
         loads.append(place.press(direction, share))
     return loads
-
-
-def _random_tangent(normal: Array, rng: np.random.Generator) -> Array:
-    turn = 2 * math.pi * rng.random()
-    t, b = tangents(normal)
-    return math.cos(turn) * t + math.sin(turn) * b

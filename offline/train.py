@@ -64,8 +64,15 @@ from palpate.offline.run.workers import (
 )
 from palpate.offline.run.writing import provenance, write_model
 from palpate.offline.scenes import default_artifact, find_scene
-from palpate.offline.validate.calibrate import calibrate, calibrate_by_halves
-from palpate.offline.validate.compare import Row, compare, reference_task, summarise, write_rows
+from palpate.offline.validate.compare import (
+    Row,
+    calibrate,
+    calibrate_by_halves,
+    compare,
+    reference_task,
+    summarise,
+    write_rows,
+)
 from palpate.offline.validate.queries import KINDS, LOADS, Kind
 from palpate.shared.artifact import ArtifactError, read_artifact
 from palpate.shared.local_models import Estimator, LocalModels

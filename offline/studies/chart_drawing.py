@@ -34,37 +34,6 @@ STATISTICS = ("median", "p95", "max")
 ACCENT, DARK_ACCENT = "#D55E00", "#A34700"
 """Of what is Palpate's; the second for letters."""
 
-SIZES = {"*": (17.0, 5), "P": (11.0, 4)}
-"""Of markers that stand out, and how high they lie."""
-
-GROUPS: dict[str, tuple[str, dict[str, str]]] = {
-    "Palpate": (ACCENT, {"artifact": "this artifact", "artifact, warm": "the same without memory"}),
-    "Finite elements": ("#000000", {"full": "full model, several meshes"}),
-    "Modes of the body at rest": (
-        "#0072B2",
-        {"modal": "vibration modes", "ritz": "responses to loads (Ritz)",
-         "krylov": "load-dependent vectors (Krylov)"},
-    ),
-    "POD, hyper-reduced": (
-        "#E69F00",
-        {"pod-ecm": "cubature of points (ECM)", "pod-ecsw": "cubature of elements (ECSW)",
-         "pod-deim": "interpolation (DEIM)", "pod-gappy": "least squares (gappy POD)"},
-    ),
-    "Modes made for each load": (
-        "#56B4E9", {"ritz-at-hand": "Ritz vectors", "derivatives": "static derivatives"}
-    ),
-    "POD of full solutions": (
-        "#009E73", {"pod": "energy norm", "pod-euclidean": "Euclidean norm"}
-    ),
-    "No equilibrium solved": (
-        "#CC79A7", {"linear": "linear response", "regression": "regression (RBF)"}
-    ),
-    "Springs and tetrahedra": (
-        "#7A7A7A", {"mass-spring": "mass-spring", "tensor-mass": "tensor-mass"}
-    ),
-}  # fmt: skip
-"""Colour of a group, and the names of its methods by family; a marker each, in this order."""
-
 PAGE_MARKERS = {
     "o": "circle", "s": "square", "^": "triangle-up", "D": "diamond", "*": "star", "P": "cross",
 }  # fmt: skip
@@ -72,23 +41,37 @@ PAGE_MARKERS = {
 
 
 class Look(NamedTuple):
-    """How a method is drawn; what is Palpate's stands out."""
+    """How a method is drawn."""
 
-    name: str
     group: str
+    name: str
     colour: str
     marker: str
-    size: float  # points
-    above: int  # the rest
+    size: float = 5.5  # points
+    above: int = 3  # higher than others where they meet
 
 
 LOOKS = {
-    family: Look(name, group, colour, marker, *SIZES.get(marker, (5.5, 3)))
-    for group, (colour, methods) in GROUPS.items()
-    for (family, name), marker in zip(
-        methods.items(), "*P" if group == "Palpate" else "os^D", strict=False
-    )
+    "artifact": Look("Palpate", "this artifact", ACCENT, "*", 17.0, 5),
+    "artifact, warm": Look("Palpate", "the same without memory", ACCENT, "P", 11.0, 4),
+    "full": Look("Finite elements", "full model, several meshes", "#000000", "o"),
+    "modal": Look("Modes of the body at rest", "vibration modes", "#0072B2", "o"),
+    "ritz": Look("Modes of the body at rest", "responses to loads (Ritz)", "#0072B2", "s"),
+    "krylov": Look("Modes of the body at rest", "load-dependent vectors (Krylov)", "#0072B2", "^"),
+    "pod-ecm": Look("POD, hyper-reduced", "cubature of points (ECM)", "#E69F00", "o"),
+    "pod-ecsw": Look("POD, hyper-reduced", "cubature of elements (ECSW)", "#E69F00", "s"),
+    "pod-deim": Look("POD, hyper-reduced", "interpolation (DEIM)", "#E69F00", "^"),
+    "pod-gappy": Look("POD, hyper-reduced", "least squares (gappy POD)", "#E69F00", "D"),
+    "ritz-at-hand": Look("Modes made for each load", "Ritz vectors", "#56B4E9", "o"),
+    "derivatives": Look("Modes made for each load", "static derivatives", "#56B4E9", "s"),
+    "pod": Look("POD of full solutions", "energy norm", "#009E73", "o"),
+    "pod-euclidean": Look("POD of full solutions", "Euclidean norm", "#009E73", "s"),
+    "linear": Look("No equilibrium solved", "linear response", "#CC79A7", "o"),
+    "regression": Look("No equilibrium solved", "regression (RBF)", "#CC79A7", "s"),
+    "mass-spring": Look("Springs and tetrahedra", "mass-spring", "#7A7A7A", "o"),
+    "tensor-mass": Look("Springs and tetrahedra", "tensor-mass", "#7A7A7A", "s"),
 }
+"""Methods by family, in groups of a colour."""
 
 NAMES = {
     "linear 160": ("linear\nresponse", (-4, -26), "left"),
@@ -282,7 +265,7 @@ def _draw_legend(axes: Axes, rows: Sequence[Row]) -> None:
     )  # fmt: skip
     words = axes.text(0, 0, NOTE, transform=axes.transAxes, fontsize=9.5, linespacing=1.4)
     for text in legend.get_texts():
-        if text.get_text() in GROUPS:
+        if text.get_text() in {look.group for look in LOOKS.values()}:
             text.set_fontweight("bold")
     for artist in (legend, words):
         artist.set_in_layout(False)

@@ -27,32 +27,22 @@ ROUGHLY = 0.1
 """Displacement error up to which a wrong answer is roughly right; the artifact is nearly the only
 method within the tolerance of a scene."""
 
-RIGHT = "right"
-RIGHT_FLAGGED = "right but flagged"
-WRONG_FLAGGED = "wrong but flagged"
-ANOTHER_FLAGGED = "another equilibrium but flagged"
-REFUSED = "refused, or rightly none"
-DIVERGED = "not converged"
-ANOTHER = "silently another equilibrium"
-ROUGH = "silently wrong, displacement within 10 %"
-SILENT = "silently wrong"
-INVERTED = "silently inverted"
-
 OUTCOMES = {
-    RIGHT: "#0072B2",
-    RIGHT_FLAGGED: "#8CC5E8",
-    WRONG_FLAGGED: "#C8C8C8",
-    ANOTHER_FLAGGED: "#EBC9DB",
-    REFUSED: "#ECECEC",
-    DIVERGED: "#7F7F7F",
-    ANOTHER: "#CC79A7",
-    ROUGH: "#F0E442",
-    SILENT: "#D55E00",
-    INVERTED: "#000000",
+    "right": "#0072B2",
+    "right but flagged": "#8CC5E8",
+    "wrong but flagged": "#C8C8C8",
+    "another equilibrium but flagged": "#EBC9DB",
+    "refused, or rightly none": "#ECECEC",
+    "not converged": "#7F7F7F",
+    "silently another equilibrium": "#CC79A7",
+    "silently wrong, displacement within 10 %": "#F0E442",
+    "silently wrong": "#D55E00",
+    "silently inverted": "#000000",
 }
 """What can become of an answer, and its colour: after Okabe & Ito, safe for colour-blind eyes."""
 
-SILENT_OUTCOMES = (ANOTHER, ROUGH, SILENT, INVERTED)
+RIGHT, RIGHT_FLAGGED, WRONG_FLAGGED, ANOTHER_FLAGGED, REFUSED, DIVERGED, *SILENT_OUTCOMES = OUTCOMES
+ANOTHER, ROUGH, SILENT, INVERTED = SILENT_OUTCOMES
 
 
 @dataclass(frozen=True)

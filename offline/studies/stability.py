@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -149,16 +148,15 @@ def stability(
         own_tissue = hard_cases.tissue(problem, poisson)
         training = Training(own_tissue, snapshots(pairs), atlas, in_time=in_time)
         for name in tqdm(wanted, f"methods, Poisson {poisson:g}"):
-            put = {
-                kind: [q for q in every if _applies(name, q.case, poisson, atlas)]
-                for kind, every in questions.items()
-            }
             label = f"answers {name} {poisson:g}"
             if label not in checkpoint:
-                found = _answers(name, rows[name], training, [*chain(*put.values())])
-                checkpoint.store(label, found)
-            results = iter(checkpoint.load(label))
-            table[name] |= {kind: [next(results) for _ in x] for kind, x in put.items() if x}
+                put = {
+                    kind: [q for q in every if _applies(name, q.case, poisson, atlas)]
+                    for kind, every in questions.items()
+                }
+                put = {kind: own for kind, own in put.items() if own}
+                checkpoint.store(label, _answers(name, rows[name], training, put) if put else {})
+            table[name] |= checkpoint.load(label)
     noun = "histories (one of those of many steps)" if in_time else "loads"
     kept = [kind for kind, own in questions.items() if own]
     outcomes.publish(artifact.parent / atlas.name / "report", title, table, kept, noun)
@@ -184,19 +182,18 @@ def _answers(
     name: str,
     named: tuple[str, float] | None,
     training: Training,
-    questions: Sequence[Question],
-) -> list[Result]:
+    asked: Mapping[str, Sequence[Question]],
+) -> dict[str, list[Result]]:
     """What becomes of a method's answers; of the full model's jump if there is no method."""
-    problem = training.problem
-    if named is None:
-        return [
-            outcomes.classify(problem, q.jump, q.jump is not None, q.exact, q.other)
-            for q in questions
-        ]
-    if not questions:
-        return []
-    method, every = build(*named, training), LARGER if name == STEPS else 1
-    return [_answer(method, problem, question, every) for question in questions]
+    problem, every = training.problem, LARGER if name == STEPS else 1
+    method = None if named is None else build(*named, training)
+
+    def answer(q: Question) -> Result:
+        if method is not None:
+            return _answer(method, problem, q, every)
+        return outcomes.classify(problem, q.jump, q.jump is not None, q.exact, q.other)
+
+    return {kind: [answer(question) for question in own] for kind, own in asked.items()}
 
 
 def _answer(method: Method, problem: FullProblem, question: Question, every: int) -> Result:

@@ -9,7 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.offline.fem.problem import Load, Step, TipPosition
-from palpate.offline.reduce.sampling import cone, random_points, random_points_and_rim, tangents
+from palpate.offline.reduce.sampling import (
+    cone,
+    random_points,
+    random_points_and_rim,
+    random_tangent,
+)
 from palpate.offline.run.streams import Stage, stream
 from palpate.shared.local_models import LocalModels
 from palpate.shared.mechanics.footprint import TIP_DEPTH, pressure_limit
@@ -157,8 +162,7 @@ class Tool:
     def _slide(self) -> Iterator[Step]:
         """Move over the surface at 3 to 30 mm/s, as far as 8 mm or to where it ends."""
         speed, length = 10 ** self._rng.uniform(0.5, 1.5), self._rng.uniform(2.0, 8.0)
-        turn = self._rng.uniform(0, 2 * np.pi)
-        heading = np.array([np.cos(turn), np.sin(turn)]) @ np.array(tangents(self._place.normal))
+        heading = random_tangent(self._place.normal, self._rng)
         count = int(np.ceil(length / 0.5))
         for _ in range(count):
             self._go(self._place.position + length / count * heading)
@@ -184,31 +188,12 @@ class Kind(NamedTuple):
     tip: bool  # whether the rigid tip presses, not a footprint
     in_time: bool  # whether over a history
     stage: Stage  # whose random numbers training draws
+    document: str  # name of its summary in an artifact
+    title: str  # what its full solutions are called
     damping: float  # of the error estimate, see ``calibrate``
+    coverage: float  # of it, so that it covers 95 % of unseen errors; those of a history are alike
+    quantities: tuple[str, ...]  # what errors are estimated of; the force of a footprint is given
     others: tuple[str, ...]  # what a summary has statistics of beside the quantities
-
-    @property
-    def document(self) -> str:
-        """Name of its summary in an artifact."""
-        return "validation" + "_tip" * self.tip + "_histories" * self.in_time
-
-    @property
-    def title(self) -> str:
-        """What its full solutions are called."""
-        return f"full {'histories' if self.in_time else 'solutions'}" + " under the tip" * self.tip
-
-    @property
-    def quantities(self) -> tuple[str, ...]:
-        """What errors are estimated of; the force of a footprint is given."""
-        return ("displacement", "von_mises", "force")[: 3 if self.tip else 2]
-
-    @property
-    def coverage(self) -> float:
-        """Of the error estimate, so that it covers 95 % of unseen errors; see ``calibrate``.
-
-        Answers within one history err alike.
-        """
-        return 0.97 if self.in_time else 0.96
 
     def random(
         self, model: ReducedModel, count: int, rng: np.random.Generator
@@ -226,15 +211,25 @@ class Kind(NamedTuple):
         return "is elastic and has no histories" if self.in_time and not models.viscous else None
 
 
-LOADS = Kind("loads", False, False, Stage.VALIDATION, 0.3, ("von_mises_p99",))
-TIP = Kind("touches", True, False, Stage.TIP_VALIDATION, 1.0, ("tangent", "penetration_over_depth"))
+FIELDS = "displacement", "von_mises"
+LOADS = Kind(
+    "loads", False, False, Stage.VALIDATION, "validation", "full solutions", 0.3, 0.96,
+    FIELDS, ("von_mises_p99",),
+)  # fmt: skip
+TIP = Kind(
+    "touches", True, False, Stage.TIP_VALIDATION, "validation_tip",
+    "full solutions under the tip", 1.0, 0.96,
+    (*FIELDS, "force"), ("tangent", "penetration_over_depth"),
+)  # fmt: skip
 HISTORIES = Kind(
-    "histories", False, True, Stage.HISTORY_VALIDATION, 30.0,
-    ("depth", "worst_displacement", "worst_von_mises", "last_displacement"),
+    "histories", False, True, Stage.HISTORY_VALIDATION, "validation_histories",
+    "full histories", 30.0, 0.97,
+    FIELDS, ("depth", "worst_displacement", "worst_von_mises", "last_displacement"),
 )  # fmt: skip
 TIP_HISTORIES = Kind(
-    "courses", True, True, Stage.TIP_HISTORY_VALIDATION, 30.0,
-    tuple(f"{of}_{name}" for of in ("worst", "together") for name in TIP.quantities),
+    "courses", True, True, Stage.TIP_HISTORY_VALIDATION, "validation_tip_histories",
+    "full histories under the tip", 30.0, 0.97,
+    TIP.quantities, tuple(f"{of}_{x}" for of in ("worst", "together") for x in TIP.quantities),
 )  # fmt: skip
 
 KINDS = (LOADS, TIP, HISTORIES, TIP_HISTORIES)
