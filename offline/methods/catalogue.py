@@ -34,7 +34,6 @@ from palpate.offline.methods.spaces import Inner, krylov, mass, modal, pod, stat
 from palpate.offline.methods.tetrahedra import MassSpring, TensorMass
 from palpate.offline.reduce.ritz import TANGENTIAL
 from palpate.offline.reduce.sampling import spread_points, tangents
-from palpate.shared.errors import PalpateError
 from palpate.shared.model import ReducedModel
 
 Array = NDArray[np.float64]
@@ -56,7 +55,7 @@ class Training:
 
     problem: FullProblem  # with the scene's files, if there are to be methods on other meshes
     snapshots: Snapshots
-    atlas: ReducedModel | None = None  # of the same mesh, for the methods that query it
+    atlas: ReducedModel  # of the same mesh, for the methods that query it
     seed: int = 0
     in_time: bool = False  # whether the methods that can remember what happened before
 
@@ -162,8 +161,6 @@ def loads_about(problem: FullProblem, case: Case) -> Array:
 
 
 def _shipped(size: int, training: Training, way: Way = "cold") -> Method:
-    if training.atlas is None:
-        raise PalpateError("artifact: the training context has none")
     if way == "cold" and training.in_time:
         way = "in time"
     return Shipped(training.problem, training.atlas, way)

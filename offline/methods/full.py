@@ -87,11 +87,8 @@ class Remeshed(Method):
         The accessible surface of the other mesh ends at other faces: projected onto that, a
         contact on the rim would move.
         """
-        load = np.zeros_like(self.other.mesh.nodes)
-        for contact, foot in zip(case.contacts, case.feet, strict=True):
-            nodal = self.other.unit_load_at(*foot, case.radius)
-            load += contact.pressure * nodal[:, None] * contact.direction
-        return load
+        own = Case.of(self.other, *case.contacts, feet=case.feet, radius=case.radius)
+        return own.load(len(self.other.mesh.nodes))
 
     def field(self, state: Array) -> Array:
         """See ``Method``."""

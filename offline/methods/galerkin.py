@@ -26,7 +26,6 @@ from palpate.shared.reduced.corrections import Secants, forget_secants
 from palpate.shared.reduced.past import Elastic, Memory, Remembering, opened, remembering
 from palpate.shared.reduced.points import (
     LANES,
-    STATE,
     Points,
     increments,
     linearise,
@@ -244,16 +243,6 @@ class Galerkin(Method):
         tiles = histories.reshape(terms, -1, SYMMETRIC, LANES).transpose(0, 1, 3, 2)
         points = tiles.reshape(terms, -1, SYMMETRIC)[:, : elements * own].astype(float)
         return Past(self.field(state), points.reshape(terms, elements, own, SYMMETRIC))
-
-    def tangent(self, test: Field) -> Array:
-        """Tangent (r, r) of elastic tissue where ``stress_points`` has been, just before.
-
-        ``test`` (r, 9 c) are gradients of the test functions: Galerkin's are those of the modes.
-        """
-        products = np.empty_like(test)
-        state = np.empty(STATE * len(self.content.points.weights), np.float32)
-        linearise_points(self._bound, state, products)
-        return np.eye(len(products)) + test @ products.T
 
 
 class GalerkinAtHand(Galerkin):

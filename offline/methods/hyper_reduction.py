@@ -25,23 +25,31 @@ a cubature of positive weights.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from contextlib import suppress
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from palpate.offline.fem.model import FullModel
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods.galerkin import (
     TOLERANCE,
+    Content,
     Cubature,
+    Field,
     Galerkin,
+    linearise_points,
     reduce_load,
     stress_points,
 )
 from palpate.offline.methods.method import Answer, Case
 from palpate.offline.reduce.cubature import by_point, compress, nonnegative, training_forces
+from palpate.shared.compiled import bind
+from palpate.shared.reduced.points import STATE, Points, project
 
 Array = NDArray[np.float64]
 
@@ -62,13 +70,15 @@ def contributions(
     root of the compliance, relative to the answer: an error of their sum is then a relative error
     of displacement in the energy norm.
     """
-    states = []
+    states, content, points = [], bind(reduced.content), reduced.content.points
+    tangent, products = _scratch(points), np.empty_like(points.gradients)
     for answer in map(reduced.solve, cases):
         if answer.converged:
-            q, points = answer.state, reduced.content.points
-            stress_points(reduced.content, q)
-            looks = np.linalg.inv(np.linalg.cholesky(reduced.tangent(points.gradients)).T)
-            states.append((q, looks / np.linalg.norm(q), None))
+            q = answer.state
+            stress_points(content, q)
+            linearise_points(content, tangent, products)
+            L = np.linalg.cholesky(np.eye(len(q)) + points.gradients @ products.T)
+            states.append((q, np.linalg.inv(L.T) / np.linalg.norm(q), None))
     law = points.weights, points.law
     return training_forces(by_point(points.gradients), law, states, LOOKS, RESPONSES, rng)
 
@@ -116,6 +126,38 @@ def sample(modes: Array, per_mode: int) -> NDArray[np.int64]:
     return np.unique(chosen)
 
 
+class _Content(NamedTuple):
+    trial: Content
+    test: Field  # (r, 9 c) gradients of the test functions, in tiles
+    state: Field  # scratch of ``linearise_points``
+    products: Field  # (r, 9 c)
+
+
+def _scratch(points: Points) -> Field:
+    return np.empty(STATE * len(points.weights), np.float32)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _newton(content, nodes, forces):
+    """Plain Newton's method from rest: whether it converges, and ``q``."""
+    trial, test = content.trial, content.test
+    q, f, residual = trial.q, trial.load.f, trial.newton[0]
+    reduce_load(trial.modes, nodes, forces, f)
+    q[:] = f
+    target = max(TOLERANCE * math.sqrt(np.dot(f, f)), 1e-12)
+    for _ in range(MAX_ITERATIONS):
+        if not stress_points(trial, q) > 0.0:
+            return False
+        project(test, trial.work.P, residual)
+        residual += q - f
+        if math.sqrt(np.dot(residual, residual)) <= target:
+            return True
+        linearise_points(trial, content.state, content.products)
+        tangent = np.eye(len(q)) + np.dot(test, content.products.T)
+        q -= np.linalg.solve(tangent, residual)
+    return False
+
+
 class PlainNewton(Galerkin):
     """A reduced model by Newton's method without a line search: every step is taken whole.
 
@@ -130,26 +172,19 @@ class PlainNewton(Galerkin):
         functions: Array | None = None,
     ) -> None:
         super().__init__(problem, basis, cubature)
-        self.label, self._test = "no line search", self.content.points.gradients
+        self.label, points = "no line search", self.content.points
+        test, products = points.gradients, np.empty_like(points.gradients)
         if functions is not None:
-            self._test = np.empty_like(self._test)
-            self.write_gradients(functions, self._test)
+            test = np.empty_like(test)
+            self.write_gradients(functions, test)
+        self._plain = bind(_Content(self.content, test, _scratch(points), products))
 
     def step(self, state: Array | None, case: Case, dt: float = 0.0) -> Answer:
         """See ``Method``."""
-        content, f = self.content, np.empty_like(self.content.q)
-        reduce_load(content.modes, case.nodes, case.forces, f)
-        q, target = f, max(TOLERANCE * float(np.linalg.norm(f)), 1e-12)
-        # a singular tangent, or none that is finite
-        with np.errstate(all="ignore"), suppress(np.linalg.LinAlgError):
-            for _ in range(MAX_ITERATIONS):
-                if not stress_points(self._bound, q) > 0.0:
-                    break
-                residual = q + self._test @ content.work.P - f
-                if np.linalg.norm(residual) <= target:
-                    return Answer(q)
-                q = q - np.linalg.solve(self.tangent(self._test), residual)
-        return Answer(state, False)
+        found = False
+        with suppress(np.linalg.LinAlgError):  # a singular tangent, or none that is finite
+            found = _newton(self._plain, case.nodes, case.forces)
+        return Answer(self.content.q.copy() if found else state, found)
 
 
 class Deim(PlainNewton):

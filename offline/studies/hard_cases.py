@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +25,7 @@ from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.methods.method import Case, Steps
 from palpate.offline.reduce.sampling import cone, random_points
 from palpate.offline.run.streams import Stage, stream
-from palpate.offline.studies.references import Fields, followed
+from palpate.offline.studies.references import Fields, followed, of_tissue
 from palpate.offline.validate.queries import Place, random_loads
 from palpate.shared.model import ReducedModel
 
@@ -105,7 +105,7 @@ class Question(NamedTuple):
 
 def ask_full_model(problem: FullProblem, case: HardCase) -> Question:
     """Full solutions of a hard case; a task for ``run.workers``."""
-    own = tissue(problem, case.poisson)
+    own = of_tissue(problem, poisson=case.poisson)
     if case.history:
         found = None if case.nonsense else followed(own, case.brief or case.steps, case.tip)
         return Question(case, found, found)
@@ -128,16 +128,6 @@ def _lead(problem: FullProblem, loads: Sequence[Array], finest: float) -> Fields
         except NoEquilibrium:
             return None
     return None if u is None else Fields.at_once(problem, [u])
-
-
-@lru_cache(maxsize=1 + len(RATIOS))
-def tissue(problem: FullProblem, poisson: float) -> FullProblem:
-    """The same body of tissue of another Poisson's ratio."""
-    scene = problem.scene
-    if poisson == scene.tissue.poisson:
-        return problem
-    other = scene.tissue.model_copy(update={"poisson": poisson})
-    return FullProblem(scene.model_copy(update={"tissue": other}), problem.mesh)
 
 
 def several(questions: Mapping[str, Sequence[Question]], most: int) -> dict[str, list[Question]]:

@@ -76,6 +76,16 @@ def opened(artifact: Path, scene: Scene | None) -> tuple[ReducedModel, FullProbl
     return atlas, FullProblem(scene, problem.mesh)
 
 
+@lru_cache(maxsize=4)
+def of_tissue(problem: FullProblem, **changes: Any) -> FullProblem:
+    """The same body of tissue that differs in what is given."""
+    scene = problem.scene
+    if all(getattr(scene.tissue, key) == value for key, value in changes.items()):
+        return problem
+    other = scene.tissue.model_copy(update=changes)
+    return FullProblem(scene.model_copy(update={"tissue": other}), problem.mesh)
+
+
 def kept_results(artifact: Path, scene: Scene, name: str, settings: object) -> Checkpoint:
     """What a killed study goes on from: named by all that its results depend on."""
     sha = hashlib.sha256(artifact.read_bytes() + str(settings).encode()).hexdigest()[:16]

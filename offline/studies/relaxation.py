@@ -32,8 +32,6 @@ PHASES = ((0.2, 10, 1.0), (4.0, 40, 1.0), (0.1, 5, 0.0), (4.0, 40, 0.0))
 def relaxation(artifact: Path, position: Sequence[float] | None = None) -> dict[str, Any]:
     """Press one place (mm) of an artifact's surface, or its middle, hold, release, wait.
 
-    Writes ``relaxation.csv`` and ``relaxation.png`` to the report beside the artifact.
-
     Returns
     -------
     dict

@@ -34,6 +34,7 @@ from palpate.offline.studies.references import (
     Fields,
     in_parallel,
     kept_results,
+    of_tissue,
     opened,
     random_steps,
     snapshots,
@@ -45,7 +46,6 @@ from palpate.shared.scene import Scene
 SNAPSHOTS, SNAPSHOTS_IN_TIME = 150, 12
 """Full solutions of each tissue, or histories, that the methods learn from."""
 
-MANY = 100_000  # steps of the longest history
 SIZE, DERIVATIVES = 40, 19
 LARGER = 5  # steps of the full model that are made one
 ARTIFACT, WARM, FULL = "artifact", "artifact, warm", "full model, one jump"
@@ -85,14 +85,12 @@ def stability(
     scene: Scene | None,
     cases: int,
     seed: int,
-    many: int = MANY,
+    many: int = 0,
     methods: Sequence[str] | None = None,
     kinds: Sequence[str] | None = None,
     learnt: int | None = None,
 ) -> dict[str, Any]:
     """Map what becomes of the answers of methods under hard loads, or in hard histories.
-
-    A table, a row per method and kind, and a picture go to ``NAME/report`` beside the artifact.
 
     Parameters
     ----------
@@ -102,7 +100,7 @@ def stability(
     cases : int
         Loads of each kind, or places in which each kind of history is tried.
     many : int
-        Steps of the longest history.
+        Steps of the longest history, if there are any.
     methods, kinds : sequence of str, optional
         Only these of ``METHODS`` or ``METHODS_IN_TIME``, and only these kinds; all if absent.
     learnt : int, optional
@@ -122,12 +120,12 @@ def stability(
         else ("stability", METHODS, Stage.STABILITY_SNAPSHOTS, SNAPSHOTS)
     )
     wanted = [name for name in methods or rows if name != TIP or atlas.models.viscous_tips]
-    asked: dict[str, list[HardCase]] = {}
-    if not in_time:
+    if in_time:
+        asked = histories(atlas, problem, False, cases, seed, many)
+        touched = histories(atlas, problem, True, cases, seed, many) if TIP in wanted else {}
+        asked = {kind: own + touched.get(kind, []) for kind, own in asked.items()}
+    else:
         asked = hard_cases.HardLoads(atlas, problem, cases, seed).cases()
-    for tip in [False, True][: (1 + (TIP in wanted)) * in_time]:
-        for kind, own in histories(atlas, problem, tip, cases, seed, many).items():
-            asked.setdefault(kind, []).extend(own)
     asked = {kind: asked[kind] for kind in kinds or asked}
     poissons = sorted({case.poisson for own in asked.values() for case in own})
     random = stream(atlas.scene.seed, stage)
@@ -145,7 +143,7 @@ def stability(
     table: dict[str, dict[str, list[Result]]] = {name: {} for name in wanted}
     for poisson, solutions in zip(poissons, learning, strict=True):
         pairs = [(question.case.steps, question.jump) for question in solved[solutions]]
-        own_tissue = hard_cases.tissue(problem, poisson)
+        own_tissue = of_tissue(problem, poisson=poisson)
         training = Training(own_tissue, snapshots(pairs), atlas, in_time=in_time)
         for name in tqdm(wanted, f"methods, Poisson {poisson:g}"):
             label = f"answers {name} {poisson:g}"

@@ -316,21 +316,16 @@ def calibrate(known: Sequence[KnownAnswer], share: float, damping: float) -> Est
     middle = X.mean(axis=0)
     A = np.column_stack([(X - middle) / scale, np.ones(len(known))])
     ridge = np.diag([damping] * len(middle) + [0.0])
-    leverage = np.sum(A * np.linalg.pinv(np.vstack([A, ridge])).T[: len(A)], axis=1)
-    coefficients, rests = [], []
-    for errors in np.transpose([answer.errors for answer in known]):
-        y = np.log(np.maximum(errors, 1e-8))
-        c = np.linalg.lstsq(np.vstack([A, ridge]), np.append(y, np.zeros(len(ridge))))[0]
-        c, constant = c[:-1] / scale, c[-1]
-        c[0] = constant - c @ middle
-        rest = y - X @ c
-        c[0] += np.median(rest)
-        coefficients.append(c)
-        rests.append((rest - np.median(rest)) / (1 - leverage))
-    covered = np.argsort(np.max(rests, axis=0))[: int(np.ceil(share * (len(known) + 1)))]
-    for c, rest in zip(coefficients, rests, strict=True):
-        c[0] += rest[covered].max()
-    return Estimator(np.array(coefficients))
+    inverse = np.linalg.pinv(np.vstack([A, ridge]))[:, : len(A)]
+    leverage = np.sum(A * inverse.T, axis=1)
+    Y = np.log(np.maximum([answer.errors for answer in known], 1e-8))
+    coefficients = (inverse @ Y)[:-1] / scale[:, None]
+    rest = Y - X @ coefficients
+    coefficients[0] = np.median(rest, axis=0)
+    rest = (rest - coefficients[0]) / (1 - leverage)[:, None]
+    covered = np.argsort(rest.max(axis=1))[: int(np.ceil(share * (len(known) + 1)))]
+    coefficients[0] += rest[covered].max(axis=0)
+    return Estimator(np.ascontiguousarray(coefficients.T))
 
 
 def calibrate_by_halves(
