@@ -18,12 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.offline.fem.model import NoEquilibrium
-from palpate.offline.fem.problem import FullProblem, Load
-from palpate.offline.reduce.sampling import tangents
-from palpate.offline.validate.against_full import held_out_loads
+from palpate.offline.fem.problem import Load
+from palpate.offline.reduce.sampling import random_tangent
+from palpate.offline.validate.compare import opened
+from palpate.offline.validate.queries import Place, held_out_loads
 from palpate.shared.answer import Answer
-from palpate.shared.artifact import read_artifact
-from palpate.shared.mechanics.footprint import TIP_DEPTH, pressure_limit
 from palpate.shared.model import ReducedModel, Region
 from palpate.shared.reduced.workspace import Warm
 
@@ -44,8 +43,7 @@ def bench(artifact: Path) -> dict[str, Any]:
     query with displacement and von Mises stress at the surface's or all nodes; ``full_us``, the
     full model in a single jump from rest.  ``p95``: 95th percentiles.  ``ratio``: full over cold.
     """
-    atlas = ReducedModel.load(artifact)
-    problem = FullProblem.of_artifact(read_artifact(artifact))
+    atlas, problem = opened(artifact)
     state, walker = atlas.new_warm(), atlas.new_warm()
     rng = np.random.default_rng(atlas.scene.seed)
     times: dict[str, list[float]] = {}
@@ -86,7 +84,7 @@ def bench(artifact: Path) -> dict[str, Any]:
         take("fields_us", partial(with_fields, "all"), loads)
         take("full_us", full, loads[:1])
         if atlas.models.tips is not None:
-            touches = [tip_at(atlas, load) for load in path]
+            touches = [Place.at(atlas, load.position).touch(0.5).position for load in path]
             touch(touches[0])
             take("tip_us", touch, touches[1:])
         if round_ == 0:  # compiled code came in from disk
@@ -105,38 +103,20 @@ def walk(
 
     Tilt and share of the local pressure limit are those of ``start``.
     """
-    surface, x = atlas.surface, start.position
-    normal = surface.project(x)[1]
-    share = start.pressure / limit_at(atlas, x, start.direction)
-    cosine = min(1.0, -float(start.direction @ normal))
-    heading, turns = _random_tangent(normal, rng), 0
+    place = Place.at(atlas, start.position)
+    share = start.pressure / place.limit(start.direction)
+    cosine = min(1.0, -float(start.direction @ place.normal))
+    heading, turns = random_tangent(place.normal, rng), 0
     loads: list[Load] = []
     while len(loads) < count:
-        reached, above, _ = surface.project(x + step * heading)
-        if np.linalg.norm(reached - x) < 0.9 * step and turns < TURNS:
-            heading, turns = _random_tangent(normal, rng), turns + 1
+        reached = Place.at(atlas, place.position + step * heading)
+        moved = np.linalg.norm(reached.position - place.position)
+        if moved < 0.9 * step and turns < TURNS:
+            heading, turns = random_tangent(place.normal, rng), turns + 1
             continue
-        x, normal, turns = reached, above, 0
-        heading = heading - (heading @ normal) * normal
+        place, turns = reached, 0
+        heading = heading - (heading @ place.normal) * place.normal
         heading /= np.linalg.norm(heading)
-        direction = math.sqrt(1 - cosine**2) * heading - cosine * normal
-        loads.append(Load(x, direction, share * limit_at(atlas, x, direction)))
+        direction = math.sqrt(1 - cosine**2) * heading - cosine * place.normal
+        loads.append(place.press(direction, share))
     return loads
-
-
-def limit_at(atlas: ReducedModel, position: Array, direction: Array) -> float:
-    """Largest trained pressure (kPa) at a place along a direction."""
-    _, normal, _, fields = atlas.surface.locate(position, atlas.limits)
-    return float(pressure_limit(fields, normal, direction))
-
-
-def tip_at(atlas: ReducedModel, load: Load) -> Array:
-    """Centre of a tip at a load's contact, half as deep as may be."""
-    x, normal, _, fields = atlas.surface.locate(load.position, atlas.limits)
-    return x + (atlas.scene.endoscope.radius - fields[TIP_DEPTH] / 2) * normal
-
-
-def _random_tangent(normal: Array, rng: np.random.Generator) -> Array:
-    turn = 2 * math.pi * rng.random()
-    t, b = tangents(normal)
-    return math.cos(turn) * t + math.sin(turn) * b

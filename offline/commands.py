@@ -72,13 +72,11 @@ def _leaves(report: Report, prefix: str) -> Iterator[tuple[str, object]]:
 def count_option(name: str, default: int | None, help: str, least: int = 1) -> Option:
     """Option of a whole number."""
     kind = click.IntRange(min=least)
-    return click.option(name, type=kind, default=default, show_default=bool(default), help=help)
+    shown = default is not None
+    return click.option(name, type=kind, default=default, show_default=shown, help=help)
 
 
-seed_option = click.option(
-    "--seed", type=click.IntRange(min=0), default=0, show_default=True,
-    help="Number that the random loads follow from.",
-)  # fmt: skip
+seed_option = count_option("--seed", 0, "Number that the random loads follow from.", least=0)
 
 
 def vector_option(*names: str, help: str, required: bool = False) -> Option:
@@ -201,8 +199,8 @@ def validate(tip: bool, queries: int, histories: int | None, **settings: Any) ->
     Both solve new random loads, positions of the tip, or histories of either, over the whole range
     of the artifact. Errors are relative L2 norms as fractions; of histories over all moments.
     """
-    from palpate.offline.validate.against_full import against_full
-    from palpate.offline.validate.kinds import HISTORIES, LOADS, TIP, TIP_HISTORIES
+    from palpate.offline.validate.compare import against_full
+    from palpate.offline.validate.queries import HISTORIES, LOADS, TIP, TIP_HISTORIES
 
     if histories is not None:
         return against_full(kind=TIP_HISTORIES if tip else HISTORIES, count=histories, **settings)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -90,8 +91,8 @@ def accuracy(report: Mapping[str, Any]) -> dict[str, str]:
     """Errors that training found, by what presses."""
     kinds = {"errors": ("validation", "loads"), "tip's errors": ("validation_tip", "positions")}
     return {
-        label: f"95 of 100 random {noun} at most {_percent(found['displacement']['p95'])} in "
-        f"displacement, {_percent(found['von_mises']['p95'])} in von Mises stress"
+        label: f"95 of 100 random {noun} at most {percent(found['displacement']['p95'])} in "
+        f"displacement, {percent(found['von_mises']['p95'])} in von Mises stress"
         for label, (kind, noun) in kinds.items()
         if (found := report.get(kind))
     }
@@ -104,7 +105,7 @@ def closing(artifact: Path) -> list[str]:
     place = " ".join(f"{x:.4g}" for x in example["at"])
     errors = [f"{label}: {text}" for label, text in accuracy(report).items()]
     if any(report["validation"][key]["p95"] > most for key, most in tolerance.model_dump().items()):
-        asked = f"{_percent(tolerance.displacement)} and {_percent(tolerance.von_mises)}"
+        asked = f"{percent(tolerance.displacement)} and {percent(tolerance.von_mises)}"
         errors.append(f"this is more than the {asked} that the scene asks for")
     return [
         f"{artifact}: {report['bytes'] / 1e6:.1f} MB",
@@ -113,15 +114,25 @@ def closing(artifact: Path) -> list[str]:
     ]
 
 
-def _percent(share: float) -> str:
-    return f"{100 * share:.2g} %"
+def percent(share: float) -> str:
+    """A share for people, a dash where there is none."""
+    if math.isnan(share):
+        return "–"
+    if share > 10.0 or 0.0 < share < 1e-4:
+        return "> 999 %" if share > 10.0 else "< 0.01 %"
+    return f"{_digits(100 * share)} %"
 
 
 def duration(seconds: float) -> str:
     """A time for people."""
-    if seconds < 100:
-        return f"{seconds:.0f} s"
+    for most, unit, factor in ((1e-3, "µs", 1e6), (1.0, "ms", 1e3), (100.0, "s", 1.0)):
+        if seconds < most:
+            return f"{_digits(factor * seconds)} {unit}"
     return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+
+
+def _digits(value: float) -> str:
+    return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
 
 
 def _tissue(scene: Scene) -> str:
@@ -132,7 +143,7 @@ def _tissue(scene: Scene) -> str:
             name, _, unit = (field.description or key).partition(", ")
             said.append(f"{name} {value:g} {unit}".rstrip())
     lost = sum(share for share, _ in tissue.prony)
-    return ", ".join([*said, f"{_percent(lost)} relaxes with time" if lost else "elastic"])
+    return ", ".join([*said, f"{percent(lost)} relaxes with time" if lost else "elastic"])
 
 
 def _patch(patch: Patch) -> str:

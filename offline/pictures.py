@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.vtu import CELL_TYPES
+from palpate.offline.solve import CELL_TYPES
 from palpate.shared.answer import Answer
 from palpate.shared.errors import PalpateError
 from palpate.shared.model import ReducedModel

@@ -1,11 +1,18 @@
-"""One load on an artifact, beside the full model if wanted, and the fields of either as a file."""
+"""One load on an artifact, beside the full model if wanted, and the fields of either as a file.
+
+The file is VTK's XML (.vtu), which ParaView and its kin read: VTK file formats,
+https://docs.vtk.org/en/latest/design_documents/VTKFileFormats.html
+"""
 
 from __future__ import annotations
 
+import sys
 import time
-from collections.abc import Callable, Sequence
+from base64 import b64encode
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +20,14 @@ from numpy.typing import NDArray
 from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import FullProblem, Load
-from palpate.offline.vtu import write_vtu
 from palpate.shared.answer import describe
 from palpate.shared.artifact import read_artifact
 from palpate.shared.model import ReducedModel
 
 Array = NDArray[np.float64]
+
+CELL_TYPES = {8: 12, 20: 25}  # VTK_HEXAHEDRON and VTK_QUADRATIC_HEXAHEDRON, by nodes per element
+TYPE_NAMES = {"f": "Float64", "i": "Int64", "u": "UInt8"}
 
 
 def solve(
@@ -59,35 +68,36 @@ def solve(
             "pressure: no equilibrium found under this load; the model was trained for up to "
             f"{solution.pressure_limit:.3g} kPa there"
         )
-    (moved, stress), recover_us = _timed(
-        lambda: [f(solution).astype(float) for f in (atlas.displacement, atlas.von_mises)]
+    fields, recover_us = _timed(
+        lambda: {
+            name: getattr(atlas, name)(solution).astype(float)
+            for name in ("displacement", "von_mises")
+        }
     )
     report = {"scene": atlas.name} | describe(solution)
-    report["peak"] = _peaks(moved, stress)
+    report["peak"] = _peaks(**fields)
     report["timing"] = {"solve_us": solve_us, "recover_us": recover_us}
     if not (full_model or vtu):
         return report
     problem = FullProblem.of_artifact(read_artifact(artifact))
     load = Load(solution.contact_point, solution.direction, pressure)
-    fields = {"displacement": moved, "von_mises": stress}
     if full_model:
         exact, full_us = _timed(lambda: problem.solve(load))
-        exact_stress = problem.von_mises(exact.displacement)
-        errors = moved - exact.displacement, stress - exact_stress
+        moved, stress = exact.displacement, problem.von_mises(exact.displacement)
         kept = problem.beyond_clamped_layer
         report["full_model"] = {
             "error": {
-                "displacement": relative(moved, exact.displacement),
-                "von_mises": relative(stress[kept], exact_stress[kept]),
+                "displacement": relative(fields["displacement"], moved),
+                "von_mises": relative(fields["von_mises"][kept], stress[kept]),
             },
-            "peak": _peaks(exact.displacement, exact_stress),
+            "peak": _peaks(moved, stress),
             "iterations": exact.iterations,
             "load_steps": exact.load_steps,
             "min_jacobian": exact.min_jacobian,
             "timing": {"solve_us": full_us},
         }
-        fields = {"displacement": exact.displacement, "von_mises": exact_stress}
-        fields |= {"displacement_error": errors[0], "von_mises_error": errors[1]}
+        found = {"displacement": moved, "von_mises": stress}
+        fields = found | {f"{name}_error": fields[name] - own for name, own in found.items()}
     if vtu:
         mesh = problem.mesh
         fields |= {"load": problem.load_vector(load), "clamped": mesh.clamped}
@@ -113,3 +123,42 @@ def _peaks(displacement: Array, von_mises: Array) -> dict[str, float]:
         "von_mises": float(von_mises.max()),
         "von_mises_p99": float(np.percentile(von_mises, 99)),
     }
+
+
+def write_vtu(
+    path: Path,
+    nodes: NDArray[np.float64],
+    elements: NDArray[np.integer[Any]],
+    point_data: Mapping[str, NDArray[Any]],
+) -> None:
+    """Write a mesh of hexahedra (e, 8) or (e, 20) and fields (n,) or (n, k) on its nodes (n, 3).
+
+    Floats are written with 8 bytes, truth values as 0 and 1.
+    """
+    count, size = elements.shape
+    order = "LittleEndian" if sys.byteorder == "little" else "BigEndian"
+    root = ET.Element(
+        "VTKFile", type="UnstructuredGrid", version="1.0", byte_order=order, header_type="UInt64"
+    )
+    grid = ET.SubElement(root, "UnstructuredGrid")
+    piece = ET.SubElement(grid, "Piece", NumberOfPoints=str(len(nodes)), NumberOfCells=str(count))
+    _add(ET.SubElement(piece, "Points"), "points", nodes)
+    cells = ET.SubElement(piece, "Cells")
+    _add(cells, "connectivity", elements.ravel())
+    _add(cells, "offsets", size * np.arange(1, count + 1))
+    _add(cells, "types", np.full(count, CELL_TYPES[size], np.uint8))
+    fields = ET.SubElement(piece, "PointData")
+    for name, values in point_data.items():
+        _add(fields, name, values)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    ET.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
+
+
+def _add(parent: ET.Element, name: str, values: NDArray[Any]) -> None:
+    kind = values.dtype.kind.replace("b", "u")
+    data = np.ascontiguousarray(values, dtype=TYPE_NAMES[kind].lower()).tobytes()
+    element = ET.SubElement(parent, "DataArray", type=TYPE_NAMES[kind], Name=name, format="binary")
+    if values.ndim == 2:
+        element.set("NumberOfComponents", str(values.shape[1]))
+    # the length of the data goes before them, into the same base64
+    element.text = b64encode(np.uint64(len(data)).tobytes() + data).decode()

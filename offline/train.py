@@ -42,10 +42,16 @@ from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.workers import Checkpoint, Tasks, content_key, open_scene, run, worker_pool
 from palpate.offline.run.writing import provenance, write_model
 from palpate.offline.scenes import default_artifact, find_scene
-from palpate.offline.validate.against_full import reference_task, write_rows
-from palpate.offline.validate.calibrate import calibrate, calibrate_by_halves
-from palpate.offline.validate.compare import Row, compare, summarise
-from palpate.offline.validate.kinds import KINDS, Kind
+from palpate.offline.validate.compare import (
+    Row,
+    calibrate,
+    calibrate_by_halves,
+    compare,
+    reference_task,
+    summarise,
+    write_rows,
+)
+from palpate.offline.validate.queries import KINDS, Kind
 from palpate.shared.artifact import ArtifactError, read_artifact
 from palpate.shared.local_models import Estimator, LocalModels
 from palpate.shared.mechanics.footprint import TIP_DEPTH

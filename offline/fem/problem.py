@@ -92,9 +92,13 @@ class FullProblem:
         x, normal, _ = self.surface.project(position)
         return self.unit_load_at(x, normal), normal
 
-    def unit_load_at(self, x: Array, normal: Array) -> Array:
-        """The same at a contact point of another mesh, whose accessible surface ends elsewhere."""
-        footprint(self.body.boundary, x, normal, self.scene.endoscope.radius, self._nodal)
+    def unit_load_at(self, x: Array, normal: Array, radius: float | None = None) -> Array:
+        """The same at a contact point of another mesh, whose accessible surface ends elsewhere.
+
+        The radius (mm) is the scene's if absent.
+        """
+        radius = radius or self.scene.endoscope.radius
+        footprint(self.body.boundary, x, normal, radius, self._nodal)
         return self._nodal.copy()
 
     def load_vector(self, load: Load) -> Array:

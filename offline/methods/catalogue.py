@@ -17,19 +17,23 @@ from scipy.sparse import csr_matrix
 
 from palpate.offline.fem.model import FullModel
 from palpate.offline.fem.problem import FullProblem
-from palpate.offline.methods.cubatures import PointForces, point_forces
-from palpate.offline.methods.deim import Deim, PlainNewton, force_modes, sample
 from palpate.offline.methods.full import Full, Remeshed
 from palpate.offline.methods.galerkin import Galerkin, GalerkinAtHand
-from palpate.offline.methods.mass_spring import MassSpring
-from palpate.offline.methods.method import Case, Method, Snapshots, pressed_nodes
+from palpate.offline.methods.hyper_reduction import (
+    Deim,
+    PlainNewton,
+    contributions,
+    fit_cubature,
+    force_modes,
+    sample,
+)
+from palpate.offline.methods.method import Case, Method, Snapshots
 from palpate.offline.methods.regression import Linear, Regression, compliance
 from palpate.offline.methods.shipped import Shipped, Way
 from palpate.offline.methods.spaces import Inner, krylov, mass, modal, pod, static_derivatives
-from palpate.offline.methods.tetrahedra import TensorMass
+from palpate.offline.methods.tetrahedra import MassSpring, TensorMass
 from palpate.offline.reduce.ritz import TANGENTIAL
 from palpate.offline.reduce.sampling import spread_points, tangents
-from palpate.shared.errors import PalpateError
 from palpate.shared.model import ReducedModel
 
 Array = NDArray[np.float64]
@@ -51,7 +55,7 @@ class Training:
 
     problem: FullProblem  # with the scene's files, if there are to be methods on other meshes
     snapshots: Snapshots
-    atlas: ReducedModel | None = None  # of the same mesh, for the methods that query it
+    atlas: ReducedModel  # of the same mesh, for the methods that query it
     seed: int = 0
     in_time: bool = False  # whether the methods that can remember what happened before
 
@@ -88,11 +92,6 @@ class Training:
         """All modes of the linear responses to what can load the surface."""
         return compliance(self.problem)
 
-    def point_forces(self, basis: Array) -> PointForces:
-        """What a cubature of a basis is fitted to."""
-        cases = [Case.of(self.problem, load) for load in self.snapshots.loads[:CASES]]
-        return point_forces(Galerkin(self.problem, basis), cases, self.rng(basis.shape[1]))
-
 
 # --- one basis for the whole surface -------------------------------------------------------------
 
@@ -109,11 +108,11 @@ def _krylov(size: int, training: Training, moments: int = MOMENTS) -> Method:
 def _cubature(
     size: int, training: Training, most: int = POINTS_PER_MODE, by_element: bool = False
 ) -> Method:
-    basis = training.pod(size)
-    forces = training.point_forces(basis)
-    choose = forces.by_element if by_element else forces.by_point
-    cubature = choose(most * basis.shape[1], training.rng(size))
-    return Galerkin(training.problem, basis, cubature)
+    problem, basis, rng = training.problem, training.pod(size), training.rng(size)
+    cases = (Case.of(problem, load) for load in training.snapshots.loads[:CASES])
+    forces = contributions(Galerkin(problem, basis), cases, rng)
+    cubature = fit_cubature(problem.model, forces, most * basis.shape[1], rng, by_element)
+    return Galerkin(problem, basis, cubature)
 
 
 def _deim(size: int, training: Training, per_mode: int = 1) -> Method:
@@ -153,7 +152,7 @@ def loads_about(problem: FullProblem, case: Case) -> Array:
     for contact, foot in zip(case.contacts, case.feet, strict=True):
         frame = np.array([contact.direction, *tangents(contact.direction)])
         frame[1:] *= TANGENTIAL
-        weights = contact.pressure * pressed_nodes(problem, *foot, case.radius)
+        weights = contact.pressure * problem.unit_load_at(*foot, case.radius)
         total += weights[:, None, None] * frame.T
     return total.reshape(-1, 3)
 
@@ -162,8 +161,6 @@ def loads_about(problem: FullProblem, case: Case) -> Array:
 
 
 def _shipped(size: int, training: Training, way: Way = "cold") -> Method:
-    if training.atlas is None:
-        raise PalpateError("artifact: the training context has none")
     if way == "cold" and training.in_time:
         way = "in time"
     return Shipped(training.problem, training.atlas, way)

@@ -9,7 +9,7 @@ from scipy.sparse import csr_matrix
 from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.terms import Past
-from palpate.offline.methods.method import Answer, Case, Method, pressed_nodes
+from palpate.offline.methods.method import Answer, Case, Method
 from palpate.shared.geometry.elements import hexahedron, shape
 from palpate.shared.scene import ElementName, Extrusion, Scene, divisions_of
 
@@ -35,15 +35,15 @@ class Full(Method):
             found = self.problem.model.solve(load, state, dt)
         except NoEquilibrium:
             return Answer(state, False)
-        return Answer(found.past, True, found.iterations)
+        return Answer(found.past)
 
     def field(self, state: Past) -> Array:
         """See ``Method``."""
         return state.displacement
 
-    def von_mises(self, state: Past) -> Array:
+    def past(self, state: Past) -> Past:
         """See ``Method``."""
-        return self.problem.von_mises(state.displacement, state)
+        return state
 
 
 class Remeshed(Method):
@@ -79,7 +79,7 @@ class Remeshed(Method):
             found = self.other.model.solve(self.load(case))
         except NoEquilibrium:
             return Answer(state, False)
-        return Answer(found.displacement, True, found.iterations)
+        return Answer(found.displacement)
 
     def load(self, case: Case) -> Array:
         """Nodal forces (m, 3) mN on the other mesh, pressed where the scene's own mesh is.
@@ -87,11 +87,8 @@ class Remeshed(Method):
         The accessible surface of the other mesh ends at other faces: projected onto that, a
         contact on the rim would move.
         """
-        load = np.zeros_like(self.other.mesh.nodes)
-        for contact, foot in zip(case.contacts, case.feet, strict=True):
-            nodal = pressed_nodes(self.other, *foot, case.radius)
-            load += contact.pressure * nodal[:, None] * contact.direction
-        return load
+        own = Case.of(self.other, *case.contacts, feet=case.feet, radius=case.radius)
+        return own.load(len(self.other.mesh.nodes))
 
     def field(self, state: Array) -> Array:
         """See ``Method``."""

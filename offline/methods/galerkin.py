@@ -8,14 +8,12 @@ secants make up, from rest on elastic tissue and from the last answer on tissue 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from palpate.offline.fem.model import FullModel
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.terms import Past
 from palpate.offline.methods.method import Answer, Case, Method
@@ -27,8 +25,6 @@ from palpate.shared.reduced.corrections import Secants, forget_secants
 from palpate.shared.reduced.past import Elastic, Memory, Remembering, opened, remembering
 from palpate.shared.reduced.points import (
     LANES,
-    STATE,
-    TILE,
     Points,
     increments,
     linearise,
@@ -49,17 +45,11 @@ error, small beside that of any basis here.  Single precision ends at about 1e-6
 MAX_ITERATIONS = 400
 
 
-@dataclass(frozen=True)
-class Cubature:
+class Cubature(NamedTuple):
     """Quadrature points (c,), counted element by element, and their weights (c,) mm^3."""
 
     points: NDArray[np.int64]
     weights: Array
-
-    @classmethod
-    def full(cls, model: FullModel) -> Cubature:
-        """Every point with its own weight."""
-        return cls(np.arange(model.weights.size), model.weights.ravel())
 
 
 class Content(NamedTuple):
@@ -73,33 +63,6 @@ class Content(NamedTuple):
     modes: Array  # (3 nodes, r) mm
     q: Array  # (r,) coordinates of the answer
     newton: Array  # (4, r)
-
-
-@njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc"})
-def point_gradients(connectivity, gradients, points, modes, out):
-    """Write displacement gradients of modes at quadrature points in tiles (``reduced.points``).
-
-    Of the elements' ``connectivity`` (e, n) and ``gradients`` (e, q, n, 3) 1/mm, at points (c,),
-    counted element by element, of modes (3 nodes, m) mm, to ``out`` (>= m, 9 c) 1/mm, with ``c``
-    filled up to whole tiles; what fills up is not written.
-    """
-    m = modes.shape[1]
-    tile = np.zeros((9 * LANES, m))
-    for first in range(0, len(points), LANES):
-        tile[:] = 0.0
-        for lane in range(min(LANES, len(points) - first)):
-            e, q = divmod(points[first + lane], gradients.shape[1])
-            for a in range(connectivity.shape[1]):
-                for i in range(3):
-                    mode = modes[3 * connectivity[e, a] + i]
-                    for j in range(3):
-                        slope, row = gradients[e, q, a, j], tile[(3 * i + j) * LANES + lane]
-                        for k in range(m):
-                            row[k] += slope * mode[k]
-        start = 9 * first
-        for k in range(m):
-            for c in range(9 * LANES):
-                out[k, start + c] = tile[c, k]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -132,7 +95,7 @@ def linearise_points(content, state, products):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _step(content, nodes, forces, accurate):
-    """Go to the end of a time step: (status, iterations); the past is advanced if it is found."""
+    """Go to the end of a time step, whether it is found; the past is advanced if it is."""
     points, past, load, secants = content.points, content.past, content.load, content.secants
     q, work = content.q, content.newton
     reduce_load(content.modes, nodes, forces, load.f)
@@ -141,14 +104,14 @@ def _step(content, nodes, forces, accurate):
     size = past.external_force(load.f, secants.external, secants.origin)
     past.last_answer(0, q)
     target = max(accurate * size, SMALLEST_TARGET)
-    status, iterations, _, _ = newton_method(
+    status, _, _, _ = newton_method(
         problem, q, work, target, np.inf, MAX_ITERATIONS, True, ROUND_OFF
     )
     if status == newton.CONVERGED:
         past.end_step(points, content.work, 0, q)
-    else:
-        forget_secants(secants.inverse, secants.origin)
-    return status, iterations
+        return True
+    forget_secants(secants.inverse, secants.origin)
+    return False
 
 
 class Galerkin(Method):
@@ -176,14 +139,14 @@ class Galerkin(Method):
         accurate: float = TOLERANCE,
     ) -> None:
         model, m = problem.model, basis.shape[1]
-        cubature = cubature or Cubature.full(model)
+        cubature = cubature or Cubature(np.arange(model.weights.size), model.weights.ravel())
         self.points, self._accurate = cubature.points, accurate
         super().__init__(problem, m, f"{m} modes, {len(self.points)} points")
         element = self.points // model.weights.shape[1]
         rows, count = -(-m // 4) * 4, -(-len(self.points) // LANES) * LANES
         fill = (0, count - len(self.points))
         points = Points(
-            gradients=np.zeros((rows, TILE // LANES * count), np.float32),
+            gradients=np.zeros((rows, 9 * count), np.float32),
             steps=np.ones(rows, np.float32),
             weights=np.pad(cubature.weights, fill),
             law=model.law.at(np.pad(element, fill)),
@@ -209,22 +172,28 @@ class Galerkin(Method):
         model, m, content = self.problem.model, basis.shape[1], self.content
         content.modes[model.free, :m] = basis
         content.modes[:, m:] = 0.0
-        content.points.gradients[m:] = 0.0
-        self.gradients_of(content.modes[:, :m].copy(), content.points.gradients)
-        if isinstance(content.past, Remembering):
+        self.write_gradients(content.modes[:, :m], content.points.gradients)
+        if content.past.in_time:
             soft = basis.T @ (model.deviatoric_stiffness @ basis)
             content.past.deviatoric[0, :m, :m] = soft
 
-    def gradients_of(self, functions: Array, out: Field) -> None:
-        """Write the gradients of displacements (3 nodes, m) mm at the points."""
-        model = self.problem.model
-        point_gradients(model.connectivity, model.gradients, self.points, functions, out)
+    def write_gradients(self, functions: Array, out: Field) -> None:
+        """Write the gradients of displacements (3 nodes, m) mm at the points, in tiles."""
+        model, m = self.problem.model, functions.shape[1]
+        elements, own, nodes, _ = model.gradients.shape
+        slopes = model.gradients.swapaxes(2, 3).reshape(elements, 3 * own, nodes)
+        moved = functions.reshape(-1, 3, m)[model.connectivity].reshape(elements, nodes, 3 * m)
+        at_points = (slopes @ moved).reshape(-1, 3, 3, m)[self.points].swapaxes(1, 2)
+        filled = np.zeros((out.shape[1] // 9, 3, 3, m), np.float32)
+        filled[: len(self.points)] = at_points
+        tiles = filled.reshape(-1, LANES, 9, m).transpose(3, 0, 2, 1)
+        out[:m], out[m:] = tiles.reshape(m, -1), 0.0
 
     def at_rest(self) -> Array | None:
         """See ``Method``; the next search knows no secants."""
         secants, past = self.content.secants, self.content.past
         forget_secants(secants.inverse, secants.origin)
-        if not isinstance(past, Remembering):
+        if not past.in_time:
             return None
         record = np.zeros_like(past.records[0])
         self.opened(record).share[-1] = 1.0
@@ -232,34 +201,22 @@ class Galerkin(Method):
 
     def step(self, state: Array | None, case: Case, dt: float = 0.0) -> Answer:
         """See ``Method``."""
-        past, prony = self.content.past, self.problem.model.prony
-        if isinstance(past, Remembering):
-            for own, weights in zip(past.time, step_weights(prony, dt), strict=True):
+        past, found = self.content.past, self.content.q
+        if past.in_time:
+            times = step_weights(self.problem.model.prony, dt)
+            for own, weights in zip(past.time, times, strict=True):
                 own[:] = weights
-            past.records[0] = state
+            found = past.records[0]
+            found[:] = state
         else:
             self.at_rest()
-        status, iterations = _step(self._bound, case.nodes, case.forces, self._accurate)
-        converged = status == newton.CONVERGED
-        return Answer(self.state if converged else state, converged, iterations)
-
-    @property
-    def state(self) -> Array:
-        """The last answer."""
-        past = self.content.past
-        return (past.records[0] if isinstance(past, Remembering) else self.content.q).copy()
+        converged = _step(self._bound, case.nodes, case.forces, self._accurate)
+        return Answer(found.copy() if converged else state, converged)
 
     def field(self, state: Array) -> Array:
         """See ``Method``."""
         modes = self.content.modes
         return (modes @ state[: modes.shape[1]]).reshape(-1, 3)
-
-    def von_mises(self, state: Array | None) -> Array:
-        """See ``Method``."""
-        if state is None or not isinstance(self.content.past, Remembering):
-            return super().von_mises(state)
-        past = self.history(state)
-        return self.problem.von_mises(past.displacement, past)
 
     def opened(self, record: Array) -> Memory:
         """Views of a record."""
@@ -268,22 +225,16 @@ class Galerkin(Method):
         memory: Memory = opened(record, *sizes)
         return memory
 
-    def history(self, record: Array) -> Past:
-        """A record as the full model's history, without the means that only energies need."""
+    def past(self, state: Array) -> Past | None:
+        """See ``Method``; without the means that only energies need."""
+        if not self.content.past.in_time:
+            return None
         elements, own = self.problem.model.weights.shape
-        histories = self.opened(record).points
+        histories = self.opened(state).points
         terms = len(histories)
         tiles = histories.reshape(terms, -1, SYMMETRIC, LANES).transpose(0, 1, 3, 2)
         points = tiles.reshape(terms, -1, SYMMETRIC)[:, : elements * own].astype(float)
-        return Past(self.field(record), points.reshape(terms, elements, own, SYMMETRIC))
-
-    def tangent(self, q: Array) -> Array:
-        """Tangent (r, r) of elastic tissue at coordinates."""
-        points = self.content.points
-        products = np.empty_like(points.gradients)
-        stress_points(self._bound, q)
-        linearise_points(self._bound, np.empty(STATE * len(points.weights), np.float32), products)
-        return np.eye(len(q)) + points.gradients @ products.T
+        return Past(self.field(state), points.reshape(terms, elements, own, SYMMETRIC))
 
 
 class GalerkinAtHand(Galerkin):
@@ -298,12 +249,14 @@ class GalerkinAtHand(Galerkin):
 
     def step(self, state: Any, case: Case, dt: float = 0.0) -> Answer:
         """See ``Method``."""
-        free = self.problem.model.free
-        basis = self._space(case) if case.forces.any() else np.empty((len(free), 0))
+        if not case.forces.any():
+            return Answer(None)
+        basis = self._space(case)
         self.adopt(basis)
         answer = super().step(None, case)
-        found = basis, self.state[: basis.shape[1]]
-        return replace(answer, state=found if answer.converged else state)
+        if not answer.converged:
+            return Answer(state, False)
+        return Answer((basis, answer.state[: basis.shape[1]]))
 
     def field(self, state: Any) -> Array:
         """See ``Method``."""

@@ -15,18 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.offline.fem.problem import FullProblem, Load
-from palpate.shared.mechanics.footprint import footprint
+from palpate.offline.fem.terms import Past
 
 Array = NDArray[np.float64]
-
-
-def pressed_nodes(
-    problem: FullProblem, x: Array, normal: Array, radius: float | None = None
-) -> Array:
-    """Nodal weights (n,) mm^2 of a unit pressure at a point; the scene's radius (mm) if absent."""
-    nodal = np.zeros(len(problem.mesh.nodes))
-    footprint(problem.body.boundary, x, normal, radius or problem.scene.endoscope.radius, nodal)
-    return nodal
+Foot = tuple[Array, Array]
+"""Where a contact presses, mm, and the normal there."""
 
 
 @dataclass(frozen=True)
@@ -36,27 +29,22 @@ class Case:
     contacts: tuple[Load, ...]
     nodes: NDArray[np.int64]  # (k,) that are loaded
     forces: Array  # (k, 3) mN, on those
-    feet: tuple[tuple[Array, Array], ...] = ()  # where each presses, mm, and the normal there
+    feet: tuple[Foot, ...] = ()
     radius: float | None = None  # mm, of the footprints; the scene's if absent
 
     @classmethod
-    def of(cls, problem: FullProblem, *contacts: Load) -> Case:
-        """Case of one or more footprints pressed on the accessible surface of a scene's body."""
-        feet = [problem.surface.project(contact.position)[:2] for contact in contacts]
-        return cls.pressed(problem, contacts, feet)
-
-    @classmethod
-    def pressed(
+    def of(
         cls,
         problem: FullProblem,
-        contacts: tuple[Load, ...],
-        feet: Sequence[tuple[Array, Array]],
+        *contacts: Load,
+        feet: Sequence[Foot] = (),
         radius: float | None = None,
     ) -> Case:
-        """Case of contacts at given places of the body."""
+        """Case of footprints, pressed on the accessible surface unless ``feet`` are given."""
+        feet = feet or [problem.surface.project(contact.position)[:2] for contact in contacts]
         forces = np.zeros((len(problem.mesh.nodes), 3))
         for contact, foot in zip(contacts, feet, strict=True):
-            weights = contact.pressure * pressed_nodes(problem, *foot, radius)
+            weights = contact.pressure * problem.unit_load_at(*foot, radius)
             forces += np.outer(weights, contact.direction)
         nodes = np.flatnonzero(forces.any(axis=1))
         return cls(contacts, nodes, forces[nodes], tuple(feet), radius)
@@ -95,7 +83,6 @@ class Answer:
 
     state: Any
     converged: bool = True  # whether there is an answer at all
-    iterations: int = 0
     doubted: bool = False  # whether the method says that it may be wrong; most cannot tell
     refused: bool = False  # whether the method declined the case instead of trying
 
@@ -135,9 +122,13 @@ class Method(ABC):
         """Nodal displacement (n, 3) mm of an answer, or at rest."""
         return np.zeros_like(self.problem.mesh.nodes) if state is None else self.field(state)
 
+    def past(self, state: Any) -> Past | None:
+        """What the tissue remembers in a state: nothing, unless a method knows time."""
+        return None
+
     def von_mises(self, state: Any) -> Array:
         """Nodal von Mises stress (n,) kPa."""
-        return self.problem.von_mises(self.displacement(state))
+        return self.problem.von_mises(self.displacement(state), self.past(state))
 
     def solve(self, case: Case) -> Answer:
         """Answer a case from rest: one step of no time."""

@@ -6,7 +6,7 @@ contact at a time and refuses several.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,27 +53,24 @@ class Shipped(Method):
         except QueryError:
             return Answer(state, False, refused=True)
         if not found.converged:
-            return Answer(state, False, found.iterations)
+            return Answer(state, False)
         tolerance = self._atlas.scene.tolerance
         doubted = not (
             found.in_range
             and found.error_displacement <= tolerance.displacement
             and found.error_von_mises <= tolerance.von_mises
         )
-        return Answer(found, True, found.iterations, doubted)
+        return Answer(found, doubted=doubted)
 
     def _ask(self, state: Found | None, case: Case, dt: float) -> Found:
         """Put a case of one contact to the reduced model."""
-        (contact,), past = case.contacts, None
+        (contact,), time = case.contacts, dict[str, Any](warm=self._warm)
         if self._way in ("in time", "tip"):
-            past = REST if state is None else state.past
-        dt = 0.0 if past is None else dt
+            time |= {"past": REST if state is None else state.past, "dt": dt}
         if self._way == "tip":
-            return self._atlas.touch(contact.position, past=past, dt=dt, warm=self._warm)
-        return self._atlas.press(
-            contact.position, contact.pressure, contact.direction, case.radius,
-            past=past, dt=dt, warm=self._warm,
-        )  # fmt: skip
+            return self._atlas.touch(contact.position, **time)
+        where = contact.position, contact.pressure, contact.direction, case.radius
+        return self._atlas.press(*where, **time)
 
     def field(self, state: Found) -> Array:
         """See ``Method``."""

@@ -32,18 +32,11 @@ MASS_POINTS = 3
 
 def mass(model: FullModel) -> csr_matrix:
     """Consistent mass (free dofs, free dofs) mm^3 of unit density."""
-    nodes, elements = model.mesh.nodes, model.mesh.elements
-    count = elements.shape[1]
-    N, _ = shape(hexahedron(count), gauss(MASS_POINTS, 3)[0])
-    _, weights = volume_quadrature(nodes, elements, MASS_POINTS)
-    blocks = np.einsum("eq,qa,qb->eab", weights, N, N)
-    dofs = 3 * elements.astype(np.int64)[..., None] + np.arange(3)
-    rows = np.broadcast_to(dofs[:, :, None], (len(elements), count, count, 3))
-    cols = np.broadcast_to(dofs[:, None], rows.shape)
-    values = np.broadcast_to(blocks[..., None], rows.shape)
-    size = 3 * len(nodes)
-    whole = csr_matrix((values.ravel(), (rows.ravel(), cols.ravel())), (size, size))
-    return whole[model.free][:, model.free]
+    elements, used = model.mesh.elements, model.slots >= 0
+    N, _ = shape(hexahedron(elements.shape[1]), gauss(MASS_POINTS, 3)[0])
+    _, weights = volume_quadrature(model.mesh.nodes, elements, MASS_POINTS)
+    blocks = np.kron(np.einsum("eq,qa,qb->eab", weights, N, N), np.eye(3))
+    return model.matrix(np.bincount(model.slots[used], blocks[used]).astype(float))
 
 
 def modal(model: FullModel, size: int) -> Array:

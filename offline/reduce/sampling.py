@@ -87,6 +87,11 @@ def cone(
     )
 
 
+def random_tangent(normal: Array, rng: np.random.Generator) -> Array:
+    """A random unit vector (3,) square to a normal."""
+    return cone(normal, 90.0, 1, rng, border=True)[0]
+
+
 def tangents(normal: Array) -> tuple[Array, Array]:
     """Two unit vectors that complete ``normal`` to an orthonormal frame."""
     t = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])

@@ -31,14 +31,12 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from palpate.offline.fem.norms import relative
-from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods.catalogue import Training, build
-from palpate.offline.methods.full import Remeshed
+from palpate.offline.methods.full import Full, Remeshed
 from palpate.offline.methods.method import Method, Steps
 from palpate.offline.methods.shipped import Shipped
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.tables import write_csv
-from palpate.offline.run.workers import Checkpoint
 from palpate.offline.studies import chart_drawing as drawing
 from palpate.offline.studies import references as full
 from palpate.offline.studies.chart_drawing import SHIPPED, TWIN, Row
@@ -87,9 +85,6 @@ def chart(
 ) -> dict[str, Any]:
     """Measure and draw speed and accuracy of every method.
 
-    Table, picture and page, ``chart.*`` or ``chart_in_time.*``, go to ``NAME/report/`` beside the
-    artifact.
-
     Parameters
     ----------
     scene : Scene or None
@@ -112,17 +107,26 @@ def chart(
     """
     in_time = scene is None
     layout = drawing.IN_TIME if in_time else drawing.OF_LOADS
-    atlas, problem = full.opened(artifact, scene, in_time)
+    atlas, problem = full.opened(artifact, scene)
     plan = plan or (PLAN_IN_TIME if in_time else PLAN)
     if not in_time:
         plan = {**plan, "pod": sorted({*plan["pod"], Shipped(problem, atlas).unknowns})}
     settings = snapshots, queries, seed
     checkpoint = full.kept_results(artifact, atlas.scene, layout.name, settings)
-    given = [
-        full.random_steps(atlas, problem, count, stream(atlas.scene.seed, stage, seed), in_time)
+    given = {
+        stage.name: full.random_steps(
+            atlas, problem, count, stream(atlas.scene.seed, stage, seed), in_time
+        )
         for stage, count in ((Stage.SNAPSHOTS, snapshots), (Stage.UNSEEN, queries))
-    ]
-    learnt, asked = _answered(artifact, given, checkpoint)
+    }
+    follow = {name: [(full.followed, steps) for steps in own] for name, own in given.items()}
+    solved = full.in_parallel(artifact, checkpoint, "full solutions", follow)
+    learnt, asked = (
+        [(steps, found) for steps, found in zip(given[name], own, strict=True) if found]
+        for name, own in solved.items()
+    )
+    if not asked:
+        raise PalpateError(f"{artifact}: the full model could follow none of the histories")
     loads = [] if scene is None else [steps[0][0].contacts[0] for steps, _ in asked]
     tasks = {"refined": [(full.refined, scene, REFINEMENT, x) for x in loads[:REFINED_LOADS]]}
     finer = full.in_parallel(artifact, checkpoint, "refined mesh", tasks)["refined"]
@@ -142,21 +146,6 @@ def chart(
     drawing.write_page(report / f"{layout.name}.html", rows, atlas.scene, layout)
     checkpoint.remove()
     return _summary(rows) | {"without_equilibrium": queries - len(asked)}
-
-
-def _answered(
-    artifact: Path, given: Sequence[Sequence[Steps]], checkpoint: Checkpoint
-) -> list[Queries]:
-    """Histories that the full model can follow, with its answers."""
-    tasks = {f"histories {i}": [(full.followed, x) for x in own] for i, own in enumerate(given)}
-    found = full.in_parallel(artifact, checkpoint, "full solutions", tasks).values()
-    pairs = [zip(*both, strict=True) for both in zip(given, found, strict=True)]
-    kept: list[Queries] = [
-        [(steps, own) for steps, own in both if own is not None] for both in pairs
-    ]
-    if not all(kept):
-        raise PalpateError(f"{artifact}: the full model could follow none of the histories")
-    return kept
 
 
 # --- measuring -----------------------------------------------------------------------------------
@@ -185,8 +174,10 @@ def measure(
         converged[i] = not missed
         if not missed:
             fields = Fields.of(method, states)
-            twin = training.in_time and name == "artifact, warm"
-            errors[i] = fields.errors(problem, at_once(problem, steps) if twin else exact)
+            if training.in_time and name == "artifact, warm":
+                elastic = Full(full.of_tissue(problem, prony=()))
+                exact = Fields.of(elastic, play(elastic, steps)[0])
+            errors[i] = fields.errors(problem, exact)
             if i < len(finer):
                 from_finer[i] = relative(fields.displacements[-1], finer[i])
     from_finer[[bool(np.isnan(u).any()) for u in finer]] = np.nan
@@ -219,15 +210,6 @@ def play(method: Method, steps: Steps) -> tuple[list[Any], Array, int]:
 
 def _pressing(steps: Steps) -> NDArray[np.bool_]:
     return np.array([case.forces.any() for case, _ in steps])
-
-
-def at_once(problem: FullProblem, steps: Steps) -> Fields:
-    """Fields of the full model without a past, each solution from the last."""
-    u: list[Array] = []
-    for case, _ in steps:
-        load = case.load(len(problem.mesh.nodes))
-        u.append(problem.model.solve(load, start=u[-1] if u else None).displacement)
-    return Fields.at_once(problem, u)
 
 
 def _times(

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from palpate.offline.info import duration, percent
 from palpate.shared.scene import Scene
 
 if TYPE_CHECKING:
@@ -32,39 +34,44 @@ STATISTICS = ("median", "p95", "max")
 ACCENT, DARK_ACCENT = "#D55E00", "#A34700"
 """Of what is Palpate's; the second for letters."""
 
-GROUPS: dict[str, tuple[str, dict[str, str]]] = {
-    "Palpate": (ACCENT, {"artifact": "this artifact", "artifact, warm": "the same without memory"}),
-    "Finite elements": ("#000000", {"full": "full model, several meshes"}),
-    "Modes of the body at rest": (
-        "#0072B2",
-        {"modal": "vibration modes", "ritz": "responses to loads (Ritz)",
-         "krylov": "load-dependent vectors (Krylov)"},
-    ),
-    "POD, hyper-reduced": (
-        "#E69F00",
-        {"pod-ecm": "cubature of points (ECM)", "pod-ecsw": "cubature of elements (ECSW)",
-         "pod-deim": "interpolation (DEIM)", "pod-gappy": "least squares (gappy POD)"},
-    ),
-    "Modes made for each load": (
-        "#56B4E9", {"ritz-at-hand": "Ritz vectors", "derivatives": "static derivatives"}
-    ),
-    "POD of full solutions": (
-        "#009E73", {"pod": "energy norm", "pod-euclidean": "Euclidean norm"}
-    ),
-    "No equilibrium solved": (
-        "#CC79A7", {"linear": "linear response", "regression": "regression (RBF)"}
-    ),
-    "Springs and tetrahedra": (
-        "#7A7A7A", {"mass-spring": "mass-spring", "tensor-mass": "tensor-mass"}
-    ),
-}  # fmt: skip
-"""Colour of a group, and the names of its methods by family; a marker each, in this order."""
-
-MARKERS, OUR_MARKERS = ("o", "s", "^", "D"), ("*", "P")
 PAGE_MARKERS = {
     "o": "circle", "s": "square", "^": "triangle-up", "D": "diamond", "*": "star", "P": "cross",
 }  # fmt: skip
 """Plotly's names of Matplotlib's markers."""
+
+
+class Look(NamedTuple):
+    """How a method is drawn."""
+
+    group: str
+    name: str
+    colour: str
+    marker: str
+    size: float = 5.5  # points
+    above: int = 3  # higher than others where they meet
+
+
+LOOKS = {
+    "artifact": Look("Palpate", "this artifact", ACCENT, "*", 17.0, 5),
+    "artifact, warm": Look("Palpate", "the same without memory", ACCENT, "P", 11.0, 4),
+    "full": Look("Finite elements", "full model, several meshes", "#000000", "o"),
+    "modal": Look("Modes of the body at rest", "vibration modes", "#0072B2", "o"),
+    "ritz": Look("Modes of the body at rest", "responses to loads (Ritz)", "#0072B2", "s"),
+    "krylov": Look("Modes of the body at rest", "load-dependent vectors (Krylov)", "#0072B2", "^"),
+    "pod-ecm": Look("POD, hyper-reduced", "cubature of points (ECM)", "#E69F00", "o"),
+    "pod-ecsw": Look("POD, hyper-reduced", "cubature of elements (ECSW)", "#E69F00", "s"),
+    "pod-deim": Look("POD, hyper-reduced", "interpolation (DEIM)", "#E69F00", "^"),
+    "pod-gappy": Look("POD, hyper-reduced", "least squares (gappy POD)", "#E69F00", "D"),
+    "ritz-at-hand": Look("Modes made for each load", "Ritz vectors", "#56B4E9", "o"),
+    "derivatives": Look("Modes made for each load", "static derivatives", "#56B4E9", "s"),
+    "pod": Look("POD of full solutions", "energy norm", "#009E73", "o"),
+    "pod-euclidean": Look("POD of full solutions", "Euclidean norm", "#009E73", "s"),
+    "linear": Look("No equilibrium solved", "linear response", "#CC79A7", "o"),
+    "regression": Look("No equilibrium solved", "regression (RBF)", "#CC79A7", "s"),
+    "mass-spring": Look("Springs and tetrahedra", "mass-spring", "#7A7A7A", "o"),
+    "tensor-mass": Look("Springs and tetrahedra", "tensor-mass", "#7A7A7A", "s"),
+}
+"""Methods by family, in groups of a colour."""
 
 NAMES = {
     "linear 160": ("linear\nresponse", (-4, -26), "left"),
@@ -140,41 +147,11 @@ than none. Dashed: the Pareto front; nothing is both
 faster and more accurate than what lies on it."""
 
 
-class Look(NamedTuple):
-    """How a method is drawn."""
-
-    name: str
-    group: str
-    colour: str
-    marker: str
-
-    @property
-    def size(self) -> float:
-        """Of the marker, points; what is Palpate's stands out."""
-        return {"*": 17.0, "P": 11.0}.get(self.marker, 5.5)
-
-
 def looks(rows: Sequence[Row]) -> Iterator[tuple[Look, list[Row]]]:
-    """Every method that has points, with these; Palpate's last so that they lie on top."""
-    for title in (*list(GROUPS)[1:], "Palpate"):
-        colour, methods = GROUPS[title]
-        markers = OUR_MARKERS if title == "Palpate" else MARKERS
-        for (family, name), marker in zip(methods.items(), markers, strict=False):
-            if own := [row for row in rows if row["family"] == family]:
-                yield Look(name, title, colour, marker), own
-
-
-def duration(microseconds: float) -> str:
-    """A time for people."""
-    for factor, unit in ((1e6, "s"), (1e3, "ms")):
-        if microseconds >= factor:
-            return f"{microseconds / factor:.3g} {unit}"
-    return f"{microseconds:.3g} µs"
-
-
-def percent(error: float) -> str:
-    """An error for people."""
-    return f"{100 * error:.2g} %" if error < 0.995 else f"{100 * error:.0f} %"
+    """Every method that has points, with these."""
+    for family, look in LOOKS.items():
+        if own := [row for row in rows if row["family"] == family]:
+            yield look, own
 
 
 # --- picture -------------------------------------------------------------------------------------
@@ -202,7 +179,7 @@ def _draw_panel(axes: Axes, panel: Panel, rows: Sequence[Row], per: str) -> None
     kept, error = panel.plotted(rows), panel.error
     axes.set(xscale="log", yscale="log", xlabel=f"time per {per} on one core", ylabel=panel.axis)
     axes.set_title(panel.title, fontsize=12.5, fontweight="bold", loc="left")
-    axes.xaxis.set_major_formatter(lambda x, _: duration(x))
+    axes.xaxis.set_major_formatter(lambda x, _: duration(1e-6 * x))
     axes.yaxis.set_major_formatter(lambda y, _: f"{100 * y:g} %")
     axes.grid(color="0.9", linewidth=0.7)
     axes.tick_params(labelbottom=True)
@@ -212,7 +189,7 @@ def _draw_panel(axes: Axes, panel: Panel, rows: Sequence[Row], per: str) -> None
         axes.vlines(times, errors, largest, look.colour, lw=0.8, alpha=0.3)
         axes.plot(
             times, errors, look.marker, ls="-", lw=0.9, color=look.colour, markersize=look.size,
-            markeredgecolor="white", markeredgewidth=0.6, zorder=3,
+            markeredgecolor="white", markeredgewidth=0.6, zorder=look.above,
         )  # fmt: skip
     times, errors = [row["time_us"] for row in rows], [row[error] for row in kept]
     axes.set_xlim(min(times) / 1.8, max(times) * 2)
@@ -233,12 +210,13 @@ def _draw_goals(axes: Axes, panel: Panel, rows: Sequence[Row], scene: Scene, per
         return
     axes.axvline(full["time_us"], color="black", lw=0.9, ls=":")
     where = full["time_us"], bottom ** (2 / 3) * top ** (1 / 3)
-    _write(axes, f"full model:\n{duration(full['time_us'])},\nno error", where, (6, 0))
+    time = duration(1e-6 * full["time_us"])
+    _write(axes, f"full model:\n{time},\nno error", where, (6, 0))
     tolerance = getattr(scene.tolerance, panel.field)
     text = f"aim: {percent(tolerance)}"
     if per == "query":
         right = 1e6 * scene.budget.query
-        text += f" in {duration(right)}"
+        text += f" in {duration(scene.budget.query)}"
     axes.fill_between([left, right], bottom, tolerance, color=ACCENT, alpha=0.12, lw=0)
     _write(axes, text, (left, bottom), (8, 8), color=DARK_ACCENT)
 
@@ -253,7 +231,7 @@ def _draw_names(axes: Axes, panel: Panel, rows: Sequence[Row]) -> None:
                 text, offset, side = NAMES[row["key"]]
                 _write(axes, text, at, offset, ha=side, color=look.colour)
             elif row["key"] == SHIPPED:
-                text = f"Palpate: {percent(error)}\nin {duration(time)}"
+                text = f"Palpate: {percent(error)}\nin {duration(1e-6 * time)}"
                 text += "".join(f",\n{time / x:.1f} x that without memory" for x in twin)
                 _write(axes, text, at, (12, -32), color=DARK_ACCENT, fontweight="bold")
 
@@ -275,20 +253,19 @@ def _draw_legend(axes: Axes, rows: Sequence[Row]) -> None:
 
     axes.axis("off")
     handles: list[Line2D] = []
-    for title in GROUPS:
-        if own := [look for look, _ in looks(rows) if look.group == title]:
-            handles.append(Line2D([], [], ls="", label=title))
-            handles += [
-                Line2D([], [], color=look.colour, marker=look.marker, label=look.name, lw=0.9,
-                       markersize=min(look.size, 12.0)) for look in own
-            ]  # fmt: skip
+    for title, own in groupby((look for look, _ in looks(rows)), lambda look: look.group):
+        handles.append(Line2D([], [], ls="", label=title))
+        handles += [
+            Line2D([], [], color=look.colour, marker=look.marker, label=look.name, lw=0.9,
+                   markersize=min(look.size, 12.0)) for look in own
+        ]  # fmt: skip
     legend = axes.legend(
         handles=handles, loc="upper left", bbox_to_anchor=(-0.05, 1.03), frameon=False,
         fontsize=9.5, ncols=2,
     )  # fmt: skip
     words = axes.text(0, 0, NOTE, transform=axes.transAxes, fontsize=9.5, linespacing=1.4)
     for text in legend.get_texts():
-        if text.get_text() in GROUPS:
+        if text.get_text() in {look.group for look in LOOKS.values()}:
             text.set_fontweight("bold")
     for artist in (legend, words):
         artist.set_in_layout(False)
@@ -304,17 +281,16 @@ def write_page(path: Path, rows: Sequence[Row], scene: Scene, layout: Layout) ->
     down, across = layout.grid
     titles = [f"<b>{panel.title}</b>" for panel in layout.panels]
     figure = make_subplots(down, across, subplot_titles=titles)
+    dashed = {"color": "#404040", "width": 1, "dash": "dash", "shape": "hv"}
     for number, panel in enumerate(layout.panels):
         where = {"row": 1 + number // across, "col": 1 + number % across}
-        kept = panel.plotted(rows)
+        kept, front = panel.plotted(rows), pareto(panel.plotted(rows), panel.error)
         for look, own in looks(rows):
-            points = [row for row in kept if row["family"] == own[0]["family"]]
-            shown = {"showlegend": panel is layout.panels[-1]}
-            figure.add_trace(_trace(points, panel, look) | shown, **where)
-        front = pareto(kept, panel.error)
-        dashed = {"color": "#404040", "width": 1, "dash": "dash", "shape": "hv"}
+            known = [row for row in own if row in kept]
+            named = panel is layout.panels[-1]
+            figure.add_scatter(**_points(known, panel), **_style(look), showlegend=named, **where)
         line = {"mode": "lines", "line": dashed, "showlegend": False, "hoverinfo": "skip"}
-        figure.add_trace(_trace(front, panel) | line, **where)
+        figure.add_scatter(**_points(front, panel) | {"error_y": None} | line, **where)
         title = f"time per {layout.per} on one core"
         figure.update_xaxes(type="log", title=title, tickformat="~s", ticksuffix="s", **where)
         figure.update_yaxes(type="log", title=panel.axis, tickformat="~%", **where)
@@ -331,29 +307,33 @@ def write_page(path: Path, rows: Sequence[Row], scene: Scene, layout: Layout) ->
     figure.write_html(path, include_plotlyjs=True)
 
 
-def _trace(rows: Sequence[Row], panel: Panel, look: Look | None = None) -> dict[str, Any]:
-    """Points of the page and the line that joins them; of a method with all that is known."""
-    points = [(1e-6 * row["time_us"], row[panel.error]) for row in rows]
-    trace = {"type": "scatter", "x": [x for x, _ in points], "y": [y for _, y in points]}
-    if look is None:
-        return trace
+def _points(rows: Sequence[Row], panel: Panel) -> dict[str, Any]:
+    """Times and errors of points of the page, up to the largest, and all that is known of them."""
     above = [row[f"{panel.field}_max"] - row[panel.error] for row in rows]
-    return trace | {
-        "mode": "lines+markers",
-        "line": {"color": look.colour, "width": 1},
+    return {
+        "x": [1e-6 * row["time_us"] for row in rows],
+        "y": [row[panel.error] for row in rows],
         "error_y": {"array": above, "arrayminus": [0.0] * len(above), "thickness": 0.6, "width": 0},
         "text": [_hover(row, panel.field) for row in rows],
+    }
+
+
+def _style(look: Look) -> dict[str, Any]:
+    return {
+        "mode": "lines+markers",
+        "line": {"color": look.colour, "width": 1},
         "name": look.name,
         "legendgroup": look.group,
         "legendgrouptitle": {"text": look.group},
         "hovertemplate": f"<b>{look.name}</b><br>%{{text}}<extra></extra>",
         "marker": {"symbol": PAGE_MARKERS[look.marker], "size": max(look.size, 9.0)},
+        "zorder": look.above,
     }
 
 
 def _hover(row: Row, field: str) -> str:
     errors = [f"{percent(row[f'{field}_{name}'])} ({name})" for name in STATISTICS]
     return (
-        f"{row['label']}; {row['unknowns']} unknowns<br>{duration(row['time_us'])}<br>"
+        f"{row['label']}; {row['unknowns']} unknowns<br>{duration(1e-6 * row['time_us'])}<br>"
         f"error {', '.join(errors)}<br>{row['unconverged']} queries without an answer"
     )

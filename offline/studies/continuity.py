@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from palpate.offline.bench import STEP, tip_at, walk
+from palpate.offline.bench import STEP, walk
 from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.norms import relative
-from palpate.offline.fem.problem import FullProblem, Load, TipPosition
-from palpate.offline.studies.references import opened
-from palpate.offline.validate.against_full import held_out_loads
-from palpate.offline.validate.compare import OTHER_EQUILIBRIUM
+from palpate.offline.fem.problem import FullProblem, Load
+from palpate.offline.validate.compare import OTHER_EQUILIBRIUM, opened
+from palpate.offline.validate.queries import Place, held_out_loads
 from palpate.shared.model import ReducedModel
 
 Array = NDArray[np.float64]
@@ -68,12 +67,11 @@ def _forces(atlas: ReducedModel, problem: FullProblem, loads: Sequence[Load]) ->
     warm, before = atlas.new_warm(), None
     forces = np.full((2, len(loads), 1, 3), np.nan)
     for i, load in enumerate(loads):
-        answer = atlas.touch(tip_at(atlas, load), warm=warm)
+        tip = Place.at(atlas, load.position).touch(0.5)
+        answer = atlas.touch(tip.position, warm=warm)
         reduced = atlas.displacement(answer).astype(float)
         try:
-            full = problem.solve(
-                TipPosition(answer.position), start=reduced if before is None else before
-            )
+            full = problem.solve(tip, start=reduced if before is None else before)
         except NoEquilibrium:
             before = None
             continue

@@ -9,15 +9,15 @@ elsewhere than one raised from nothing: there the right answer is the one that t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.bench import limit_at, walk
+from palpate.offline.bench import walk
 from palpate.offline.fem.mesh import accessible_surface
 from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.norms import relative
@@ -25,8 +25,8 @@ from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.methods.method import Case, Steps
 from palpate.offline.reduce.sampling import cone, random_points
 from palpate.offline.run.streams import Stage, stream
-from palpate.offline.studies.references import Fields, followed
-from palpate.offline.validate.queries import random_loads
+from palpate.offline.studies.references import Fields, followed, of_tissue
+from palpate.offline.validate.queries import Place, random_loads
 from palpate.shared.model import ReducedModel
 
 Array = NDArray[np.float64]
@@ -71,8 +71,12 @@ class HardCase:
     tip: bool = False  # whether the rigid tip presses
     follow: bool = False  # whether the full model follows the load path
     brief: Steps = ()  # fewer steps to the same end, which the full model follows instead
-    end_only: bool = False  # whether only the answer to the last step counts
     nonsense: bool = False  # whether the right answer is to refuse
+
+    @property
+    def end_only(self) -> bool:
+        """Whether only the answer to the last step counts."""
+        return not self.history or bool(self.brief)
 
 
 class Question(NamedTuple):
@@ -101,7 +105,7 @@ class Question(NamedTuple):
 
 def ask_full_model(problem: FullProblem, case: HardCase) -> Question:
     """Full solutions of a hard case; a task for ``run.workers``."""
-    own = tissue(problem, case.poisson)
+    own = of_tissue(problem, poisson=case.poisson)
     if case.history:
         found = None if case.nonsense else followed(own, case.brief or case.steps, case.tip)
         return Question(case, found, found)
@@ -126,16 +130,6 @@ def _lead(problem: FullProblem, loads: Sequence[Array], finest: float) -> Fields
     return None if u is None else Fields.at_once(problem, [u])
 
 
-@lru_cache(maxsize=1 + len(RATIOS))
-def tissue(problem: FullProblem, poisson: float) -> FullProblem:
-    """The same body of tissue of another Poisson's ratio."""
-    scene = problem.scene
-    if poisson == scene.tissue.poisson:
-        return problem
-    other = scene.tissue.model_copy(update={"poisson": poisson})
-    return FullProblem(scene.model_copy(update={"tissue": other}), problem.mesh)
-
-
 def several(questions: Mapping[str, Sequence[Question]], most: int) -> dict[str, list[Question]]:
     """Of all loads that were followed, those of several equilibria: raised, and lowered again."""
     found: dict[str, list[Question]] = {}
@@ -154,19 +148,17 @@ class HardLoads:
         self._atlas, self._problem, self._count, self._seed = atlas, problem, count, seed
         self._poisson, self._endoscope = problem.scene.tissue.poisson, problem.scene.endoscope
 
-    @property
-    def makers(self) -> dict[str, Callable[[Rng], list[HardCase]]]:
-        """What makes the cases of each kind, by its name."""
-        radius = self._endoscope.radius
-        return {
+    def cases(self) -> dict[str, list[HardCase]]:
+        """Cases of every kind by its name; of several equilibria, candidates."""
+        makers: dict[str, Callable[[Rng], Iterable[HardCase]]] = {
             CONTROL: partial(self._in_tissue, self._poisson),
             **{f"load x {x:g}": partial(self._raised, (x, x)) for x in FACTORS},
             SEVERAL: partial(self._raised, (FACTORS[0], FACTORS[-1])),
             **{f"tilt {tilt:g}°": partial(self._tilted, tilt) for tilt in TILTS},
             "off surface, in reach": partial(self._elsewhere, True),
             "off surface, out of reach": partial(self._elsewhere, False),
-            "half the radius": partial(self._footprints, 0.5 * radius),
-            "1.5 x the radius": partial(self._footprints, 1.5 * radius),
+            "half the radius": partial(self._footprints, 0.5),
+            "1.5 x the radius": partial(self._footprints, 1.5),
             "two contacts": self._pairs,
             **{f"Poisson {ratio:g}": partial(self._in_tissue, ratio) for ratio in RATIOS},
             **{f"tool moves {step:g} mm": partial(self._moves, step) for step in STEPS},
@@ -174,88 +166,71 @@ class HardLoads:
             LOWERED: partial(self._lowered, RAISED, self._count),
             HYSTERESIS: partial(self._lowered, SNAPPED, SEARCHED * self._count),
         }
-
-    def cases(self) -> dict[str, list[HardCase]]:
-        """Cases of every kind by its name; of several equilibria, candidates."""
-        return {
-            name: make(stream(self._problem.scene.seed, Stage.HARD_CASES, self._seed, i))
-            for i, (name, make) in enumerate(self.makers.items())
-        }
+        seeds = self._problem.scene.seed, Stage.HARD_CASES, self._seed
+        return {name: [*makers[name](stream(*seeds, i))] for i, name in enumerate(makers)}
 
     def _loads(self, rng: Rng, count: int | None = None) -> list[Load]:
-        return random_loads(self._atlas, self._count if count is None else count, rng)
+        return random_loads(self._atlas, count or self._count, rng)
 
     def _through(self, *cases: Case, follow: bool = False) -> HardCase:
         """A case that is reached through others, all at once."""
-        steps = [(case, 0.0) for case in cases]
-        return HardCase(steps, self._poisson, follow=follow, end_only=True)
+        return HardCase([(case, 0.0) for case in cases], self._poisson, follow=follow)
 
     def _path(self, *loads: Load, follow: bool = False) -> HardCase:
         return self._through(*(Case.of(self._problem, load) for load in loads), follow=follow)
 
-    def _in_tissue(self, poisson: float, rng: Rng) -> list[HardCase]:
-        return [replace(self._path(load), poisson=poisson) for load in self._loads(rng)]
-
     def _peak(self, load: Load, factors: tuple[float, float], rng: Rng) -> float:
-        return rng.uniform(*factors) * limit_at(self._atlas, load.position, load.direction)
+        return rng.uniform(*factors) * Place.at(self._atlas, load.position).limit(load.direction)
 
-    def _raised(self, factors: tuple[float, float], rng: Rng) -> list[HardCase]:
-        return [
-            self._path(replace(load, pressure=self._peak(load, factors, rng)), follow=True)
-            for load in self._loads(rng)
-        ]
+    def _in_tissue(self, poisson: float, rng: Rng) -> Iterator[HardCase]:
+        return (replace(self._path(load), poisson=poisson) for load in self._loads(rng))
 
-    def _lowered(self, peaks: tuple[float, float], count: int, rng: Rng) -> list[HardCase]:
+    def _raised(self, factors: tuple[float, float], rng: Rng) -> Iterator[HardCase]:
+        for load in self._loads(rng):
+            peak = replace(load, pressure=self._peak(load, factors, rng))
+            yield self._path(peak, follow=True)
+
+    def _lowered(self, peaks: tuple[float, float], count: int, rng: Rng) -> Iterator[HardCase]:
         """Loads in range that come down from a multiple of the limit."""
-        found, turns = [], np.arange(1, PATH_STEPS + 1)
+        turns = np.arange(1, PATH_STEPS + 1)
         for load in self._loads(rng, count):
             corners = (0.0, self._peak(load, peaks, rng), load.pressure)
             pressures = np.interp(turns, (0, PATH_STEPS // 2, PATH_STEPS), corners).tolist()
-            found.append(self._path(*(replace(load, pressure=p) for p in pressures), follow=True))
-        return found
+            yield self._path(*(replace(load, pressure=p) for p in pressures), follow=True)
 
-    def _within(self, position: Array, direction: Array, rng: Rng) -> Load:
-        """A random load up to the limit."""
-        pressure = limit_at(self._atlas, position, direction) * np.sqrt(rng.random())
-        return Load(position, direction, float(pressure))
-
-    def _tilted(self, tilt: float, rng: Rng) -> list[HardCase]:
-        cases = []
+    def _tilted(self, tilt: float, rng: Rng) -> Iterator[HardCase]:
         for load in self._loads(rng):
-            normal = self._atlas.surface.project(load.position)[1]
-            direction = cone(normal, tilt, 1, rng, border=True)[0]
-            cases.append(self._path(self._within(load.position, direction, rng)))
-        return cases
+            place = Place.at(self._atlas, load.position)
+            direction = cone(place.normal, tilt, 1, rng, border=True)[0]
+            yield self._path(place.press(direction, np.sqrt(rng.random())))
 
-    def _elsewhere(self, within: bool, rng: Rng) -> list[HardCase]:
+    def _elsewhere(self, within: bool, rng: Rng) -> Iterator[HardCase]:
         """Presses other parts of the free boundary, straight in."""
-        mesh, reach = self._problem.mesh, self._endoscope.reach
+        mesh, reach, found = self._problem.mesh, self._endoscope.reach, 0
         free = np.asarray(~mesh.clamped[mesh.faces].all(axis=1))
-        surface, cases = accessible_surface(replace(mesh, accessible=free)), list[HardCase]()
-        while len(cases) < self._count:
+        surface = accessible_surface(replace(mesh, accessible=free))
+        while found < self._count:
             point = random_points(surface, 1, rng)[0]
             _, _, distance = self._atlas.surface.project(point)
             if not (OFF < distance <= reach if within else distance > reach):
                 continue
             x, normal, _ = surface.project(point)
-            load = replace(self._within(point, -normal, rng), position=x)
-            cases.append(self._through(Case.pressed(self._problem, (load,), [(x, normal)])))
-        return cases
+            load = Place.at(self._atlas, point).press(-normal, np.sqrt(rng.random()))
+            load, found = replace(load, position=x), found + 1
+            yield self._through(Case.of(self._problem, load, feet=[(x, normal)]))
 
-    def _footprints(self, radius: float, rng: Rng) -> list[HardCase]:
-        cases = []
-        for load in self._loads(rng):
-            foot = load.position, self._atlas.surface.project(load.position)[1]
-            cases.append(self._through(Case.pressed(self._problem, (load,), [foot], radius)))
-        return cases
-
-    def _pairs(self, rng: Rng) -> list[HardCase]:
-        pairs = zip(self._loads(rng), self._loads(rng), strict=True)
-        return [self._through(Case.of(self._problem, *pair)) for pair in pairs]
-
-    def _moves(self, step: float, rng: Rng) -> list[HardCase]:
+    def _footprints(self, share: float, rng: Rng) -> Iterator[HardCase]:
+        radius = share * self._endoscope.radius
         loads = self._loads(rng)
-        return [self._path(x, *walk(self._atlas, x, WARM_UP, rng, step)) for x in loads]
+        return (self._through(Case.of(self._problem, load, radius=radius)) for load in loads)
 
-    def _teleports(self, rng: Rng) -> list[HardCase]:
-        return [self._path(*self._loads(rng, WARM_UP + 1)) for _ in range(self._count)]
+    def _pairs(self, rng: Rng) -> Iterator[HardCase]:
+        pairs = zip(self._loads(rng), self._loads(rng), strict=True)
+        return (self._through(Case.of(self._problem, *pair)) for pair in pairs)
+
+    def _moves(self, step: float, rng: Rng) -> Iterator[HardCase]:
+        loads = self._loads(rng)
+        return (self._path(x, *walk(self._atlas, x, WARM_UP, rng, step)) for x in loads)
+
+    def _teleports(self, rng: Rng) -> Iterator[HardCase]:
+        return (self._path(*self._loads(rng, WARM_UP + 1)) for _ in range(self._count))

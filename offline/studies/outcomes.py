@@ -18,41 +18,31 @@ from typing import Any
 import numpy as np
 
 from palpate.offline.fem.problem import FullProblem
+from palpate.offline.info import percent
 from palpate.offline.run.tables import write_csv
 from palpate.offline.studies.hard_cases import CONTROL
 from palpate.offline.studies.references import Fields
 
-MIDDLE = -0.12  # position of the bar in a cell of the map: above the middle
 ROUGHLY = 0.1
 """Displacement error up to which a wrong answer is roughly right; the artifact is nearly the only
 method within the tolerance of a scene."""
 
-RIGHT = "right"
-RIGHT_FLAGGED = "right but flagged"
-WRONG_FLAGGED = "wrong but flagged"
-ANOTHER_FLAGGED = "another equilibrium but flagged"
-REFUSED = "refused, or rightly none"
-DIVERGED = "not converged"
-ANOTHER = "silently another equilibrium"
-ROUGH = "silently wrong, displacement within 10 %"
-SILENT = "silently wrong"
-INVERTED = "silently inverted"
-
 OUTCOMES = {
-    RIGHT: "#0072B2",
-    RIGHT_FLAGGED: "#8CC5E8",
-    WRONG_FLAGGED: "#C8C8C8",
-    ANOTHER_FLAGGED: "#EBC9DB",
-    REFUSED: "#ECECEC",
-    DIVERGED: "#7F7F7F",
-    ANOTHER: "#CC79A7",
-    ROUGH: "#F0E442",
-    SILENT: "#D55E00",
-    INVERTED: "#000000",
+    "right": "#0072B2",
+    "right but flagged": "#8CC5E8",
+    "wrong but flagged": "#C8C8C8",
+    "another equilibrium but flagged": "#EBC9DB",
+    "refused, or rightly none": "#ECECEC",
+    "not converged": "#7F7F7F",
+    "silently another equilibrium": "#CC79A7",
+    "silently wrong, displacement within 10 %": "#F0E442",
+    "silently wrong": "#D55E00",
+    "silently inverted": "#000000",
 }
 """What can become of an answer, and its colour: after Okabe & Ito, safe for colour-blind eyes."""
 
-SILENT_OUTCOMES = (ANOTHER, ROUGH, SILENT, INVERTED)
+RIGHT, RIGHT_FLAGGED, WRONG_FLAGGED, ANOTHER_FLAGGED, REFUSED, DIVERGED, *SILENT_OUTCOMES = OUTCOMES
+ANOTHER, ROUGH, SILENT, INVERTED = SILENT_OUTCOMES
 
 
 @dataclass(frozen=True)
@@ -186,19 +176,19 @@ def _draw(
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.add_subplot()
     left = np.array([columns.index(row["stressor"]) - 0.45 for row in rows])
-    y = np.array([methods.index(row["method"]) + MIDDLE for row in rows])
+    y = np.array([methods.index(row["method"]) for row in rows])
     axes.barh(y, 0.9, 0.46, left, fill=False, edgecolor="0.4", linewidth=0.5, zorder=2)
     for row, x, middle in zip(rows, left + 0.45, y, strict=True):
-        text = _percent(row["displacement_median"])
-        axes.text(x, middle - MIDDLE + 0.25, text, ha="center", va="center", size=8)
+        error = percent(row["displacement_median"])
+        axes.text(x, middle + 0.37, error, ha="center", va="center", size=8)
     for outcome, colour in OUTCOMES.items():
         width = np.array([0.9 * row[outcome] / row["cases"] for row in rows])
         axes.barh(y, width, 0.46, left, color=colour, linewidth=0)
         left += width
     axes.set_xticks(range(len(columns)), columns, rotation=40, ha="left", rotation_mode="anchor")
     axes.xaxis.tick_top()
-    axes.set_yticks([y + MIDDLE for y in range(len(methods))], methods)
-    axes.set(xlim=(-0.55, len(columns) - 0.45), ylim=(len(methods) - 0.45, -0.55))
+    axes.set_yticks(range(len(methods)), methods)
+    axes.set(xlim=(-0.55, len(columns) - 0.45), ylim=(len(methods) - 0.33, -0.43))
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
     handles = [Patch(facecolor=c, edgecolor="0.4", label=name) for name, c in OUTCOMES.items()]
@@ -210,12 +200,3 @@ def _draw(
         fontsize=13,
     )
     figure.savefig(path, dpi=100)
-
-
-def _percent(error: float) -> str:
-    """Two digits for people; a dash where there is no answer."""
-    if math.isnan(error):
-        return "–"
-    if not 1e-4 < error < 10:
-        return "< 0.01 %" if error < 1 else "> 999 %"
-    return f"{100 * error:{'.0f' if error > 0.0995 else '.2g'}} %"

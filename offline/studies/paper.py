@@ -61,6 +61,8 @@ from palpate.shared.scene import Block
 
 Array = NDArray[np.float64]
 Claims = dict[str, dict[str, Any]]
+Nodes = dict[str, tuple[Array, Array]]
+"""Values (n,) by name, mm or kPa, and their relative errors, nan where there is no value."""
 
 SNAPSHOTS = 20
 ROUNDS = 3  # how often every step is timed
@@ -148,9 +150,7 @@ def footprint(problem: FullProblem) -> Example:
     return Example(problem, -pressure * areas[:, None] * normal, pressure, at)
 
 
-def compare(
-    example: Example, report: Path, sizes: Sequence[int] | None = None, contours: bool = False
-) -> dict[str, Any]:
+def compare(example: Example, report: Path, contours: bool = False) -> dict[str, Any]:
     """Errors and times of the three methods, and whether the paper's claims hold.
 
     Writes ``paper_NAME.csv`` (a row per method and number of bases), ``paper_NAME.png`` (figures 1a
@@ -165,7 +165,7 @@ def compare(
     """
     problem, name = example.problem, example.problem.scene.name
     training = snapshots(example)
-    rows = measure(example, training, sizes or SIZES)
+    rows = measure(example, training)
     moved = float(np.linalg.norm(training[:, example.point], axis=1).max())
     title = f"{name}, pressed with up to {example.pressure:.3g} kPa"
     title += f"{', held and let go' if example.in_time else ''}: P moves {moved:.1f} mm"
@@ -173,10 +173,11 @@ def compare(
     paper_pictures.chart(report / f"paper_{name}.png", rows, title)
     claims: dict[int, Claims] = {}
     for size in range(CONTOUR_BASES if example.in_time else 1, CONTOUR_BASES + 1):
-        values, errors = node_by_node(*last_fields(example, training, size))
-        claims[size] = claims_of_figure_2(values, errors, ~problem.beyond_clamped_layer)
+        nodes = node_by_node(example, training, size)
+        claims[size] = claims_of_figure_2(nodes, ~problem.beyond_clamped_layer)
     if contours:
         path, radius = report / f"paper_{name}_contours.png", problem.scene.endoscope.radius
+        errors = {name: error for name, (_, error) in nodes.items()}
         paper_pictures.contours(path, problem.mesh, errors, example.at, radius)
     return {
         "load": {
@@ -197,26 +198,22 @@ def snapshots(example: Example) -> Array:
     return np.array([full.displacement(state) for state in states])
 
 
-def spaces(example: Example, training: Array, size: int) -> dict[str, Array]:
-    """Bases of the three methods, (free dofs, <= size), nested."""
-    model = example.problem.model
-    load = example.load.reshape(-1, 1)[model.free]
-    return {
-        "MOD": modal(model, size),
-        "RITZ": krylov(model, mass(model), load, size),
-        "POD": pod(model, training.reshape(len(training), -1), size),
-    }
-
-
-def measure(example: Example, training: Array, sizes: Sequence[int]) -> list[dict[str, Any]]:
+def measure(example: Example, training: Array) -> list[dict[str, Any]]:
     """Rows of the table: a method and number of bases each."""
-    problem, histories = example.problem, example.queries()
+    problem, model, most = example.problem, example.problem.model, max(SIZES)
+    bases = {
+        "MOD": modal(model, most),
+        "RITZ": krylov(model, mass(model), example.load.reshape(-1, 1)[model.free], most),
+        "POD": pod(model, training.reshape(len(training), -1), most),
+    }
     methods: dict[tuple[str, int], Method] = {("full", 0): Full(problem)}
-    for name, basis in spaces(example, training, max(sizes)).items():
-        for size in sizes:
-            if size <= basis.shape[1]:
-                own = basis[:, :size].copy()
-                methods[name, size] = Galerkin(problem, own, in_time=example.in_time)
+    methods |= {
+        (name, size): Galerkin(problem, basis[:, :size].copy(), in_time=example.in_time)
+        for name, basis in bases.items()
+        for size in SIZES
+        if size <= basis.shape[1]
+    }
+    histories = example.queries()
     for method in methods.values():  # compiled code comes in from disk
         method.solve(histories[0][0][0])
     seconds: dict[tuple[str, int], list[Array]] = {key: [] for key in methods}
@@ -242,30 +239,39 @@ def measure(example: Example, training: Array, sizes: Sequence[int]) -> list[dic
 
 def _errors(example: Example, found: list[Fields], full: list[Fields]) -> dict[str, float]:
     """Columns of the table; means and maxima are over histories."""
-    problem, P = example.problem, example.point
     pairs = list(zip(found, full, strict=True))
-    points = [(own.displacements[:, P], exact.displacements[:, P]) for own, exact in pairs]
+    points = [[own.displacements[:, example.point] for own in pair] for pair in pairs]
     worst = [
         np.linalg.norm(u - exact, axis=1).max() / np.linalg.norm(exact, axis=1).max()
         for u, exact in points
     ]
-    displacement, stress = np.mean([own.errors(problem, exact) for own, exact in pairs], axis=0)
+    errors = [own.errors(example.problem, exact) for own, exact in pairs]
+    displacement, stress = np.mean(errors, axis=0).tolist()
     return {
         "error_at_P_mean": float(np.mean([relative(*pair) for pair in points])),
         "error_at_P_max": float(np.max(worst)),
-        "displacement_error_mean": float(displacement),
-        "von_mises_error_mean": float(stress),
+        "displacement_error_mean": displacement,
+        "von_mises_error_mean": stress,
     }
 
 
-def last_fields(example: Example, training: Array, bases: int) -> tuple[Fields, Fields]:
-    """Fields in POD bases and the full ones: when the load has been held, or is the greatest."""
-    problem, in_time = example.problem, example.in_time
+def node_by_node(example: Example, training: Array, bases: int) -> Nodes:
+    """Displacement and stress when the load has been held, or is the greatest, in POD bases."""
+    problem = example.problem
     basis = pod(problem.model, training.reshape(len(training), -1), bases)
     steps = example.queries()[-1][: HELD + 1]
-    reduced = Galerkin(problem, basis, in_time=in_time, accurate=EXACT)
-    one, other = (Fields.of(m, play(m, steps)[0][-1:]) for m in (reduced, Full(problem)))
-    return one, other
+    methods = Galerkin(problem, basis, None, example.in_time, EXACT), Full(problem)
+    ends = [play(method, steps)[0][-1:] for method in methods]
+    (u, stress), (exact, full) = (
+        [field[0] for field in Fields.of(*own)] for own in zip(methods, ends, strict=True)
+    )
+    return {
+        name: (value, np.divide(off, value, out=np.full_like(value, np.nan), where=value > 0))
+        for name, value, off in (
+            ("displacement", np.linalg.norm(exact, axis=1), np.linalg.norm(u - exact, axis=1)),
+            ("von Mises stress", full, np.abs(stress - full)),
+        )
+    }
 
 
 # --- the paper's claims ------------------------------------------------------------------------
@@ -305,24 +311,8 @@ def claims_of_figure_1(rows: list[dict[str, Any]]) -> Claims:
     }
 
 
-def node_by_node(reduced: Fields, full: Fields) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Displacement (n,) mm and von Mises stress (n,) kPa of a moment, and relative errors of both.
-
-    Errors are nan where there is nothing to approximate.
-    """
-    (u, found), (exact, stress) = ((field[0] for field in fields) for fields in (reduced, full))
-    values = {"displacement": np.linalg.norm(exact, axis=1), "von Mises stress": stress}
-    off = np.linalg.norm(u - exact, axis=1), np.abs(found - stress)
-    return values, {
-        name: np.divide(error, value, out=np.full_like(value, np.nan), where=value > 0)
-        for (name, value), error in zip(values.items(), off, strict=True)
-    }
-
-
-def claims_of_figure_2(
-    values: dict[str, Array], errors: dict[str, Array], near_support: NDArray[np.bool_]
-) -> Claims:
-    """Where the errors are largest, in numbers; see ``node_by_node``.
+def claims_of_figure_2(nodes: Nodes, near_support: NDArray[np.bool_]) -> Claims:
+    """Where the errors are largest, in numbers.
 
     ``error_largest_where_value_smallest``, for displacement and stress: median relative errors of
     the tenth of nodes with the least and with the greatest values, and the rank correlation of
@@ -330,18 +320,12 @@ def claims_of_figure_2(
     ``stress_best_near_support``: medians near the support and elsewhere, and whether the largest
     stress is near it, as the paper says too.
     """
-    smallest = {
-        name: _tenths(value, error)
-        for name, value, error in zip(
-            ("displacement", "von_mises"), values.values(), errors.values(), strict=True
-        )
-    }
-    _, stress = values.values()
-    _, error = errors.values()
+    displacement, (stress, error) = nodes.values()
+    tenths = {"displacement": _tenths(*displacement), "von_mises": _tenths(stress, error)}
     near, elsewhere = (float(np.nanmedian(error[w])) for w in (near_support, ~near_support))
-    holds = all(found["holds"] for found in smallest.values())
+    holds = all(found["holds"] for found in tenths.values())
     return {
-        "error_largest_where_value_smallest": {"holds": holds} | smallest,
+        "error_largest_where_value_smallest": {"holds": holds} | tenths,
         "stress_best_near_support": {
             "holds": near < elsewhere,
             "near": near,

@@ -17,9 +17,9 @@ from palpate.offline.fem.problem import FullProblem, Load, TipPosition
 from palpate.offline.methods.full import Remeshed
 from palpate.offline.methods.method import Case, Method, Snapshots, Steps
 from palpate.offline.run.workers import Checkpoint, content_key, open_artifact, worker_pool
-from palpate.offline.validate.queries import random_histories, random_loads
-from palpate.shared.artifact import read_artifact
-from palpate.shared.errors import PalpateError, QueryError
+from palpate.offline.validate import compare
+from palpate.offline.validate.queries import HISTORIES, LOADS
+from palpate.shared.errors import PalpateError
 from palpate.shared.model import ReducedModel
 from palpate.shared.scene import Scene, parse_scene
 
@@ -52,27 +52,32 @@ class Fields(NamedTuple):
         return relative(self.displacements, u), relative(self.stresses[:, kept], s[:, kept])
 
 
-def opened(
-    artifact: Path, scene: Scene | None = None, in_time: bool = False
-) -> tuple[ReducedModel, FullProblem]:
-    """Reduced and full model of an artifact; of its scene with the files, if that is given.
+def opened(artifact: Path, scene: Scene | None) -> tuple[ReducedModel, FullProblem]:
+    """Reduced and full model of an artifact; of its scene with the files, or of tissue with time.
 
     Raises
     ------
     PalpateError
         If the artifact was trained on another scene.
     QueryError
-        If it is to answer in time and its tissue is elastic.
+        If there is no scene and its tissue is elastic.
     """
-    atlas = ReducedModel.load(artifact)
-    if in_time and atlas.models.viscous is None:
-        raise QueryError("scene", f"{atlas.name!r} is elastic: it has no histories")
-    problem = FullProblem.of_artifact(read_artifact(artifact))
     if scene is None:
-        return atlas, problem
+        return compare.opened(artifact, HISTORIES)
+    atlas, problem = compare.opened(artifact)
     if atlas.scene.text != scene.text:
         raise PalpateError(f"{artifact}: trained on another scene than {scene.name!r}")
     return atlas, FullProblem(scene, problem.mesh)
+
+
+@lru_cache(maxsize=4)
+def of_tissue(problem: FullProblem, **changes: Any) -> FullProblem:
+    """The same body of tissue that differs in what is given."""
+    scene = problem.scene
+    if all(getattr(scene.tissue, key) == value for key, value in changes.items()):
+        return problem
+    other = scene.tissue.model_copy(update=changes)
+    return FullProblem(scene.model_copy(update={"tissue": other}), problem.mesh)
 
 
 def kept_results(artifact: Path, scene: Scene, name: str, settings: object) -> Checkpoint:
@@ -98,11 +103,8 @@ def random_steps(
     atlas: ReducedModel, problem: FullProblem, count: int, rng: np.random.Generator, in_time: bool
 ) -> list[Steps]:
     """Random histories of footprints, or single loads, over the whole surface and range."""
-    if in_time:
-        histories = random_histories(atlas, count, rng)
-    else:
-        histories = [[load] for load in random_loads(atlas, count, rng)]
-    return [[(Case.of(problem, load), load.dt) for load in history] for history in histories]
+    queries = (HISTORIES if in_time else LOADS).random(atlas, count, rng)
+    return [[(Case.of(problem, load), load.dt) for load in query] for query in queries]
 
 
 def followed(problem: FullProblem, steps: Steps, tip: bool = False) -> Fields | None:

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from palpate.offline.fem.problem import Load
 from palpate.offline.methods.full import Full
 from palpate.offline.methods.method import Case
 from palpate.offline.methods.shipped import Shipped
 from palpate.offline.run.tables import write_csv
 from palpate.offline.studies.chart import play
-from palpate.offline.studies.references import opened
+from palpate.offline.validate.compare import opened
+from palpate.offline.validate.queries import HISTORIES, Place
 
 Array = NDArray[np.float64]
 
@@ -32,30 +32,29 @@ PHASES = ((0.2, 10, 1.0), (4.0, 40, 1.0), (0.1, 5, 0.0), (4.0, 40, 0.0))
 def relaxation(artifact: Path, position: Sequence[float] | None = None) -> dict[str, Any]:
     """Press one place (mm) of an artifact's surface, or its middle, hold, release, wait.
 
-    Writes ``relaxation.csv`` and ``relaxation.png`` to the report beside the artifact.
-
     Returns
     -------
     dict
         Depths (mm) at once and after the hold, the depth left after the rest, the largest
         difference of the two models' depths, and the median time of a step (µs).
     """
-    atlas, problem = opened(artifact, in_time=True)
+    atlas, problem = opened(artifact, HISTORIES)
     vertices = atlas.surface.vertices
     middle = vertices[np.linalg.norm(vertices - vertices.mean(axis=0), axis=1).argmin()]
-    at = middle if position is None else np.array(position)
-    x, normal, _, fields = atlas.surface.locate(at, atlas.limits)
-    pressure = PRESSED * float(fields[0])
+    place = Place.at(atlas, middle if position is None else np.array(position))
     steps = [
-        (Case.of(problem, Load(x, -normal, share * pressure)), dt)
+        (Case.of(problem, place.press(-place.normal, share * PRESSED)), dt)
         for dt, share in load_steps(PHASES)
     ]
     reduced, full = Shipped(problem, atlas, "in time"), Full(problem)
     reduced.solve(steps[0][0])  # compiles
     answers, *_ = play(reduced, steps)
-    exact = [problem.under(x, past.displacement) for past in play(full, tqdm(steps, "full"))[0]]
+    exact = [
+        problem.under(place.position, past.displacement)
+        for past in play(full, tqdm(steps, "full"))[0]
+    ]
     moved = list(zip(exact, [answer.contact_displacement for answer in answers], strict=True))
-    times, depth = np.cumsum([dt for _, dt in steps]), -np.array(moved) @ normal
+    times, depth = np.cumsum([dt for _, dt in steps]), -np.array(moved) @ place.normal
     force = np.array([np.linalg.norm(answer.force) for answer in answers])
     report = artifact.parent / atlas.name / "report"
     names = "time_s", "force_mN", "depth_full_mm", "depth_reduced_mm"

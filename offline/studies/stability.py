@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +34,7 @@ from palpate.offline.studies.references import (
     Fields,
     in_parallel,
     kept_results,
+    of_tissue,
     opened,
     random_steps,
     snapshots,
@@ -46,7 +46,6 @@ from palpate.shared.scene import Scene
 SNAPSHOTS, SNAPSHOTS_IN_TIME = 150, 12
 """Full solutions of each tissue, or histories, that the methods learn from."""
 
-MANY = 100_000  # steps of the longest history
 SIZE, DERIVATIVES = 40, 19
 LARGER = 5  # steps of the full model that are made one
 ARTIFACT, WARM, FULL = "artifact", "artifact, warm", "full model, one jump"
@@ -86,14 +85,12 @@ def stability(
     scene: Scene | None,
     cases: int,
     seed: int,
-    many: int = MANY,
+    many: int = 0,
     methods: Sequence[str] | None = None,
     kinds: Sequence[str] | None = None,
     learnt: int | None = None,
 ) -> dict[str, Any]:
     """Map what becomes of the answers of methods under hard loads, or in hard histories.
-
-    A table, a row per method and kind, and a picture go to ``NAME/report`` beside the artifact.
 
     Parameters
     ----------
@@ -103,7 +100,7 @@ def stability(
     cases : int
         Loads of each kind, or places in which each kind of history is tried.
     many : int
-        Steps of the longest history.
+        Steps of the longest history, if there are any.
     methods, kinds : sequence of str, optional
         Only these of ``METHODS`` or ``METHODS_IN_TIME``, and only these kinds; all if absent.
     learnt : int, optional
@@ -116,7 +113,7 @@ def stability(
         has no answer to.
     """
     in_time = scene is None
-    atlas, problem = opened(artifact, scene, in_time)
+    atlas, problem = opened(artifact, scene)
     title, rows, stage, most = (
         ("stability_in_time", METHODS_IN_TIME, Stage.STABILITY_IN_TIME_SNAPSHOTS, SNAPSHOTS_IN_TIME)
         if in_time
@@ -124,7 +121,9 @@ def stability(
     )
     wanted = [name for name in methods or rows if name != TIP or atlas.models.viscous_tips]
     if in_time:
-        asked = _histories(atlas, problem, [False, True][: 1 + (TIP in wanted)], cases, seed, many)
+        asked = histories(atlas, problem, False, cases, seed, many)
+        touched = histories(atlas, problem, True, cases, seed, many) if TIP in wanted else {}
+        asked = {kind: own + touched.get(kind, []) for kind, own in asked.items()}
     else:
         asked = hard_cases.HardLoads(atlas, problem, cases, seed).cases()
     asked = {kind: asked[kind] for kind in kinds or asked}
@@ -144,20 +143,18 @@ def stability(
     table: dict[str, dict[str, list[Result]]] = {name: {} for name in wanted}
     for poisson, solutions in zip(poissons, learning, strict=True):
         pairs = [(question.case.steps, question.jump) for question in solved[solutions]]
-        own_tissue = hard_cases.tissue(problem, poisson)
+        own_tissue = of_tissue(problem, poisson=poisson)
         training = Training(own_tissue, snapshots(pairs), atlas, in_time=in_time)
         for name in tqdm(wanted, f"methods, Poisson {poisson:g}"):
-            own = {
-                kind: [q for q in every if _applies(name, q.case, poisson, atlas)]
-                for kind, every in questions.items()
-            }
             label = f"answers {name} {poisson:g}"
             if label not in checkpoint:
-                checkpoint.store(
-                    label, _answers(name, rows[name], training, [*chain(*own.values())])
-                )
-            results = iter(checkpoint.load(label))
-            table[name] |= {kind: [next(results) for _ in x] for kind, x in own.items() if x}
+                put = {
+                    kind: [q for q in every if _applies(name, q.case, poisson, atlas)]
+                    for kind, every in questions.items()
+                }
+                put = {kind: own for kind, own in put.items() if own}
+                checkpoint.store(label, _answers(name, rows[name], training, put) if put else {})
+            table[name] |= checkpoint.load(label)
     noun = "histories (one of those of many steps)" if in_time else "loads"
     kept = [kind for kind, own in questions.items() if own]
     outcomes.publish(artifact.parent / atlas.name / "report", title, table, kept, noun)
@@ -166,17 +163,6 @@ def stability(
     return outcomes.summaries(table) | {
         "without_equilibrium": {kind: count for kind, count in missing.items() if count}
     }
-
-
-def _histories(
-    atlas: ReducedModel, problem: FullProblem, tips: Sequence[bool], *settings: int
-) -> dict[str, list[HardCase]]:
-    """Hard histories of footprints, and of the rigid tip if that is wanted."""
-    cases: dict[str, list[HardCase]] = {}
-    for tip in tips:
-        for kind, own in histories(atlas, problem, tip, *settings).items():
-            cases.setdefault(kind, []).extend(own)
-    return cases
 
 
 def _applies(method: str, case: HardCase, poisson: float, atlas: ReducedModel) -> bool:
@@ -194,19 +180,18 @@ def _answers(
     name: str,
     named: tuple[str, float] | None,
     training: Training,
-    questions: Sequence[Question],
-) -> list[Result]:
+    asked: Mapping[str, Sequence[Question]],
+) -> dict[str, list[Result]]:
     """What becomes of a method's answers; of the full model's jump if there is no method."""
-    problem = training.problem
-    if named is None:
-        return [
-            outcomes.classify(problem, q.jump, q.jump is not None, q.exact, q.other)
-            for q in questions
-        ]
-    if not questions:
-        return []
-    method, every = build(*named, training), LARGER if name == STEPS else 1
-    return [_answer(method, problem, question, every) for question in questions]
+    problem, every = training.problem, LARGER if name == STEPS else 1
+    method = None if named is None else build(*named, training)
+
+    def answer(q: Question) -> Result:
+        if method is not None:
+            return _answer(method, problem, q, every)
+        return outcomes.classify(problem, q.jump, q.jump is not None, q.exact, q.other)
+
+    return {kind: [answer(question) for question in own] for kind, own in asked.items()}
 
 
 def _answer(method: Method, problem: FullProblem, question: Question, every: int) -> Result:

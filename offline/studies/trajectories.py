@@ -9,20 +9,19 @@ scene has one, with the rigid tip, in the same places.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.bench import limit_at
-from palpate.offline.fem.problem import FullProblem, Load
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods.method import Case
 from palpate.offline.reduce.sampling import random_points_and_rim, tangents
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.studies.hard_cases import HardCase
 from palpate.offline.studies.relaxation import load_steps
-from palpate.offline.validate.queries import LIFTED
-from palpate.shared.mechanics.footprint import TIP_DEPTH
+from palpate.offline.validate.queries import Place
+from palpate.shared.geometry.surface import Surface
 from palpate.shared.model import ReducedModel
 
 Array = NDArray[np.float64]
@@ -39,44 +38,11 @@ PERIOD, PERIODS = 50, 10
 """Steps in a period of the periodic movement, and periods after which the full model repeats."""
 
 Step = tuple[Case, float]
+Press = Callable[..., Step]
+"""Step to a place (3,) mm, a level of the load (1 is the limit), in seconds, tilted (degrees)."""
+
 Course = Callable[[Array], Iterable[Step]]
 """Steps of a kind of history in a place."""
-
-
-class Presser:
-    """Turns levels of a load at places into steps, by footprints or by the rigid tip."""
-
-    def __init__(self, atlas: ReducedModel, problem: FullProblem, tip: bool) -> None:
-        self._atlas, self._problem, self.tip = atlas, problem, tip
-        self._cases: dict[tuple[float, ...], Case] = {}
-
-    def __call__(self, at: Array, level: float, dt: float, tilt: float = 0.0) -> Step:
-        """Press at a place to a level (1 is the limit), leaning by ``tilt`` degrees."""
-        key = (*at.tolist(), level, tilt)
-        if key not in self._cases:  # loads repeat in long histories
-            self._cases[key] = self._case(at, level, tilt)
-        return self._cases[key], dt
-
-    def _case(self, at: Array, level: float, tilt: float) -> Case:
-        atlas = self._atlas
-        x, normal, _, fields = atlas.surface.locate(at, atlas.limits)
-        if self.tip:
-            depth = level * fields[TIP_DEPTH] if level > 0.0 else -LIFTED
-            return Case.of_tip(x + (atlas.scene.endoscope.radius - depth) * normal, -normal)
-        lean = np.radians(tilt)
-        direction = np.sin(lean) * tangents(normal)[0] - np.cos(lean) * normal
-        return Case.of(self._problem, Load(x, direction, level * limit_at(atlas, x, direction)))
-
-    def aside(self, at: Array, distance: float) -> Array:
-        """The place (3,) at a distance (mm) over the surface, always the same way."""
-        surface = self._atlas.surface
-        x, normal, _ = surface.project(at)
-        return surface.project(x + distance * tangents(normal)[0])[0]
-
-    def levels(self, shares: Sequence[float] | Array, dt: float | Array, at: Array) -> list[Step]:
-        """Press at a place to one level after the other."""
-        times = np.broadcast_to(dt, len(shares)).tolist()
-        return [self(at, float(share), t) for share, t in zip(shares, times, strict=True)]
 
 
 def histories(
@@ -89,45 +55,65 @@ def histories(
     rng = stream(atlas.scene.seed, Stage.HARD_CASES_IN_TIME, seed)
     # the first is on the rim
     places = list(random_points_and_rim(atlas.surface, cases, rng))
-    press, tissue = Presser(atlas, problem, tip), atlas.scene.tissue
+    press, tissue = _presser(atlas, problem, tip), atlas.scene.tissue
     large = SHORT * max(tau for _, tau in tissue.prony)
 
     def case(steps: Sequence[Step], brief: Sequence[Step] = (), nonsense: bool = False) -> HardCase:
         return HardCase(
-            steps, tissue.poisson, history=True, tip=tip, brief=brief, end_only=bool(brief),
-            nonsense=nonsense,
-        )  # fmt: skip
+            steps, tissue.poisson, history=True, tip=tip, brief=brief, nonsense=nonsense
+        )
 
     found = {
         name: [case(list(course(at)), nonsense=name.startswith("time ")) for at in places]
-        for name, course in _courses(press, large, rng, places).items()
+        for name, course in _courses(press, large, rng, places, atlas.surface).items()
         if not (tip and "direction" in name)
     }
     at, few = places[-1], many // 10
-    pressed = _pressed(press, at)
     for seconds, steps, shown in ((LONG, few, "10 000"), (large, many, f"{large:g}")):
-        held = press.levels(np.full(steps, DEEP), seconds / steps, at)
+        held = _levels(press, np.full(steps, DEEP), seconds / steps, at)
         brief = list(_growing(press, seconds, at))
-        found[f"held for {shown} s, {steps} steps"] = [case([*pressed, *held], brief)]
+        found[f"held for {shown} s, {steps} steps"] = [case([*_pressed(press, at), *held], brief)]
     phase = 2 * np.pi * np.arange(1, PERIOD + 1) / PERIOD
-    period = press.levels(0.5 + 0.3 * np.cos(phase), 0.02, at)
+    period = list(_levels(press, 0.5 + 0.3 * np.cos(phase), 0.02, at))
     repeats = max(many // PERIOD, 1)
     periodic = case(repeats * period, min(repeats, PERIODS) * period)
     return found | {f"moves periodically, {many} steps": [periodic]}
 
 
-def _pressed(press: Presser, at: Array) -> list[Step]:
-    return press.levels([0.25 * DEEP, 0.5 * DEEP, 0.75 * DEEP, DEEP], 0.02, at)
+def _presser(atlas: ReducedModel, problem: FullProblem, tip: bool) -> Press:
+    @cache  # loads repeat in long histories
+    def case(at: tuple[float, ...], level: float, tilt: float) -> Case:
+        place, lean = Place.at(atlas, np.array(at)), np.radians(tilt)
+        if tip:
+            return Case.of_tip(place.touch(level).position, -place.normal)
+        direction = np.sin(lean) * tangents(place.normal)[0] - np.cos(lean) * place.normal
+        return Case.of(problem, place.press(direction, level))
+
+    return lambda at, level, dt, tilt=0.0: (case(tuple(at.tolist()), float(level), tilt), dt)
 
 
-def _growing(press: Presser, seconds: float, at: Array) -> Iterator[Step]:
+def _levels(press: Press, shares: Array, dt: float | Array, at: Array) -> Iterator[Step]:
+    """Press at a place to one level after the other."""
+    times = np.broadcast_to(dt, len(shares)).tolist()
+    return (press(at, share, seconds) for share, seconds in zip(shares, times, strict=True))
+
+
+def _pressed(press: Press, at: Array) -> Iterator[Step]:
+    return _levels(press, DEEP * np.array([0.25, 0.5, 0.75, 1.0]), 0.02, at)
+
+
+def _growing(press: Press, seconds: float, at: Array) -> Iterator[Step]:
     yield from _pressed(press, at)
     ends = np.concatenate([[0.0], np.geomspace(0.01, seconds, 24)])
-    yield from press.levels(np.full(24, DEEP), np.diff(ends), at)
+    yield from _levels(press, np.full(24, DEEP), np.diff(ends), at)
 
 
 def _courses(
-    press: Presser, large: float, rng: np.random.Generator, places: Sequence[Array]
+    press: Press,
+    large: float,
+    rng: np.random.Generator,
+    places: Sequence[Array],
+    surface: Surface,
 ) -> dict[str, Course]:
     """Kinds of histories that the full model follows step by step, by name."""
 
@@ -136,8 +122,9 @@ def _courses(
         return (press(at, share, dt) for dt, share in load_steps(phases))
 
     def slides(at: Array) -> Iterator[Step]:
+        x, normal, _ = surface.project(at)
         for distance in 2.0 * np.sin(np.linspace(0.0, 1.5 * np.pi, 30)):
-            yield press(press.aside(at, distance), 0.6, 1e-3)
+            yield press(surface.project(x + distance * tangents(normal)[0])[0], 0.6, 1e-3)
 
     def flipped(at: Array) -> Iterator[Step]:
         yield from _pressed(press, at)
@@ -171,7 +158,7 @@ def _courses(
     }
     return {
         CONTROL: simple,
-        **{name: partial(press.levels, *own) for name, own in series.items()},
+        **{name: partial(_levels, press, *own) for name, own in series.items()},
         "slides at 300 mm per s": slides,
         "direction flipped at once": flipped,
         "contact teleports": teleports,

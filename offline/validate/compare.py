@@ -1,21 +1,29 @@
-"""Answers of the reduced model beside full solutions, query by query.
+"""The reduced against the full model, query by query, on queries that training has not seen.
 
-A query is a list of time steps; without time its length is one.
+A query is a list of time steps; without time its length is one.  The errors found calibrate the
+reduced model's estimate of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from palpate.offline.fem.norms import relative, statistics
 from palpate.offline.fem.problem import FullProblem, Load, Reference, Step
-from palpate.offline.validate.calibrate import KnownAnswer, coverage
-from palpate.offline.validate.kinds import LOADS, Kind
+from palpate.offline.run.tables import write_csv
+from palpate.offline.run.workers import completed, open_artifact, worker_pool
+from palpate.offline.validate.queries import LOADS, Kind, held_out
 from palpate.shared.answer import Answer
+from palpate.shared.artifact import read_artifact
+from palpate.shared.errors import PalpateError, QueryError
+from palpate.shared.local_models import Estimator
 from palpate.shared.model import ReducedModel
 from palpate.shared.reduced.transfer import REST
 
@@ -70,6 +78,21 @@ class Compared(NamedTuple):
         """
         floor = 1e-9 * max(float(self.largest[-1]), 1e-300)
         return np.asarray(np.maximum.accumulate(self.away) / np.maximum(self.largest, floor))
+
+
+@dataclass
+class KnownAnswer:
+    """An answer of the reduced model whose errors are known.
+
+    The errors are the largest until then, relative to the largest norms until then, which do not
+    vanish where an error changes its sign.
+    """
+
+    errors: Array  # (quantities,)
+    features: Array  # of the error estimate
+    converged: bool
+    comparable: bool  # counts for the estimate: both models rest in the same equilibrium
+    estimated: Array = field(default_factory=lambda: np.empty(0))  # (quantities,)
 
 
 class Row(NamedTuple):
@@ -207,3 +230,126 @@ def summarise(kind: Kind, rows: Sequence[Row]) -> dict[str, Any]:
         summary[name] = statistics([row[name] for row in counted])
     medians = dict(zip(kind.quantities, ratios.tolist(), strict=True))
     return summary | {"estimate_over_error_median": medians}
+
+
+def write_rows(path: Path, kind: Kind, rows: Sequence[Row]) -> None:
+    """Write tables of queries, one line each; single answers with their estimated errors."""
+    names = [] if kind.in_time else [f"estimated_{name}" for name in kind.quantities]
+    estimated = [dict(zip(names, row.known[0].estimated.tolist(), strict=False)) for row in rows]
+    write_csv(path, [row.table | own for row, own in zip(rows, estimated, strict=True)])
+
+
+def opened(artifact: Path, *kinds: Kind) -> tuple[ReducedModel, FullProblem]:
+    """Reduced and full model of an artifact.
+
+    Raises
+    ------
+    QueryError
+        If the artifact has no answers to queries of one of the kinds.
+    """
+    model = ReducedModel.load(artifact)
+    for kind in kinds:
+        if lack := kind.lacks(model.models):
+            raise QueryError("scene", f"{model.name!r} {lack}")
+    return model, FullProblem.of_artifact(read_artifact(artifact))
+
+
+def against_full(
+    artifact: Path, kind: Kind, count: int, seed: int, csv: Path | None = None
+) -> dict[str, Any]:
+    """Compare an artifact with its full model on new random queries, written one by one to a CSV.
+
+    Returns
+    -------
+    dict
+        As ``summarise``, and ``without_equilibrium``: queries that the full model had no answer to,
+        and which count in nothing else.
+
+    Raises
+    ------
+    PalpateError
+        If the full model has no answer to any of them.
+    QueryError
+        If the artifact has none to this kind.
+    """
+    model, problem = opened(artifact, kind)
+    queries = kind.random(model, count, held_out(model, seed))
+    tasks = {str(i): reference_task(model, query) for i, query in enumerate(queries)}
+    rows = {}
+    with worker_pool(open_artifact, artifact) as pool:
+        for name, full in tqdm(completed(pool, tasks), "full solutions", count):
+            if full is not None:
+                rows[int(name)] = compare(kind, problem, model, queries[int(name)], full)
+    if not rows:
+        raise PalpateError(f"{artifact}: the full model has no equilibrium under any of the loads")
+    ordered = [rows[i] for i in sorted(rows)]
+    if csv:
+        write_rows(csv, kind, ordered)
+    return summarise(kind, ordered) | {"without_equilibrium": count - len(ordered)}
+
+
+def reference_task(model: ReducedModel, query: Sequence[Step]) -> tuple[Any, ...]:
+    """Task of a query's full solutions.
+
+    Under the tip a single one is sought near the reduced answer: a free edge can rest on either
+    side of it.
+    """
+    (*_, last) = query
+    if len(query) > 1 or isinstance(last, Load):
+        return FullProblem.reference, query
+    (answer,) = play(model, query)
+    return FullProblem.reference, query, model.displacement(answer)
+
+
+def calibrate(known: Sequence[KnownAnswer], share: float, damping: float) -> Estimator:
+    """Fit the error estimate: it covers a share of the known errors in all quantities.
+
+    A least-squares fit of their logs is raised by a constant for each quantity.  The answers that
+    need not be covered are those that would raise one most.  What counts is how far an answer lies
+    from a fit to the others, or the estimate would cover fewer of new ones.  ``damping`` holds the
+    coefficients back, since known errors are few for many features.
+    """
+    known = [answer for answer in known if answer.comparable]
+    X = np.array([answer.features for answer in known])
+    spread = X.std(axis=0)
+    scale = np.where(spread > 1e-9, spread, np.inf)  # the constant one; others may be, too
+    middle = X.mean(axis=0)
+    A = np.column_stack([(X - middle) / scale, np.ones(len(known))])
+    ridge = np.diag([damping] * len(middle) + [0.0])
+    inverse = np.linalg.pinv(np.vstack([A, ridge]))[:, : len(A)]
+    leverage = np.sum(A * inverse.T, axis=1)
+    Y = np.log(np.maximum([answer.errors for answer in known], 1e-8))
+    coefficients = (inverse @ Y)[:-1] / scale[:, None]
+    rest = Y - X @ coefficients
+    coefficients[0] = np.median(rest, axis=0)
+    rest = (rest - coefficients[0]) / (1 - leverage)[:, None]
+    covered = np.argsort(rest.max(axis=1))[: int(np.ceil(share * (len(known) + 1)))]
+    coefficients[0] += rest[covered].max(axis=0)
+    return Estimator(np.ascontiguousarray(coefficients.T))
+
+
+def calibrate_by_halves(
+    queries: Sequence[Sequence[KnownAnswer]], fit: Callable[[Sequence[KnownAnswer]], Estimator]
+) -> Estimator:
+    """Fit an estimate to the answers to all queries.
+
+    What an answer itself is estimated to err by comes from a fit to the other half of the queries.
+    """
+    for half in (0, 1):
+        estimator = fit([answer for answers in queries[1 - half :: 2] for answer in answers])
+        for answers in queries[half::2]:
+            for answer in answers:
+                answer.estimated = np.array(estimator(answer.features))
+    return fit([answer for answers in queries for answer in answers])
+
+
+def coverage(known: Sequence[KnownAnswer]) -> tuple[float, Array]:
+    """Share of answers within all their estimates; medians (quantities,) of estimate over error.
+
+    Of the answers in range: outside it there is no estimate.
+    """
+    known = [answer for answer in known if answer.estimated[0] != np.inf]
+    errors = np.array([answer.errors for answer in known])
+    estimated = np.array([answer.estimated for answer in known])
+    ratios = np.median(estimated / np.maximum(errors, 1e-12), axis=0)
+    return float(np.mean(np.all(errors <= estimated, axis=1))), ratios

@@ -1,15 +1,22 @@
-"""Random queries over the whole surface and range of loads: presses, tip positions, histories."""
+"""Random queries of every kind, over the whole surface and range of loads."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.offline.fem.problem import Load, Step, TipPosition
-from palpate.offline.reduce.sampling import cone, random_points, random_points_and_rim, tangents
+from palpate.offline.reduce.sampling import (
+    cone,
+    random_points,
+    random_points_and_rim,
+    random_tangent,
+)
+from palpate.offline.run.streams import Stage, stream
+from palpate.shared.local_models import LocalModels
 from palpate.shared.mechanics.footprint import TIP_DEPTH, pressure_limit
 from palpate.shared.model import ReducedModel
 
@@ -25,6 +32,34 @@ LIFTED = 0.05
 """Millimetres between the surface at rest and a tip that does not press."""
 
 
+class Place(NamedTuple):
+    """A point of the surface, and what may press there."""
+
+    position: Array  # (3,) mm
+    normal: Array  # (3,), outward
+    limits: Array  # (LIMIT_FIELDS,)
+    radius: float  # mm, of the endoscope
+
+    @classmethod
+    def at(cls, model: ReducedModel, point: Array) -> Place:
+        """The place nearest to a point (3,) mm."""
+        x, normal, _, limits = model.surface.locate(point, model.limits)
+        return cls(x, normal, limits, model.scene.endoscope.radius)
+
+    def limit(self, direction: Array) -> float:
+        """Largest trained pressure (kPa) along a direction."""
+        return float(pressure_limit(self.limits, self.normal, direction))
+
+    def press(self, direction: Array, level: float, dt: float = 0.0) -> Load:
+        """A footprint pressed to a level: 1 is the limit."""
+        return Load(self.position, direction, float(level * self.limit(direction)), dt)
+
+    def touch(self, level: float, dt: float = 0.0) -> TipPosition:
+        """The rigid tip as deep as a level says; at 0 it does not touch."""
+        depth = level * self.limits[TIP_DEPTH] if level > 0.0 else -LIFTED
+        return TipPosition(self.position + (self.radius - depth) * self.normal, dt)
+
+
 def random_loads(model: ReducedModel, count: int, rng: np.random.Generator) -> list[Load]:
     """Random loads over the whole surface, cone of directions and range of pressures.
 
@@ -33,10 +68,9 @@ def random_loads(model: ReducedModel, count: int, rng: np.random.Generator) -> l
     """
     loads, tilt = [], model.scene.endoscope.max_tilt
     for i, point in enumerate(random_points_and_rim(model.surface, count, rng)):
-        x, normal, _, fields = model.surface.locate(point, model.limits)
-        direction = cone(normal, tilt, 1, rng, border=i % 8 == 1)[0]
-        limit = pressure_limit(fields, normal, direction)
-        loads.append(Load(x, direction, float(limit * np.sqrt(rng.random()))))
+        place = Place.at(model, point)
+        direction = cone(place.normal, tilt, 1, rng, border=i % 8 == 1)[0]
+        loads.append(place.press(direction, np.sqrt(rng.random())))
     return loads
 
 
@@ -48,12 +82,8 @@ def random_positions(
     Contact points are uniform over the area, one in eight on the rim of the surface; depths are
     denser towards the limit.
     """
-    positions = []
-    for point in random_points_and_rim(model.surface, count, rng):
-        x, normal, _, fields = model.surface.locate(point, model.limits)
-        depth = fields[TIP_DEPTH] * np.sqrt(rng.random())
-        positions.append(TipPosition(x + (model.scene.endoscope.radius - depth) * normal))
-    return positions
+    points = random_points_and_rim(model.surface, count, rng)
+    return [Place.at(model, point).touch(np.sqrt(rng.random())) for point in points]
 
 
 def random_histories(
@@ -73,14 +103,13 @@ class Tool:
     """
 
     def __init__(self, model: ReducedModel, rng: np.random.Generator, tip: bool, rim: bool) -> None:
-        self._surface, self._ranges = model.surface, model.limits
-        self._endoscope, self._rng, self._tip = model.scene.endoscope, rng, tip
-        self._level = 0.0
+        self._model, self._rng, self._tip, self._level = model, rng, tip, 0.0
+        surface, self._most = model.surface, model.scene.endoscope.max_tilt
         if rim:
-            self._go(self._surface.vertices[rng.choice(self._surface.rim())])
+            self._go(surface.vertices[rng.choice(surface.rim())])
         else:
-            self._go(random_points(self._surface, 1, rng)[0])
-        self._lean = cone(self._normal, self._endoscope.max_tilt, 1, rng)[0] + self._normal
+            self._go(random_points(surface, 1, rng)[0])
+        self._lean = cone(self._place.normal, self._most, 1, rng)[0] + self._place.normal
 
     def history(self) -> list[Step]:
         """Press on, then make a few movements at random."""
@@ -91,20 +120,17 @@ class Tool:
         return steps
 
     def _go(self, x: Array) -> None:
-        self._x, self._normal, _, self._limits = self._surface.locate(x, self._ranges)
+        self._place = Place.at(self._model, x)
 
     def _step(self, dt: float) -> Step:
         """The tool where it is, after a time step."""
         if self._tip:
-            depth = self._level * self._limits[TIP_DEPTH] if self._level > 0.0 else -LIFTED
-            return TipPosition(self._x + (self._endoscope.radius - depth) * self._normal, dt)
-        direction = self._lean - self._normal
+            return self._place.touch(self._level, dt)
+        normal = self._place.normal
+        direction = self._lean - normal
         direction /= np.linalg.norm(direction)
-        tilt = np.degrees(np.arccos(np.clip(-direction @ self._normal, -1, 1)))
-        if tilt > self._endoscope.max_tilt:
-            direction = -self._normal
-        limit = pressure_limit(self._limits, self._normal, direction)
-        return Load(self._x.copy(), direction, float(self._level * limit), dt)
+        tilt = np.degrees(np.arccos(np.clip(-direction @ normal, -1, 1)))
+        return self._place.press(-normal if tilt > self._most else direction, self._level, dt)
 
     def _ramp(self, level: float, seconds: float | None = None) -> Iterator[Step]:
         """Press harder or softer, evenly."""
@@ -136,11 +162,74 @@ class Tool:
     def _slide(self) -> Iterator[Step]:
         """Move over the surface at 3 to 30 mm/s, as far as 8 mm or to where it ends."""
         speed, length = 10 ** self._rng.uniform(0.5, 1.5), self._rng.uniform(2.0, 8.0)
-        turn = self._rng.uniform(0, 2 * np.pi)
-        heading = np.array([np.cos(turn), np.sin(turn)]) @ np.array(tangents(self._normal))
+        heading = random_tangent(self._place.normal, self._rng)
         count = int(np.ceil(length / 0.5))
         for _ in range(count):
-            self._go(self._x + length / count * heading)
-            heading -= heading @ self._normal * self._normal
+            self._go(self._place.position + length / count * heading)
+            heading -= heading @ self._place.normal * self._place.normal
             heading /= max(float(np.linalg.norm(heading)), 1e-9)
             yield self._step(length / count / speed)
+
+
+def held_out(model: ReducedModel, seed: int) -> np.random.Generator:
+    """Random numbers that training has not drawn, whatever the seed."""
+    return stream(model.scene.seed, Stage.UNSEEN, seed)
+
+
+def held_out_loads(model: ReducedModel, count: int, seed: int) -> list[Load]:
+    """Random loads that training has not seen, whatever the seed."""
+    return random_loads(model, count, held_out(model, seed))
+
+
+class Kind(NamedTuple):
+    """A kind of query."""
+
+    name: str  # of its error estimate, see ``shared.local_models.Estimators``
+    tip: bool  # whether the rigid tip presses, not a footprint
+    in_time: bool  # whether over a history
+    stage: Stage  # whose random numbers training draws
+    document: str  # name of its summary in an artifact
+    title: str  # what its full solutions are called
+    damping: float  # of the error estimate, see ``calibrate``
+    coverage: float  # of it, so that it covers 95 % of unseen errors; those of a history are alike
+    quantities: tuple[str, ...]  # what errors are estimated of; the force of a footprint is given
+    others: tuple[str, ...]  # what a summary has statistics of beside the quantities
+
+    def random(
+        self, model: ReducedModel, count: int, rng: np.random.Generator
+    ) -> list[Sequence[Any]]:
+        """Queries over the whole surface and range of loads."""
+        if self.in_time:
+            return [*random_histories(model, count, rng, self.tip)]
+        steps = random_positions if self.tip else random_loads
+        return [[step] for step in steps(model, count, rng)]
+
+    def lacks(self, models: LocalModels) -> str | None:
+        """What local models lack to answer this kind."""
+        if self.tip and models.tips is None:
+            return "was trained without a tip"
+        return "is elastic and has no histories" if self.in_time and not models.viscous else None
+
+
+FIELDS = "displacement", "von_mises"
+LOADS = Kind(
+    "loads", False, False, Stage.VALIDATION, "validation", "full solutions", 0.3, 0.96,
+    FIELDS, ("von_mises_p99",),
+)  # fmt: skip
+TIP = Kind(
+    "touches", True, False, Stage.TIP_VALIDATION, "validation_tip",
+    "full solutions under the tip", 1.0, 0.96,
+    (*FIELDS, "force"), ("tangent", "penetration_over_depth"),
+)  # fmt: skip
+HISTORIES = Kind(
+    "histories", False, True, Stage.HISTORY_VALIDATION, "validation_histories",
+    "full histories", 30.0, 0.97,
+    FIELDS, ("depth", "worst_displacement", "worst_von_mises", "last_displacement"),
+)  # fmt: skip
+TIP_HISTORIES = Kind(
+    "courses", True, True, Stage.TIP_HISTORY_VALIDATION, "validation_tip_histories",
+    "full histories under the tip", 30.0, 0.97,
+    TIP.quantities, tuple(f"{of}_{x}" for of in ("worst", "together") for x in TIP.quantities),
+)  # fmt: skip
+
+KINDS = (LOADS, TIP, HISTORIES, TIP_HISTORIES)

@@ -2,7 +2,7 @@ import numpy as np
 
 from palpate.offline import bench as timing
 from palpate.offline.bench import STEP, walk
-from palpate.offline.validate.against_full import held_out_loads
+from palpate.offline.validate.queries import held_out_loads
 
 KINDS = ["cold_us", "warm_us", "surface_us", "fields_us", "full_us", "tip_us"]
 

@@ -6,8 +6,8 @@ import pytest
 from palpate.offline.scenes import find_scene
 from palpate.offline.studies import chart as study
 from palpate.offline.studies.chart_drawing import FULL, SHIPPED, TWIN, pareto
-from palpate.offline.validate.against_full import against_full
-from palpate.offline.validate.kinds import LOADS
+from palpate.offline.validate.compare import against_full
+from palpate.offline.validate.queries import LOADS
 from palpate.shared.errors import PalpateError
 
 from .conftest import drawn, table

@@ -61,7 +61,7 @@ def test_the_cube_under_compression(answer, tmp_path, monkeypatch, name, rounds)
 
 
 def test_the_turbinate_under_a_footprint_as_hard_as_is_trained_for(tmp_path, pressed):
-    found = paper.compare(pressed, tmp_path, SIZES)
+    found = paper.compare(pressed, tmp_path)
     claims = found["claims"]
     assert claims["pod_least_error"]["holds"]
     assert claims["pod_best_cpu_ratio"]["holds"]

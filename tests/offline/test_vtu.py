@@ -2,7 +2,7 @@ import meshio
 import numpy as np
 import pytest
 
-from palpate.offline.vtu import write_vtu
+from palpate.offline.solve import write_vtu
 from palpate.shared.geometry.elements import HEX20_NODES, HEX_CORNERS
 
 

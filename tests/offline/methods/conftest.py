@@ -3,8 +3,7 @@ import pytest
 
 from palpate.offline.methods.catalogue import Training
 from palpate.offline.methods.method import Snapshots
-from palpate.offline.validate.against_full import held_out_loads
-from palpate.offline.validate.queries import random_loads
+from palpate.offline.validate.queries import held_out_loads, random_loads
 
 SNAPSHOTS, QUERIES = 40, 4
 

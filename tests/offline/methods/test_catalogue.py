@@ -9,7 +9,6 @@ from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import Load
 from palpate.offline.methods.catalogue import BUILDERS, build
 from palpate.offline.methods.method import Case
-from palpate.shared.errors import PalpateError
 
 SIZE = 18
 
@@ -96,8 +95,3 @@ def test_a_method_is_the_same_whatever_was_built_before(training, methods, probl
     case = Case.of(problem, queries[0][0])
     again = build("pod-ecm", SIZE, replace(training))
     np.testing.assert_array_equal(again.solve(case).state, methods["pod-ecm"].solve(case).state)
-
-
-def test_without_an_artifact_there_is_no_such_method(training):
-    with pytest.raises(PalpateError, match="artifact"):
-        build("artifact", 2, replace(training, atlas=None))

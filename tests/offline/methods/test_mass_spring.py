@@ -6,9 +6,17 @@ from scipy.spatial.transform import Rotation
 
 from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import FullProblem, Load
-from palpate.offline.methods.mass_spring import TOLERANCE, MassSpring, edges_of, identify
 from palpate.offline.methods.method import Case
-from palpate.offline.methods.tetrahedra import POISSON, TensorMass, cut, stiffness
+from palpate.offline.methods.tetrahedra import (
+    POISSON,
+    TOLERANCE,
+    MassSpring,
+    TensorMass,
+    cut,
+    edges_of,
+    identify,
+    stiffness,
+)
 from palpate.offline.scenes import find_scene
 
 YOUNG = 15.0

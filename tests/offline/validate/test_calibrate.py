@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from palpate.offline.validate.calibrate import KnownAnswer, calibrate, calibrate_by_halves, coverage
+from palpate.offline.validate.compare import KnownAnswer, calibrate, calibrate_by_halves, coverage
 
 
 def known(features, errors, comparable=True):

@@ -6,8 +6,7 @@ import pytest
 from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import Reference
 from palpate.offline.validate.compare import Compared, compare, play, summarise
-from palpate.offline.validate.kinds import TIP_HISTORIES
-from palpate.offline.validate.queries import random_histories
+from palpate.offline.validate.queries import TIP_HISTORIES, random_histories
 
 
 def test_errors_are_relative_and_of_moments_to_the_largest_so_far():

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from palpate.offline.validate.against_full import held_out_loads
 from palpate.offline.validate.compare import play
-from palpate.offline.validate.queries import random_histories
+from palpate.offline.validate.queries import held_out_loads, random_histories
 from palpate.shared.mechanics.footprint import pressure_limit
 
 

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 from palpate.offline.run.streams import stream
-from palpate.offline.validate.against_full import held_out_loads
-from palpate.offline.validate.kinds import LOADS
-from palpate.offline.validate.queries import random_loads
+from palpate.offline.validate.queries import LOADS, held_out_loads, random_loads
 
 from ..conftest import table
 
