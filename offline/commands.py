@@ -129,7 +129,11 @@ def train(scene: str, out: Path | None, workers: int | None, force: bool) -> Non
     from palpate.offline.info import closing
     from palpate.offline.train import train
 
-    click.echo("\n".join(closing(train(scene, out, workers, force))))
+    try:
+        artifact = train(scene, out, workers, force)
+    except KeyboardInterrupt:
+        raise click.ClickException("stopped; the same command continues from here") from None
+    click.echo("\n".join(closing(artifact)))
 
 
 @click.command()

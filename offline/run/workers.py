@@ -16,6 +16,7 @@ import multiprocessing
 import os
 import pickle
 import shutil
+import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
@@ -73,15 +74,20 @@ def worker_pool(
 ) -> ProcessPoolExecutor:
     """Processes that start with ``initializer(*args)``; as many as cores unless ``count`` is given.
 
-    A worker is one thread: its parallelism is that of the tasks.
+    A worker is one thread: its parallelism is that of the tasks.  An interrupt from the keyboard is
+    left to this process, which stops the workers when they have done their tasks.
     """
     os.environ.update(dict.fromkeys(THREADS, "1"))
-    return ProcessPoolExecutor(
+    pool = ProcessPoolExecutor(
         count or os.cpu_count(),
         mp_context=multiprocessing.get_context("spawn"),
         initializer=initializer,
         initargs=args,
     )
+    interrupt = signal.signal(signal.SIGINT, signal.SIG_IGN)  # which workers inherit
+    pool.submit(os.getpid)  # starts them
+    signal.signal(signal.SIGINT, interrupt)
+    return pool
 
 
 def completed(executor: Executor, tasks: Tasks) -> Iterator[tuple[str, Any]]:

@@ -37,7 +37,8 @@ class ServiceError(PalpateError):
         self.code: str = error["code"]
         self.field: str = error["field"]
         self.allowed: Any = error["allowed"]
-        super().__init__(f"{self.field}: {error['message']}" if self.field else error["message"])
+        message = f"{self.field}: {error['message']}" if self.field else error["message"]
+        super().__init__(f"{message}; allowed: {self.allowed}" if self.allowed else message)
 
 
 class SessionClosed(PalpateError):

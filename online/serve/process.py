@@ -134,7 +134,10 @@ def serve(settings: Settings) -> None:
         access_log=settings.access_log,
         **OPTIONS,
     )
-    bound = config.bind_socket()
+    try:
+        bound = config.bind_socket()
+    except SystemExit:  # it has said why
+        raise PalpateError(f"cannot listen on {host}:{settings.port}; try another --port") from None
     # From here on clients wait for a worker that is ready rather than being turned away.
     bound.listen(config.backlog)
     url = f"http://{f'[{host}]' if ':' in host else host}:{bound.getsockname()[1]}"
