@@ -80,7 +80,7 @@ def replay(recording: Path, artifact: Path, as_json: bool) -> None:
     from palpate.online.session.replay import replay
     from palpate.shared.model import ReducedModel
 
-    report = replay(read_recording(recording), ReducedModel.load(artifact))._asdict()
+    report = replay(read_recording(recording), ReducedModel.load(artifact))
     if as_json:
         click.echo(json.dumps(report))
     else:

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import click
 
@@ -129,13 +129,10 @@ class Plan:
     token: str | None = _option(None, envvar="PALPATE_TOKEN")
 
 
-F = TypeVar("F", bound=Callable[..., Any])
-
-
-def options(kind: type) -> Callable[[F], F]:
+def options(kind: type) -> Callable[[Any], Any]:
     """Decorate a function with the options of `Settings` or of a `Plan`."""
 
-    def decorate(function: F) -> F:
+    def decorate(function: Any) -> Any:
         for setting in reversed(fields(kind)):
             if given := dict(setting.metadata):
                 name = setting.name.replace("_", "-")

@@ -26,7 +26,6 @@ from palpate.online.serve.schemas import HistoryRequest, MeshRegion, SolveReques
 from palpate.online.serve.store import ServedModel, Service, Store
 from palpate.online.serve.wire import BINARY, JSON, MSGPACK, OFFERED, negotiate
 from palpate.online.session import frames, websocket
-from palpate.online.session.protocol import tables
 from palpate.online.session.session import Sessions
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 
@@ -204,7 +203,10 @@ async def check(request: Request, name: SceneName, load: SolveRequest) -> Respon
 @scenes.get(
     "/{name}/session",
     response_model=None,
-    responses={101: {"description": f"{frames.__doc__}\n\n{tables()}"}, **_problems(404, 422, 426)},
+    responses={
+        101: {"description": f"{frames.__doc__}\n\n{frames.tables()}"},
+        **_problems(404, 422, 426),
+    },
 )
 async def session(name: SceneName, request: Request) -> Response:
     """Open a session (WebSocket): send positions of the tip, get forces.

@@ -40,18 +40,16 @@ class Store:
                 if name in self.models:
                     raise PalpateError(f"{path}: another file already holds {name!r}")
                 warm(served)
-            except PalpateError as error:
-                reason = str(error)
             except Exception as error:
-                # a bug in reading one file is no reason to withhold the others
-                logger.exception("failed on %s", path)
-                reason = f"{path}: cannot be used: {type(error).__name__}"
+                reason = str(error)
+                if not isinstance(error, PalpateError):  # no reason to withhold the others
+                    logger.exception("failed on %s", path)
+                    reason = f"{path}: cannot be used: {type(error).__name__}"
+                logger.error("refused %s", reason)
+                self.refused.append({"file": path.name, "reason": reason})
             else:
                 self.models[name] = served
                 logger.info("serving %s from %s", name, path)
-                continue
-            logger.error("refused %s", reason)
-            self.refused.append({"file": path.name, "reason": reason})
 
     def require_ready(self) -> None:
         """Raise `Refusal` while models are being loaded."""

@@ -57,22 +57,14 @@ def encode(media_type: str, head: Head, arrays: Arrays) -> bytes:
 
     Arrays are C-contiguous, of the dtypes float32, int32 and uint8, the last kind last.
     """
-    return _WRITERS[media_type](head, arrays)
-
-
-def _encode_json(head: Head, arrays: Arrays) -> bytes:
-    return orjson.dumps({**head, "fields": arrays}, option=orjson.OPT_SERIALIZE_NUMPY)
-
-
-def _encode_msgpack(head: Head, arrays: Arrays) -> bytes:
-    fields = {
-        name: {"dtype": array.dtype.name, "shape": array.shape, "data": array.tobytes()}
-        for name, array in arrays.items()
-    }
-    return msgpack.packb({**head, "fields": fields})
-
-
-def _encode_binary(head: Head, arrays: Arrays) -> bytes:
+    if media_type == JSON:
+        return orjson.dumps({**head, "fields": arrays}, option=orjson.OPT_SERIALIZE_NUMPY)
+    if media_type == MSGPACK:
+        fields = {
+            name: {"dtype": array.dtype.name, "shape": array.shape, "data": array.tobytes()}
+            for name, array in arrays.items()
+        }
+        return msgpack.packb({**head, "fields": fields})
     entries = []
     offset = 0
     for name, array in arrays.items():
@@ -84,9 +76,6 @@ def _encode_binary(head: Head, arrays: Arrays) -> bytes:
     text += b" " * (-len(text) % 8)
     prefix = _PREFIX.pack(MAGIC, VERSION, len(entries), len(text), offset)
     return b"".join((prefix, text, *(array.data for array in arrays.values())))
-
-
-_WRITERS = {JSON: _encode_json, MSGPACK: _encode_msgpack, BINARY: _encode_binary}
 
 
 def decode(body: bytes) -> tuple[Head, dict[str, NDArray[Any]]]:

@@ -20,8 +20,9 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from enum import IntEnum, IntFlag
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Self, get_type_hints
 
 import numpy as np
@@ -33,6 +34,9 @@ if TYPE_CHECKING:
     from palpate.shared.answer import Answer
 
 VERSION = 2
+
+PATH = Path(__file__).parents[1] / "PROTOCOL.md"
+"""Written by ``python -m palpate.online.session.frames``."""
 
 MODELS = 4
 """Local models that can take part in an answer."""
@@ -336,3 +340,55 @@ def decode_reply(frame: bytes) -> Reply:
     if end != len(frame):
         raise FrameError("frame", f"{len(frame)} bytes where its fields say {end}")
     return Reply(**head)
+
+
+def document() -> str:
+    """Describe the frames in a Markdown document."""
+    return f"# Frames of a session\n\n{__doc__}\n{tables()}".replace("``", "`")
+
+
+def layout() -> dict[str, Any]:
+    """Describe the layout, for the greeting of a session; JSON-able."""
+    return {
+        "version": VERSION,
+        "byte_order": "little",
+        "request": _described(REQUEST_FIELDS, REQUEST),
+        "reply": _described(REPLY_FIELDS, REPLY),
+        "outputs": {bit.name: bit.value for bit in Output},
+        "flags": {bit.name: bit.value for bit in Flag},
+        "reasons": {reason.name: reason.value for reason in Reason},
+    }
+
+
+def _described(fields: Sequence[Field], dtype: np.dtype[Any]) -> dict[str, Any]:
+    offsets: Mapping[str, Any] = dtype.fields or {}
+    return {
+        "size": dtype.itemsize,
+        "fields": [field._asdict() | {"offset": offsets[field.name][1]} for field in fields],
+    }
+
+
+def tables() -> str:
+    """Describe the layout in Markdown."""
+    lines = []
+    for title in ("request", "reply"):
+        frame = layout()[title]
+        lines += [f"{title.capitalize()}, {frame['size']} bytes:", ""]
+        lines += ["| offset | field | type | unit | meaning |", "|---|---|---|---|---|"]
+        for f in frame["fields"]:
+            kind = f["type"] + "".join(f"[{n}]" for n in f["shape"])
+            lines.append(f"| {f['offset']} | {f['name']} | {kind} | {f['unit']} | {f['meaning']} |")
+        lines.append("")
+    for title, meanings in (
+        ("bit of `outputs`", [(bit, bit.meaning) for bit in Output]),
+        ("bit of `flags`", [(bit, bit.meaning) for bit in Flag]),
+        ("`reason`", REASONS_MEAN.items()),
+    ):
+        lines += [f"| {title} | name | meaning |", "|---|---|---|"]
+        lines += [f"| {v.value} | {v.name} | {meaning} |" for v, meaning in meanings]
+        lines.append("")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    PATH.write_text(document())

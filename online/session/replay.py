@@ -1,7 +1,7 @@
 """Recorded sessions answered again, bit for bit."""
 
 import math
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -16,17 +16,11 @@ VOLATILE = ("server_received", "server_sent", "solve_time", "superseded")
 """Fields of a reply that depend on the clock and on the network."""
 
 
-class Replay(NamedTuple):
-    """How a replay compares with its recording."""
-
-    replies: int
-    different: int  # replies that are not the same, bit for bit
-    first_different: int | None  # number of the first of them
-    force_difference: float  # largest of a component, mN
-
-
-def replay(recording: Recording, model: ReducedModel) -> Replay:
+def replay(recording: Recording, model: ReducedModel) -> dict[str, Any]:
     """Answer a recorded session again and compare.
+
+    Returns the number of ``replies``, of those that are ``different``, that of the first of them
+    and the largest difference of a component of the force, mN.
 
     The bits are those of compiled kernels from the cache: a process that has compiled some itself,
     a server at its very first start, may differ from them in the last ones. Raises `PalpateError`
@@ -56,5 +50,9 @@ def replay(recording: Recording, model: ReducedModel) -> Replay:
     one, other = (table.view(f"V{REPLY.itemsize}") for table in (again, recording.replies))
     different = np.flatnonzero(one != other).tolist()
     forces = np.abs(again["force"] - recording.replies["force"])
-    first = different[0] if different else None
-    return Replay(len(again), len(different), first, float(forces.max(initial=0.0)))
+    return {
+        "replies": len(again),
+        "different": len(different),
+        "first_different": different[0] if different else None,
+        "force_difference": float(forces.max(initial=0.0)),
+    }

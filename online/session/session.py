@@ -11,14 +11,17 @@ import logging
 from collections.abc import Sequence
 from contextlib import suppress
 from time import perf_counter
+from typing import Literal
 
 import orjson
+import pydantic
 from starlette.types import Message, Receive, Scope, Send
 
 from palpate.online.serve.errors import Refusal, as_refusal, check_json_size
+from palpate.online.serve.schemas import Position, Strict, parse
 from palpate.online.serve.store import ServedModel, Service
-from palpate.online.session import frames, protocol
-from palpate.online.session.frames import Output, Request
+from palpate.online.session import frames
+from palpate.online.session.frames import Flag, Output, Reason, Request
 from palpate.online.session.tracker import LONGEST, Snapshot, ToolTracker, recover
 from palpate.online.session.websocket import CONNECTION, LINGER, MOST_FRAMES, STOPPING
 
@@ -38,6 +41,9 @@ PATIENCE = 5.0
 
 SPARE = 4
 """Sessions of each scene that can be opened at no cost to those under way."""
+
+MOST_SNAPSHOTS = 8
+"""Largest number of states that a session keeps."""
 
 GOING_AWAY, IDLE = 1001, 4000
 ENDING = {"internal": 1011, "unknown_version": 4001}
@@ -92,7 +98,7 @@ class Sessions:
             tracker.restart()
             answer = tracker.follow(request.position, BUDGET)
             extras = recover(served.model, answer.touch, request.outputs)
-            protocol.write_reply(frames.encode_reply(request, answer, extras))
+            write_reply(frames.encode_reply(request, answer, extras))
             tracker.restart()
             spare.append(tracker)
 
@@ -180,7 +186,7 @@ class Session:
                 return messages, message
             self._received = self._connection.read_at
             self._full_at = max(self._full_at, perf_counter()) + 1.0 / MOST_FRAMES
-            if protocol.is_command(message.get("text")):
+            if is_command(message.get("text")):
                 return [*messages, message], None
             self._superseded += len(messages)
             messages = [message]
@@ -216,12 +222,12 @@ class Session:
 
     def _answer_text(self, text: str, start: float) -> str:
         """Obey a command or answer a position."""
-        if protocol.is_command(text):
-            return self._obey(*protocol.read_command(text))
-        request = protocol.read_request(text)
-        outputs, nodes = protocol.names(Output(request.outputs)), len(self._model.surface_nodes)
+        if is_command(text):
+            return self._obey(*read_command(text))
+        request = read_request(text)
+        outputs, nodes = names(Output(request.outputs)), len(self._model.surface_nodes)
         check_json_size(outputs, nodes, self._service.settings.max_json_numbers, "outputs")
-        return protocol.write_reply(self._answer(request, start))
+        return write_reply(self._answer(request, start))
 
     def _answer(self, request: Request, start: float) -> bytes:
         """Answer a request whose decoding began at `start`."""
@@ -258,8 +264,62 @@ class Session:
             "idle_timeout": self._service.settings.session_idle,
             "max_frames_per_second": MOST_FRAMES,
             "longest_step": LONGEST if model.scene.tissue.prony else None,
-            "snapshots": protocol.MOST_SNAPSHOTS,
+            "snapshots": MOST_SNAPSHOTS,
             "server_time": perf_counter(),
-            "layout": protocol.layout(),
+            "layout": frames.layout(),
         }
         return orjson.dumps(document).decode()
+
+
+class TextRequest(Strict):
+    """A position of the tip; `seq` and `client_time` are echoed."""
+
+    seq: int = pydantic.Field(0, ge=0, lt=2**32)
+    client_time: float = 0.0
+    position: Position
+    outputs: list[Literal["coordinates", "displacement", "von_mises", "stress"]] = pydantic.Field(
+        [], max_length=4
+    )
+
+
+class TextCommand(Strict):
+    """A request to keep the state of a session's tissue, or to go back to one that was kept."""
+
+    snapshot: int | None = pydantic.Field(None, ge=0, lt=MOST_SNAPSHOTS)
+    restore: int | None = pydantic.Field(None, ge=0, lt=MOST_SNAPSHOTS)
+
+
+def read_request(text: str) -> Request:
+    """Read a position; raise `Refusal` with the field that is wrong."""
+    read = parse(TextRequest, text)
+    x, y, z = read.position
+    outputs = sum(Output[name.upper()] for name in set(read.outputs))
+    return Request(read.seq, read.client_time, (x, y, z), outputs)
+
+
+def is_command(text: str | None) -> bool:
+    """Whether a message is a `TextCommand` rather than a position."""
+    return text is not None and ('"snapshot"' in text or '"restore"' in text)
+
+
+def read_command(text: str) -> tuple[str, int]:
+    """Read a command: ``snapshot`` or ``restore``, and the number; raise `Refusal` for nonsense."""
+    given = parse(TextCommand, text).model_dump(exclude_none=True)
+    if len(given) != 1:
+        message, allowed = "One of snapshot and restore is wanted", list(TextCommand.model_fields)
+        raise Refusal("invalid_value", "snapshot", message, allowed)
+    return next(iter(given.items()))
+
+
+def names(bits: Output | Flag) -> list[str]:
+    """List bits as messages in JSON have them."""
+    return [str(bit.name).lower() for bit in bits]
+
+
+def write_reply(frame: bytes) -> str:
+    """Write a reply in JSON: bits as lists of names, the reason in words, null for infinity."""
+    reply = frames.decode_reply(frame)
+    document = {name: value for name, value in reply._asdict().items() if value is not None}
+    document["flags"], document["outputs"] = names(Flag(reply.flags)), names(Output(reply.outputs))
+    document["reason"] = frames.REASONS_MEAN[Reason(reply.reason)]
+    return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY).decode()

@@ -3,7 +3,7 @@ import struct
 import numpy as np
 import pytest
 
-from palpate.online.session import frames, protocol
+from palpate.online.session import frames
 from palpate.online.session.frames import (
     Extras,
     Flag,
@@ -128,10 +128,10 @@ def test_a_reply_cut_short_is_refused(rng):
 
 
 def test_the_protocol_has_the_layout():
-    """``python -m palpate.online.session.protocol`` writes it."""
-    told = protocol.layout()["reply"]["fields"]
+    """``python -m palpate.online.session.frames`` writes it."""
+    told = frames.layout()["reply"]["fields"]
     assert [(f["name"], f["offset"], f["type"], f["shape"]) for f in told] == [
         (name, offset, kind.base.name, kind.shape)
         for name, (kind, offset) in frames.REPLY.fields.items()
     ]
-    assert protocol.PATH.read_text() == protocol.document()
+    assert frames.PATH.read_text() == frames.document()

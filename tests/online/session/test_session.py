@@ -7,7 +7,7 @@ import pytest
 
 from palpate.online.client.http import Client
 from palpate.online.client.session import ServiceError, Session, SessionClosed
-from palpate.online.session import frames, protocol
+from palpate.online.session import frames
 from palpate.online.session.frames import Flag, Output, Reason, Request
 from palpate.shared.errors import PalpateError
 
@@ -26,7 +26,7 @@ def session(url):
 
 def test_a_session_says_how_to_speak_with_it(session):
     assert session.greeting["scene"] == "toy"
-    assert session.greeting["layout"] == json.loads(json.dumps(protocol.layout()))
+    assert session.greeting["layout"] == json.loads(json.dumps(frames.layout()))
     assert session.greeting["nodes"] == len(FakeModel().surface_nodes)
     reply = session.step(session.greeting["example"]["position"])
     assert reply.good
@@ -198,7 +198,7 @@ def test_without_a_handshake_there_is_no_session_but_its_description(client):
     assert client.get("/scenes/other/session").status_code == 404
     document = client.get("/openapi.json").json()
     responses = document["paths"]["/scenes/{name}/session"]["get"]["responses"]
-    assert protocol.tables() in responses["101"]["description"]
+    assert frames.tables() in responses["101"]["description"]
 
 
 def test_a_session_closed_by_its_client_says_so(session):
