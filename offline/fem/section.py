@@ -9,7 +9,7 @@ sampling of the same map.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -76,23 +76,8 @@ def _cross(a: Floats, b: Floats) -> Floats:
     return cross
 
 
-@dataclass(frozen=True)
-class SectionMap:
-    """A smooth map of the unit square (u, v) onto a section.
-
-    u runs from the lip (0) to the tip (1), v from the inner (0) to the outer side (1).
-    """
-
-    x: RectBivariateSpline
-    z: RectBivariateSpline
-
-    def __call__(self, u: ArrayLike, v: ArrayLike) -> Floats:
-        """Points (..., 2) mm of the section for parameters u, v of equal shape."""
-        return np.stack([self.x(u, v, grid=False), self.z(u, v, grid=False)], axis=-1)
-
-
-def map_section(points: Floats, corners: ArrayLike) -> SectionMap:
-    """Find the map of the unit square onto the inside of an outline.
+def map_section(points: Floats, corners: ArrayLike) -> Callable[[ArrayLike, ArrayLike], Floats]:
+    """Find a smooth map of the unit square onto the inside of an outline.
 
     Parameters
     ----------
@@ -100,6 +85,12 @@ def map_section(points: Floats, corners: ArrayLike) -> SectionMap:
         Clockwise outline.
     corners : array, shape (4, 2), mm
         Where (u, v) = (0, 1), (1, 1), (1, 0), (0, 0) go; moved to the nearest outline point.
+
+    Returns
+    -------
+    section : callable
+        Points (..., 2) mm for parameters u, v (...): u runs from the lip (0) to the tip (1), v from
+        the inner (0) to the outer side (1).
 
     Raises
     ------
@@ -128,7 +119,12 @@ def map_section(points: Floats, corners: ArrayLike) -> SectionMap:
             grid, slid = _smooth(boundary, grid, slid, epsilon)
     if _mean_ratio(grid, boundary.scale(grid), epsilon)[2] <= 0:
         raise SceneError("geometry.corners: this split of the outline leaves a folded mesh")
-    return SectionMap(*(RectBivariateSpline(u, v, grid[..., i]) for i in (0, 1)))
+    x, z = (RectBivariateSpline(u, v, grid[..., i]) for i in (0, 1))
+
+    def section(u: ArrayLike, v: ArrayLike) -> Floats:
+        return np.stack([x(u, v, grid=False), z(u, v, grid=False)], axis=-1)
+
+    return section
 
 
 class _Boundary:
