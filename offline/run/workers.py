@@ -85,8 +85,10 @@ def worker_pool(
         initargs=args,
     )
     interrupt = signal.signal(signal.SIGINT, signal.SIG_IGN)  # which workers inherit
-    pool.submit(os.getpid)  # starts them
-    signal.signal(signal.SIGINT, interrupt)
+    try:
+        pool.submit(os.getpid)  # starts them
+    finally:
+        signal.signal(signal.SIGINT, interrupt)
     return pool
 
 
