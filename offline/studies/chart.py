@@ -156,8 +156,8 @@ def measure(
 ) -> dict[str, Any]:
     """Build a method and have it answer the queries.
 
-    Errors (``displacement``, ``von_mises``, ``refined``) and ``converged`` are by query, ``times``
-    (s) and those ``beside``, the artifact's, by step that presses.
+    Errors (``displacement``, ``von_mises``, ``refined``) are by query, nan where nothing is known,
+    ``times`` (s) and those ``beside``, the artifact's, by step that presses.
     """
     problem = training.problem
     method, yardstick = build(name, size, training), build("artifact", 1, training)
@@ -166,34 +166,27 @@ def measure(
         queries = queries[: len(finer)]
     for one in (method, yardstick):  # compiled code comes in from disk
         one.step(one.at_rest(), *queries[0][0][0])
-    errors, converged = np.ones((len(queries), 2)), np.ones(len(queries), dtype=bool)
-    from_finer, times = np.ones(len(finer)), []
+    errors, times, unconverged = np.ones((len(queries), 3)), [], 0
     for i, (steps, exact) in enumerate(queries):
         states, seconds, missed = play(method, steps)
         times.append(seconds[_pressing(steps)])
-        converged[i] = not missed
+        unconverged += missed > 0
         if not missed:
             fields = Fields.of(method, states)
             if training.in_time and name == "artifact, warm":
                 elastic = Full(full.of_tissue(problem, prony=()))
                 exact = Fields.of(elastic, play(elastic, steps)[0])
-            errors[i] = fields.errors(problem, exact)
+            errors[i, :2] = fields.errors(problem, exact)
             if i < len(finer):
-                from_finer[i] = relative(fields.displacements[-1], finer[i])
-    from_finer[[bool(np.isnan(u).any()) for u in finer]] = np.nan
-    if other_mesh:  # nothing to compare with
-        errors[:] = np.nan
+                errors[i, 2] = relative(fields.displacements[-1], finer[i])
+    known = [bool(np.isfinite(u).all()) for u in finer] + [False] * (len(queries) - len(finer))
+    errors[~np.array(known), 2] = np.nan
+    if other_mesh:
+        errors[:, :2] = np.nan
     least, beside = _times(method, yardstick, queries, np.concatenate(times))
-    return {
-        "unknowns": method.unknowns,
-        "label": method.label,
-        "displacement": errors[:, 0],
-        "von_mises": errors[:, 1],
-        "refined": from_finer,
-        "converged": converged,
-        "times": least,
-        "beside": beside,
-    }
+    found = {"unknowns": method.unknowns, "label": method.label, "unconverged": unconverged}
+    found |= dict(zip(drawing.FIELDS, errors.T, strict=True))
+    return found | {"times": least, "beside": beside}
 
 
 def play(method: Method, steps: Steps) -> tuple[list[Any], Array, int]:
@@ -245,7 +238,7 @@ def _row(key: str, found: Mapping[str, Any], usual: float) -> dict[str, Any]:
         quantiles = np.percentile(errors, [50, 95, 100]) if errors.size else np.full(3, np.nan)
         for statistic, error in zip(drawing.STATISTICS, quantiles.tolist(), strict=True):
             row[f"{name}_{statistic}"] = error
-    return row | {"unconverged": int((~found["converged"]).sum())}
+    return row | {"unconverged": found["unconverged"]}
 
 
 def _summary(rows: Sequence[Row]) -> dict[str, Any]:

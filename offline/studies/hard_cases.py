@@ -127,7 +127,7 @@ def _lead(problem: FullProblem, loads: Sequence[Array], finest: float) -> Fields
             u = problem.model.solve(load, start=u, smallest_step=finest).displacement
         except NoEquilibrium:
             return None
-    return None if u is None else Fields.at_once(problem, [u])
+    return None if u is None else Fields(u[None], problem.von_mises(u)[None])
 
 
 def several(questions: Mapping[str, Sequence[Question]], most: int) -> dict[str, list[Question]]:

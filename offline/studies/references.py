@@ -40,11 +40,6 @@ class Fields(NamedTuple):
             np.array([method.von_mises(state) for state in states]),
         )
 
-    @classmethod
-    def at_once(cls, problem: FullProblem, displacements: Sequence[Array]) -> Fields:
-        """Fields of tissue that remembers nothing, with displacements (n, 3) mm."""
-        return cls(np.array(displacements), np.array([problem.von_mises(u) for u in displacements]))
-
     def errors(self, problem: FullProblem, exact: Fields) -> tuple[float, float]:
         """Relative L2 errors over the moments and all nodes, or those beyond the clamped layer."""
         kept = problem.beyond_clamped_layer

@@ -150,8 +150,9 @@ def test_a_load_that_snapped_and_was_lowered_stays_on_its_branch():
 def test_an_answer_on_another_branch_is_told_apart_and_counts_as_silent(problem):
     x, normal, _ = problem.surface.project(np.array([4.0, 5.5, 8.0]))
     path, jump, half = (
-        Fields.at_once(problem, [share * problem.solve(Load(x, -normal, p)).displacement])
+        Fields(share * u[None], problem.von_mises(share * u)[None])
         for p, share in ((1.5, 1.0), (1.0, 1.0), (1.0, 0.5))
+        for u in [problem.solve(Load(x, -normal, p)).displacement]
     )
 
     def outcome(found, trusted, exact, jump):

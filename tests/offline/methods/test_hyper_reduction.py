@@ -54,8 +54,7 @@ def test_it_interpolates_force_modes_of_displacements_that_invert_no_element(
     training, snapshots, modes
 ):
     sampled, count = sample(modes, 1), modes.shape[1]
-    assert len(sampled) == count
-    assert np.linalg.cond(modes[sampled]) < 1e3
+    assert np.linalg.norm(np.linalg.inv(modes[sampled])) < 1e3  # square, and far from singular
     inverted = np.vstack([snapshots, 100 * snapshots[:1]])
     np.testing.assert_array_equal(force_modes(training.model, inverted, count), modes)
 
