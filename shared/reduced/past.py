@@ -124,11 +124,11 @@ class Elastic(NamedTuple):
         external[:] = load
         return math.sqrt(np.dot(load, load))
 
-    def follow(self, inverse, q, before, change, start):
+    def follow(self, inverse, q, before, missed, change, start):
         """There is no force to follow."""
 
-    def note_force(self, before):
-        """There is no force to note."""
+    def note_answer(self, q, followed, before, missed):
+        """There is nothing to note."""
 
 
 class Step(NamedTuple):
@@ -244,20 +244,25 @@ class Remembering(NamedTuple):
         origin[:] = np.nan
         return math.sqrt(size)
 
-    def follow(self, inverse, q, before, change, start):
-        """Move a start by what the force of the past on linear tissue has changed since."""
+    def follow(self, inverse, q, before, missed, change, start):
+        """Move a start by what the force of the past on linear tissue has changed since.
+
+        What the last start ``missed`` is added; it becomes minus the start without that.
+        """
         step = self.step
         superpose(self.deviatoric[step.model[0]], q, step.softer)
         for i in range(len(q)):
             change[i] = step.exerted[i] + step.loss[0] * step.softer[i] - before[i]
         superpose(inverse, change, step.softer)
         for i in range(len(q)):
-            start[i] += step.softer[i]
+            start[i] += step.softer[i] + missed[i]
+            missed[i] -= start[i]
 
-    def note_force(self, before):
-        """Write the force of the past on linear tissue in the state of the last evaluation."""
+    def note_answer(self, q, followed, before, missed):
+        """Write the past's force on linear tissue, and what the start missed if it ``followed``."""
         for i in range(len(before)):
             before[i] = self.step.exerted[i] + self.step.loss[0] * self.step.softer[i]
+            missed[i] = missed[i] + q[i] if followed else 0.0
 
 
 def remembering(deviatoric: Field, terms: int, points: int) -> Remembering:
