@@ -208,6 +208,11 @@ class Estimators:
             }
         )
 
+    def coefficients(self, tip: bool, in_time: bool) -> Array:
+        """Of answers to loads or under the tip, at once or in time."""
+        loads, touches = (self.histories, self.courses) if in_time else (self.loads, self.touches)
+        return (touches if tip else loads).coefficients
+
 
 ESTIMATORS = {
     "loads": "error_coefficients",

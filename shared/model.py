@@ -18,12 +18,12 @@ from palpate.shared.artifact import Artifact, ArtifactError, read_artifact
 from palpate.shared.errors import QueryError
 from palpate.shared.fields import FieldRecovery
 from palpate.shared.geometry.surface import Surface, SurfaceIndex, boundary_triangles
-from palpate.shared.local_models import Body, Estimator, Estimators, LocalModels
+from palpate.shared.local_models import Body, Estimators, LocalModels
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.query import check_place, checked_load, out_of_range, vector
 from palpate.shared.reduced import press, touch
-from palpate.shared.reduced.outcome import TOUCH_FEATURES, Outcome
+from palpate.shared.reduced.outcome import Outcome
 from palpate.shared.reduced.past import Elastic, Remembering
 from palpate.shared.reduced.transfer import LeftBehind, Local, Past, Transfer, estimate_history
 from palpate.shared.reduced.workspace import Warm, Workspace
@@ -158,9 +158,9 @@ class ReducedModel:
             )
         if in_time and not self.scene.tissue.prony:
             raise QueryError("time", f"scene {self.name!r} is elastic and knows none")
-        estimator = self.estimators.touches if tip else self.estimators.loads
         past = self.transfer(tip).new_past() if in_time else Elastic()
-        return Workspace(self._tables(tip), self._index, estimator.coefficients, past)
+        coefficients = self.estimators.coefficients(tip, in_time)
+        return Workspace(self._tables(tip), self._index, coefficients, past)
 
     def transfer(self, tip: bool) -> Transfer:
         """Takes the past under loads or under the tip from one local model to the next."""
@@ -245,22 +245,21 @@ class ReducedModel:
             own.begin_step(self.scene.tissue.prony, dt)
             moves = self.transfer(False).begin(own, answering, past)
         press.press(own.solver, pressure, radius)
+        after: Past | None = None
+        active: Active = ()
         if past is None:
             press.estimate(own.solver, pressure)
-        found = own.result()
+            found = own.result()
+        else:
+            share = pressure / own.outcome.limit.item()
+            found, after, active = _in_time(
+                own, answering, past, dt, moves, own.outcome.foot.copy(), share,
+                own.outcome.displacement,
+            )  # fmt: skip
         parts = tuple([(k, w, own.warm.q[slot].copy()) for slot, k, w in answering])
         converged = found.status == newton.CONVERGED
         outside = out_of_range(self.scene.endoscope, at, found, pressure, radius)
-        active: Active = ()
-        features, errors, after = found.features, found.errors, None
-        if past is not None:
-            response = math.hypot(*found.displacement.tolist())
-            features, errors, after, active = self._in_time(
-                own, answering, past, dt, moves, self.estimators.histories, found, found.foot,
-                pressure / found.limit, response,
-            )  # fmt: skip
-        if outside or not converged:
-            errors = _UNKNOWN
+        errors = _UNKNOWN if outside or not converged else found.errors
         return Answer(
             contact_point=found.foot,
             normal=found.upward,
@@ -276,7 +275,7 @@ class ReducedModel:
             min_jacobian=found.min_jacobian,
             pressure_limit=found.limit,
             depth_limit=found.limits.item(TIP_DEPTH),
-            features=features,
+            features=found.features[: own.features],
             parts=parts,
             direction=found.direction,
             tilt=found.tilt,
@@ -341,24 +340,25 @@ class ReducedModel:
             moves = self.transfer(True).begin(own, answering, past)
         touch.touch(own.solver, at, most)
         touched = own.outcome.touched.item() > 0
-        if past is None and touched:
-            touch.estimate(own.solver, at)
-        found = own.result()
+        after: Past | None = None
+        active: Active = ()
+        if past is None:
+            if touched:
+                touch.estimate(own.solver, at)
+            found = own.result()
+        else:
+            found, after, active = _in_time(
+                own, answering, past, dt, moves, past.position if off else at,
+                depth / own.outcome.limit.item(), own.outcome.force,
+            )  # fmt: skip
         parts = tuple([(k, w, own.scratch.q[slot].copy()) for slot, k, w in answering])
         converged = found.status == newton.CONVERGED
         outside: tuple[str, ...] = ()
-        active: Active = ()
         if found.beside and (touched or depth > 0.0):
             outside += ("position",)
         if depth > found.limit * (1 + 1e-9):
             outside += ("depth",)
-        features, errors, after = found.features[:TOUCH_FEATURES], found.errors, None
-        if past is not None:
-            response = math.hypot(*found.force.tolist())
-            features, errors, after, active = self._in_time(
-                own, answering, past, dt, moves, self.estimators.courses, found,
-                past.position if off else at, depth / found.limit, response,
-            )  # fmt: skip
+        errors = found.errors
         if outside or not converged:
             errors = _UNKNOWN
         elif not touched and past is None:
@@ -378,7 +378,7 @@ class ReducedModel:
             min_jacobian=found.min_jacobian,
             pressure_limit=found.limits.item(0),
             depth_limit=found.limit,
-            features=features,
+            features=found.features[: own.features],
             parts=parts,
             tip=True,
             position=at,
@@ -405,39 +405,6 @@ class ReducedModel:
             warm.forget()
         return warm
 
-    def _in_time(
-        self,
-        own: Workspace,
-        answering: Answering,
-        past: Past,
-        dt: float,
-        moves: Moves,
-        estimator: Estimator,
-        found: Outcome,
-        position: Array | None,
-        share: float,
-        response: float,
-    ) -> tuple[Array, Array, Past, Active]:
-        """Return features and errors of a history, the past to go on from, and active models."""
-        assert isinstance(own.past, Remembering)
-        records = own.past.records
-        active = tuple([(k, w, Local(records[slot].copy(), moves[k])) for slot, k, w in answering])
-        travel = 0.0
-        if position is not None and past.position is not None:
-            travel = math.dist(position.tolist(), past.position.tolist())
-        main = max(answering, key=itemgetter(2))[1] if answering else -1
-        after = Past(
-            past.time + dt, {k: local for k, _, local in active}, main, position,
-            max(past.share, share), max(past.response, response), past.travel + travel,
-            min(past.smallest, found.min_jacobian),
-        )  # fmt: skip
-        features, errors = estimate_history(
-            estimator.coefficients, found.upward, after.share, after.response, after.travel,
-            after.smallest,
-        )  # fmt: skip
-        left = after.share > 1.0 + 1e-9  # the trained range, now or before
-        return features, _UNKNOWN if left else errors, after, active
-
     def displacement(self, answer: Answer, region: Region = "all") -> Field:
         """Nodal displacement (k, 3) mm, of all nodes or those of ``surface_nodes``."""
         displacement = self.fields.displacement(answer)
@@ -451,3 +418,29 @@ class ReducedModel:
             displacement = self.fields.displacement(answer)
         stress = self.fields.von_mises(answer, displacement)
         return stress if region == "all" else stress[self.surface_nodes]
+
+
+def _in_time(
+    own: Workspace,
+    answering: Answering,
+    past: Past,
+    dt: float,
+    moves: Moves,
+    position: Array | None,
+    share: float,
+    response: Array,
+) -> tuple[Outcome, Past, Active]:
+    """Return the outcome of a step, the past to go on from, and local models and theirs."""
+    assert isinstance(own.past, Remembering)
+    way = 0.0
+    if position is not None and past.position is not None:
+        way = math.dist(position.tolist(), past.position.tolist())
+    estimate_history(own.solver, past.features, way, share, response)
+    found, records = own.result(), own.past.records
+    active = tuple([(k, w, Local(records[slot].copy(), moves[k])) for slot, k, w in answering])
+    main = max(answering, key=itemgetter(2))[1] if answering else -1
+    after = Past(
+        past.time + dt, {k: local for k, _, local in active}, main, position,
+        found.features[: own.features],
+    )  # fmt: skip
+    return found, after, active

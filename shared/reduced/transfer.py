@@ -35,6 +35,8 @@ MOST_MOVES = 12
 MOST_PARTS = 4
 """Local models among which a move is shared out."""
 
+_NOTHING = math.log(1e-6)
+
 Parts = list[tuple[int, float, Array]]
 """Local model, weight, and a state in its modes."""
 
@@ -72,44 +74,41 @@ class Past(NamedTuple):
         The local model that had most weight; -1 at rest.
     position : ndarray, shape (3,), mm, or None
         The last contact point; under the tip, where it was over the surface last.
-    share : float
-        Largest pressure or depth so far, over its limit there.
-    response : float
-        Largest displacement of the contact (mm), or force of the tip (mN), so far.
-    travel : float, mm
-        Over the surface.
-    smallest : float
-        Smallest det F so far.
+    features : ndarray, shape (HISTORY_FEATURES,)
+        Of the error estimate so far, see ``estimate_history``.
     """
 
     time: float = 0.0
     locals: Mapping[int, Local] = {}
     main: int = -1
     position: Array | None = None
-    share: float = 0.0
-    response: float = 0.0
-    travel: float = 0.0
-    smallest: float = 1.0
+    features: Array = np.array([1.0, 0.0, _NOTHING, 1.0, 0.0, 0.0, 0.0, 0.0, _NOTHING])
 
 
 REST = Past()
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def estimate_history(coefficients, normal, share, response, travel, smallest):
-    """Features of a history and its estimated errors.
+def estimate_history(solver, before, way, share, response):
+    """Estimated errors of a history; infinite where it has left the trained range.
 
     The features: 1; the largest share of the limit so far and its log; smallest det F so far; the
     normal (where on the body); the way over the surface; the log of the largest response over the
-    largest share.
+    largest share.  ``before`` are those before this step, which goes a ``way`` (mm) and is answered
+    by a ``response`` (3,), a displacement of the contact or a force.
     """
-    features, errors = np.empty(HISTORY_FEATURES), np.empty(len(coefficients))
-    share = max(share, 1e-6)
-    features[0], features[1], features[2], features[3] = 1.0, share, math.log(share), smallest
-    features[4:7] = normal
-    features[7], features[8] = math.log1p(travel), math.log(max(response / share, 1e-6))
-    estimate_errors(coefficients, features, errors)
-    return features, errors
+    outcome, features = solver.outcome, solver.outcome.features[:HISTORY_FEATURES]
+    most = max(before[1], share, 1e-6)
+    largest = math.exp(before[8]) * max(before[1], 1e-6)
+    largest = max(largest, math.sqrt(np.dot(response, response)))
+    features[0], features[1], features[2] = 1.0, most, math.log(most)
+    features[3] = min(before[3], outcome.min_jacobian[0])
+    features[4:7] = outcome.upward
+    features[7] = math.log1p(math.expm1(before[7]) + way)
+    features[8] = math.log(max(largest / most, 1e-6))
+    estimate_errors(solver.coefficients, features, outcome.errors)
+    if most > 1.0 + 1e-9:
+        outcome.errors[:] = np.inf
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

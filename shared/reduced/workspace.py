@@ -52,6 +52,8 @@ class Workspace:
     solver : Bound of Solver
     active, warm, scratch, past, outcome
         Its members.
+    features : int
+        Of the error estimate.
     """
 
     def __init__(
@@ -85,6 +87,7 @@ class Workspace:
         self.past, self._dt = past, math.nan
         self.active = room(Active, **sizes)
         self._record, self.outcome = new_outcome()
+        self.features = coefficients.shape[1]
         self.solver = bind(
             Solver(
                 models, index, np.ascontiguousarray(coefficients), past, self.active, self.warm,
