@@ -40,7 +40,7 @@ def build_mesh(scene: Scene) -> Mesh:
     Raises
     ------
     SceneError
-        If the section cannot be read or meshed, or if support or surface hold no face.
+        If the section cannot be read or meshed, or if support or surface hold no face, or the same.
     """
     geometry, divisions = scene.geometry, divisions_of(scene.geometry)
     if isinstance(geometry, Extrusion):
@@ -67,7 +67,10 @@ def build_mesh(scene: Scene) -> Mesh:
 
     clamped = np.zeros(len(nodes), dtype=bool)
     clamped[faces[patch("support", scene.support)]] = True
-    return Mesh(nodes, elements, faces, clamped, patch("surface", scene.surface))
+    accessible = patch("surface", scene.surface)
+    if clamped[faces[accessible]].all():
+        raise SceneError("surface: the support holds all of it, so nothing can be pressed")
+    return Mesh(nodes, elements, faces, clamped, accessible)
 
 
 def _extruded(scene: Scene, geometry: Extrusion, parameters: Floats) -> Floats:

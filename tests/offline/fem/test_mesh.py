@@ -151,6 +151,7 @@ def test_local_thickness():
     [
         ("quick", '"bottom"', '"bottom"\nx = [20, 30]', "support: no face"),
         ("quick", '"top"', '"top"\ny = [-2, -1]', "surface: no face"),
+        ("quick", '"bottom"', '"top"', "surface: the support holds all of it"),
         ("turbinate", "turbinate_section", "nothing", "section: .* cannot be read"),
         ("turbinate", "[1.2, 2.9]", "[3.2, 7.0]", "corners: must lie on the outline"),
         ("turbinate", "[[4.3, 17.7], [1.2, 2.9]", "[[1.2, 2.9], [4.3, 17.7]", "corners: .* clockw"),
