@@ -33,6 +33,7 @@ from palpate.shared.reduced.points import (
     add_past_increments,
     add_past_stress,
     contract,
+    distance,
     drive_points,
     increments,
     predict_points,
@@ -44,6 +45,11 @@ Field = NDArray[np.float32]
 
 KNOTS = 8
 """Of the path of answers; the last is the last answer."""
+
+
+CORRECTED = 5e-3
+"""Change of an answer, relative to it, that its last correction may make without points being
+evaluated again: what is linear in the displacement does not need them."""
 
 
 class Memory(NamedTuple):
@@ -169,7 +175,7 @@ class Remembering(NamedTuple):
     def end_step(self, points, work, slot, q):
         """Take the memory of a slot to the end of a step that ``q`` is the answer of."""
         memory, time, driven, linear = memory_of(self, slot), self.time, self.step.B, self.step.S
-        if not np.array_equal(q, work.latest):  # the last evaluation was of another state
+        if distance(q, work.latest) > CORRECTED**2:  # the last evaluation was of another model
             points.strain(q, work.stepped, work.H)
         drive_points(work.H, driven, linear)
         viscosity.advance(driven, time, memory.points)

@@ -46,8 +46,8 @@ Ints = NDArray[np.int64]
 TOLERANCE, TOLERANCE_IN_TIME = 1.5e-3, 2e-3
 """Residual at equilibrium relative to load and past: in the energy norm of the rest state both are
 displacements, so this is the solver's share of the error.  In time the answer then is corrected
-once more, for errors add up: what is left of them is a third of those at once.  Where a scene's
-tolerance is looser than the usual, so is this: ``PressModels.tolerance_factor``."""
+once more, since errors are remembered: a quarter of that is left.  Where a scene's tolerance is
+looser than the usual, so is this: ``PressModels.tolerance_factor``."""
 
 SMALLEST_TARGET = 3e-7
 """Residual in the energy norm, (mN mm)^(1/2), that counts as equilibrium under any load.  After a
@@ -274,11 +274,10 @@ def _solve(solver, k, slot):
     q[:] = start
     warm.guess[slot] = guess
     warm.number[slot] = k if found else -1
-    if found:
+    if found and past.in_time:
+        problem.correct(scratch.newton[0], scratch.newton[1])
+        q += scratch.newton[1]
         past.end_step(problem.points, scratch.work, slot, q)
-        if past.in_time:
-            problem.correct(scratch.newton[0], scratch.newton[1])
-            q += scratch.newton[1]
     past.note_answer(q, attempt == 0, warm.past[slot], missed)
     length = departure = 0.0
     for i in range(len(q)):
