@@ -1,16 +1,12 @@
 """An answer: what a pressed or touched tissue does, and how far to trust it."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate.shared.arrays import Array
 from palpate.shared.reduced.transfer import Local, Past
-
-Array = NDArray[np.float64]
 
 
 class Answer(NamedTuple):

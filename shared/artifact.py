@@ -9,8 +9,6 @@ version and the SHA-256 of the rest of the file.  It is checked before HDF5 sees
 bit in HDF5's own structures can keep its library busy for ever.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

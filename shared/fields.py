@@ -1,21 +1,16 @@
 """Fields of an answer at all nodes: displacement and von Mises stress."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.shared.answer import Answer
+from palpate.shared.arrays import Array, Field
 from palpate.shared.geometry.quadrature import stress_recovery
 from palpate.shared.local_models import Body, LocalModels
 from palpate.shared.mechanics.stress import nodal_von_mises, remember
 from palpate.shared.reduced.points import expand
 from palpate.shared.reduced.transfer import Transfer
-
-Array = NDArray[np.float64]
-Field = NDArray[np.float32]
 
 
 class FieldRecovery:

@@ -4,8 +4,6 @@ A ``Stored`` field is a dataset of the artifact, with its unit and a description
 shape: n nodes, p local models of r modes (m under the tip) in a basis of M modes of their region.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,6 +12,7 @@ from typing import Annotated, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.shared.arrays import Array, Field, Flags, Ints, Numbers
 from palpate.shared.artifact import values_of
 from palpate.shared.geometry.quadrature import surface_quadrature, volume_quadrature
 from palpate.shared.mechanics.footprint import SurfaceQuadrature
@@ -23,11 +22,6 @@ from palpate.shared.mechanics.tissue import Law
 from palpate.shared.reduced.outcome import HISTORY_FEATURES, PRESS_FEATURES, TOUCH_FEATURES
 from palpate.shared.scene import Scene
 
-Array = NDArray[np.float64]
-Field = NDArray[np.float32]
-Ints = NDArray[np.int64]
-Numbers = NDArray[np.int32]
-
 
 @dataclass(frozen=True)
 class Mesh:
@@ -36,8 +30,8 @@ class Mesh:
     nodes: Annotated[Array, "nodes", "mm", "nodes (n, 3), dof = 3 node + axis"]
     elements: Annotated[Numbers, "elements", "1", "nodes of hexahedra (e, 8 or 20), VTK order"]
     faces: Annotated[Numbers, "faces", "1", "nodes of boundary faces (f, 4 or 8), VTK"]
-    clamped: Annotated[NDArray[np.bool_], "clamped", "1", "nodes held fixed (n,)"]
-    accessible: Annotated[NDArray[np.bool_], "accessible", "1", "faces an endoscope can touch (f,)"]
+    clamped: Annotated[Flags, "clamped", "1", "nodes held fixed (n,)"]
+    accessible: Annotated[Flags, "accessible", "1", "faces an endoscope can touch (f,)"]
 
 
 @dataclass(frozen=True)
@@ -198,7 +192,7 @@ class Estimators:
     courses: Estimator = Estimator(np.zeros((3, HISTORY_FEATURES)))
 
     @classmethod
-    def of(cls, arrays: Mapping[str, NDArray[Any]]) -> Estimators:
+    def of(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
         """Read from an artifact, which holds those of its scene."""
         return cls(
             **{

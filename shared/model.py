@@ -1,19 +1,18 @@
 """A trained scene in memory, ready to answer: locate, solve, recover fields, state the trust."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Mapping
 from functools import cached_property
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from palpate.shared.answer import Answer
+from palpate.shared.arrays import Array, Field, Flags
 from palpate.shared.artifact import Artifact, ArtifactError, read_artifact
 from palpate.shared.errors import QueryError
 from palpate.shared.fields import FieldRecovery
@@ -30,8 +29,6 @@ from palpate.shared.reduced.workspace import Warm, Workspace
 from palpate.shared.scene import Scene, SceneError, parse_scene
 from palpate.shared.tables import press_models, touch_models
 
-Array = NDArray[np.float64]
-Field = NDArray[np.float32]
 Region = Literal["surface", "all"]
 
 Active = tuple[tuple[int, float, Local], ...]
@@ -88,7 +85,7 @@ class ReducedModel:
         self._transfers: dict[bool, Transfer] = {}
 
     @classmethod
-    def load(cls, path: str | Path) -> ReducedModel:
+    def load(cls, path: str | Path) -> Self:
         """Load an artifact.
 
         Raises
@@ -103,7 +100,7 @@ class ReducedModel:
             raise ArtifactError(f"{path}: incomplete or inconsistent: {error}") from error
 
     @classmethod
-    def from_artifact(cls, artifact: Artifact) -> ReducedModel:
+    def from_artifact(cls, artifact: Artifact) -> Self:
         """Build from the contents of an artifact."""
         arrays, scene = artifact.arrays, parse_scene(artifact.scene)
         return cls(
@@ -125,7 +122,7 @@ class ReducedModel:
         return self.body.nodes
 
     @property
-    def clamped(self) -> NDArray[np.bool_]:
+    def clamped(self) -> Flags:
         """Nodes held fixed (n,)."""
         return self.body.clamped
 

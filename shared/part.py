@@ -1,7 +1,5 @@
 """What every table of a scene file is: immutable, strict about types, closed to unknown keys."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field

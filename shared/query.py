@@ -1,18 +1,15 @@
 """What a query must be to be answered, and what it must be to be within the trained range."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from palpate.shared.arrays import Array
 from palpate.shared.errors import QueryError
 from palpate.shared.geometry.surface import UPRIGHT
 from palpate.shared.reduced.outcome import Outcome
 from palpate.shared.scene import Endoscope
-
-Array = NDArray[np.float64]
 
 BESIDE = 0.1
 """Millimetres beyond the rim of the surface at which the answer is not to the question any more."""

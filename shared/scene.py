@@ -8,15 +8,13 @@ radius. Whatever is wrong is refused with one `SceneError` that names every fiel
 The descriptions of the fields are the documentation of the keys: `palpate scene` prints them.
 """
 
-from __future__ import annotations
-
 import difflib
 import json
 import tomllib
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 
 from pydantic import (
     Field,
@@ -119,7 +117,7 @@ class Patch(Part):
     z: Range | None = _chosen("all of it", "[from, to] mm")
 
     @model_validator(mode="after")
-    def _ranges_ascend(self) -> Patch:
+    def _ranges_ascend(self) -> Self:
         for axis in "xyz":
             bounds = getattr(self, axis)
             if bounds is not None and not bounds[0] <= bounds[1]:

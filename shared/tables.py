@@ -1,7 +1,5 @@
 """The tables that compiled queries read, from what training found out about a scene."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -10,16 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.shared.arrays import Field, Ints, Numbers
 from palpate.shared.local_models import Body, LocalModels, LocalTips
 from palpate.shared.mechanics.footprint import SurfaceQuadrature
 from palpate.shared.reduced.points import LANES, Points
 from palpate.shared.reduced.press import PressModels
 from palpate.shared.reduced.touch import TouchModels
 from palpate.shared.scene import Scene
-
-Array = NDArray[np.float64]
-Field = NDArray[np.float32]
-Ints = NDArray[np.int64]
 
 REACH = 0.8
 """Radius of a contact at most, in radii of the tip: nearer faces count."""
@@ -134,7 +129,7 @@ def _by_model(found: Mapping[int, tuple[Any, ...]]) -> Any:
     return zip(*(found[k] for k in sorted(found)), strict=True)
 
 
-def _compact(numbers: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def _compact(numbers: Numbers) -> tuple[Numbers, Numbers]:
     """Nodes (n,) of faces (f, k), and the faces in terms of them."""
     nodes, own = np.unique(numbers, return_inverse=True)
     return nodes, own.reshape(numbers.shape).astype(np.int32)
@@ -175,10 +170,10 @@ def _place_points(
     return np.asarray(tiles.reshape(G.shape[-1], -1))
 
 
-def _rows(basis: Field, C: Field, nodes: NDArray[np.int32]) -> Field:
+def _rows(basis: Field, C: Field, nodes: Numbers) -> Field:
     """Rows (k, 3, m) of modes ``basis @ C`` at some nodes; basis (n, 3, M), C (M, m)."""
     return (basis[nodes].reshape(-1, len(C)) @ C).reshape(len(nodes), 3, -1)
 
 
-def _offsets(parts: Sequence[Any]) -> NDArray[np.int64]:
+def _offsets(parts: Sequence[Any]) -> Ints:
     return np.concatenate([[0], np.cumsum([len(part) for part in parts])]).astype(np.int64)

@@ -6,9 +6,8 @@ Node order is VTK's: hex8 corners, hex20 corners then edge midpoints; faces like
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from palpate.shared.arrays import Array
 
 HEX_CORNERS = np.array(
     [

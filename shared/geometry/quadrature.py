@@ -1,10 +1,8 @@
 """Integration points of a mesh: in the volume, on the boundary, and for stress recovery."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate.shared.arrays import Array, Numbers
 from palpate.shared.errors import PalpateError
 from palpate.shared.geometry.elements import (
     HEX_CORNERS,
@@ -18,14 +16,11 @@ from palpate.shared.mechanics.footprint import SurfaceQuadrature
 from palpate.shared.mechanics.stress import StressRecovery
 from palpate.shared.mechanics.tissue import Law
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int32]
-
 LOAD_SPACING = 0.4
 """Millimetres of a face's edge to a Gauss point: the load must be smooth in the contact point."""
 
 
-def volume_quadrature(nodes: Array, elements: Ints, points: int) -> tuple[Array, Array]:
+def volume_quadrature(nodes: Array, elements: Numbers, points: int) -> tuple[Array, Array]:
     """Gradients of the shape functions and weights at ``points``^3 Gauss points.
 
     Returns
@@ -50,7 +45,7 @@ def volume_quadrature(nodes: Array, elements: Ints, points: int) -> tuple[Array,
 
 
 def surface_quadrature(
-    nodes: Array, faces: Ints, spacing: float = LOAD_SPACING
+    nodes: Array, faces: Numbers, spacing: float = LOAD_SPACING
 ) -> SurfaceQuadrature:
     """Gauss points of boundary faces, one to each ``spacing`` mm of an edge, feeding mesh nodes."""
     X = nodes[faces]
@@ -78,7 +73,7 @@ def surface_quadrature(
 
 
 def stress_recovery(
-    nodes: Array, elements: Ints, law: Law, precision: type = np.float64
+    nodes: Array, elements: Numbers, law: Law, precision: type = np.float64
 ) -> StressRecovery:
     """Recovery of nodal stresses from 2x2x2 points per element; law (e,)."""
     gradients, _ = volume_quadrature(nodes, elements, 2)

@@ -1,7 +1,5 @@
 """The body's boundary as triangles: where a queried position lands and which way is out."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,9 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from palpate.shared.arrays import Array, Ints, Numbers
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -64,10 +61,10 @@ class SurfaceIndex(NamedTuple):
     """A surface as compiled code sees it, with fields given at its vertices."""
 
     vertices: Array  # (v, 3) mm
-    triangles: NDArray[np.int32]  # (t, 3), neighbours next to each other
+    triangles: Numbers  # (t, 3), neighbours next to each other
     balls: Array  # (t, 4) mm, centres and radii of balls that hold them
     normals: Array  # (v, 3)
-    first: NDArray[np.int64]  # (c + 1,) first triangle of each cluster
+    first: Ints  # (c + 1,) first triangle of each cluster
     centres: Array  # (3, c) mm, of balls that hold the clusters
     radii: Array  # (c,) mm
     values: Array  # (v, k)
@@ -139,7 +136,7 @@ class Surface:
     """
 
     vertices: Array
-    triangles: NDArray[np.int32]
+    triangles: Numbers
     normals: Array
 
     @cached_property
@@ -184,14 +181,14 @@ class Surface:
         """For compiled code, with fields (v, k) given at the vertices."""
         return self._index._replace(values=np.ascontiguousarray(values))
 
-    def rim(self) -> NDArray[np.int64]:
+    def rim(self) -> Ints:
         """Vertices on the border of the surface: ends of edges that belong to one triangle."""
         edges = np.sort(np.vstack([self.triangles[:, [i, (i + 1) % 3]] for i in range(3)]), axis=1)
         unique, count = np.unique(edges, axis=0, return_counts=True)
         return np.unique(unique[count == 1])
 
 
-def _clusters(centres: Array, members: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+def _clusters(centres: Array, members: Ints) -> list[Ints]:
     """Triangles in groups of neighbours, halved across the longest side until small enough."""
     if len(members) <= CLUSTER:
         return [members]
@@ -201,7 +198,7 @@ def _clusters(centres: Array, members: NDArray[np.int64]) -> list[NDArray[np.int
     return _clusters(centres, members[:half]) + _clusters(centres, members[half:])
 
 
-def boundary_triangles(faces: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def boundary_triangles(faces: Numbers) -> tuple[Numbers, Numbers]:
     """Boundary for drawing: node ids (s,) and triangles (t, 3) as indices into them."""
     if faces.shape[1] == 4:
         pattern = [(0, 1, 2), (0, 2, 3)]

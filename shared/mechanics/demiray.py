@@ -13,8 +13,6 @@ Demiray, J. Biomech. 5 (1972) 309-311; the separation and the volumetric energy:
 Computational Inelasticity, ch. 9.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, Literal, NamedTuple
 

@@ -13,11 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from palpate.shared.arrays import Array, Numbers
 from palpate.shared.compiled import methods
-
-Array = NDArray[np.float64]
 
 
 @methods()
@@ -27,7 +25,7 @@ class SurfaceQuadrature(NamedTuple):
     points: Array  # (g, 3) mm
     normals: Array  # (g, 3) outward unit normals
     areas: Array  # (g,) mm^2
-    nodes: NDArray[np.int32]  # (g, k) rows of the nodal vector that a point feeds
+    nodes: Numbers  # (g, k) rows of the nodal vector that a point feeds
     shape: Array  # (g, k) shape functions
 
     def between(self, a, b):

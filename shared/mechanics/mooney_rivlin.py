@@ -16,10 +16,8 @@ Mooney, J. Appl. Phys. 11 (1940) 582-592; Rivlin, Phil. Trans. R. Soc. A 241 (19
 separation and the volumetric energy: Simo & Hughes, Computational Inelasticity, ch. 9.
 """
 
-from __future__ import annotations
-
 import math
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
@@ -109,7 +107,7 @@ class MooneyRivlinTissue(Tissue):
         return 4.0 * (self.c10 + self.c01) * (1.0 + self.poisson)
 
     @model_validator(mode="after")
-    def _both_invariants_stay_stiff(self) -> MooneyRivlinTissue:
+    def _both_invariants_stay_stiff(self) -> Self:
         """Relaxation takes the share of ``mu`` from the first invariant alone."""
         most = self.c10 / (self.c10 + self.c01)
         if not sum(share for share, _ in self.prony) < most:

@@ -9,8 +9,6 @@ With ``J = det F``::
 Taylor, FEAP Theory Manual, finite elasticity.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, Literal, NamedTuple
 

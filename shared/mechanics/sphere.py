@@ -24,20 +24,15 @@ that it can reach.  A point whose outward normal (at rest) faces away from the t
 feel it: it belongs to the far side of a thin wall.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from palpate.shared.arrays import Array, Flags, Ints, Numbers
 from palpate.shared.compiled import room
 from palpate.shared.geometry.elements import quadrilateral, shape
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int32]
 
 HARDNESS = 12000.0
 """Of the penalty, in units of Young's modulus over the tip's radius."""
@@ -79,10 +74,10 @@ class TipSurface(NamedTuple):
     """Faces that a tip can touch, with b blocks of ``BLOCK`` integration points each."""
 
     nodes: Array  # (n, 3) mm, at rest
-    faces: Ints  # (f, k) rows of ``nodes``
+    faces: Numbers  # (f, k) rows of ``nodes``
     shape: Array  # (b, k, BLOCK) shape functions at the points of a face
     corner_shape: Array  # (k, e) the same at the corners of blocks
-    corners: Ints  # (b, 4) those of each block
+    corners: Numbers  # (b, 4) those of each block
     reach: Array  # (f, b) mm^2, squared distance of all corners at which the tip misses the block
     areas: Array  # (f, b, BLOCK) mm^2
     normals: Array  # (f, b, 3, BLOCK) outward unit normals at rest
@@ -91,11 +86,11 @@ class TipSurface(NamedTuple):
 class Touching(NamedTuple):
     """What the tip does to the faces that it touches; room for f of them."""
 
-    face: Annotated[Ints, "f"]  # places in the list of faces looked at
+    face: Annotated[Numbers, "f"]  # places in the list of faces looked at
     force: Annotated[Array, "f, k, 3"]  # mN, on their nodes
     stiffness: Annotated[Array, "f, 3, 3, k, k"]  # mN/mm, second derivative in the nodes' places
     own: Annotated[Array, "3, 3"]  # mN/mm, in the place of the tip
-    touched: Annotated[NDArray[np.int64], "1"]  # number of faces
+    touched: Annotated[Ints, "1"]  # number of faces
     deepest: Annotated[Array, "1"]  # mm, largest penetration
     around: Annotated[Array, "k, 3"]  # scratch: nodes of a face from the tip's centre, mm
     gap: Annotated[Array, "4, block"]  # scratch: points of a block from there, squared distances
@@ -108,9 +103,7 @@ def tip_of(radius: float, young: float) -> Tip:
     return Tip(radius, HARDNESS * young / radius, ONSET * radius)
 
 
-def tip_surface(
-    nodes: Array, faces: Ints, accessible: NDArray[np.bool_], radius: float
-) -> TipSurface:
+def tip_surface(nodes: Array, faces: Numbers, accessible: Flags, radius: float) -> TipSurface:
     """Faces that a tip on the accessible ones can touch: those and their smooth continuation.
 
     Parameters
@@ -147,7 +140,7 @@ def tip_surface(
     )
 
 
-def _grid(nodes: Array, spacing: float) -> tuple[Array, Array, Ints]:
+def _grid(nodes: Array, spacing: float) -> tuple[Array, Array, Numbers]:
     """Blocks of equal cells of the reference face, at most ``spacing`` mm wide on any face.
 
     Returns
@@ -171,9 +164,7 @@ def _grid(nodes: Array, spacing: float) -> tuple[Array, Array, Ints]:
     return centres, np.stack(borders, axis=-1).reshape(-1, 2), np.stack(corners, -1).reshape(-1, 4)
 
 
-def _with_smooth_neighbours(
-    nodes: Array, faces: Ints, accessible: NDArray[np.bool_]
-) -> NDArray[np.int64]:
+def _with_smooth_neighbours(nodes: Array, faces: Numbers, accessible: Flags) -> Ints:
     """Accessible faces and those that share an edge with one at less than 45 degrees."""
     reference = quadrilateral(faces.shape[1])
     _, dN = shape(reference, reference[:4])

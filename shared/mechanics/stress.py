@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from palpate.shared.arrays import Array, Numbers
 from palpate.shared.mechanics import laws, viscosity
 from palpate.shared.mechanics.tensors import (
     FAST,
@@ -29,12 +30,12 @@ from palpate.shared.mechanics.tissue import Law
 class StressRecovery(NamedTuple):
     """What recovery needs of a mesh: 2x2x2 points per element."""
 
-    connectivity: NDArray[np.int32]  # (e, n)
+    connectivity: Numbers  # (e, n)
     gradients: NDArray[np.floating]  # (e, n, 3, 8) 1/mm: point index last, for vector arithmetic
-    extrapolation: NDArray[np.float64]  # (8, 8) corner from point
+    extrapolation: Array  # (8, 8) corner from point
     law: Law  # (e,)
-    elements_at: NDArray[np.float64]  # (nodes,) number of elements that share a corner node
-    midsides: NDArray[np.int32]  # (k, 3) midside node and the corners either side of it
+    elements_at: Array  # (nodes,) number of elements that share a corner node
+    midsides: Numbers  # (k, 3) midside node and the corners either side of it
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)

@@ -1,20 +1,15 @@
 """What tissue of every law is: its table in a scene, its parameters, its answer at rest."""
 
-from __future__ import annotations
-
 import math
-from typing import Annotated, Any, ClassVar, Protocol
+from typing import Annotated, Any, ClassVar, Protocol, Self
 
-import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from palpate.shared.arrays import Array
 from palpate.shared.mechanics.tensors import dot, trace, transposed
 from palpate.shared.part import Fraction, Part, Positive
-
-Array = NDArray[np.float64]
 
 INVERTED = math.inf
 """Energy returned where det F <= 0: a barrier every line search respects."""
@@ -62,7 +57,7 @@ class Tissue(Part):
     )
 
     @model_validator(mode="after")
-    def _some_stiffness_stays(self) -> Tissue:
+    def _some_stiffness_stays(self) -> Self:
         total = sum(share for share, _ in self.prony)
         if not total < 1.0:
             raise PydanticCustomError(

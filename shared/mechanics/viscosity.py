@@ -44,8 +44,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from palpate.shared.arrays import Array
 from palpate.shared.mechanics.tensors import (
     FAST,
     add,
@@ -65,8 +65,6 @@ from palpate.shared.mechanics.tensors import (
     unit,
 )
 from palpate.shared.mechanics.tissue import equivalent
-
-Array = NDArray[np.float64]
 
 
 class Weights(NamedTuple):

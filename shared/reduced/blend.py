@@ -5,16 +5,13 @@ Weights are cubic in that excess and fade with zero slope, so that answers are c
 of the place.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from palpate.shared.arrays import Array, Ints
 
 MAX_ACTIVE = 4
 """Local models blended at most; three meet at a corner of a Voronoi cell."""
@@ -23,7 +20,7 @@ MAX_ACTIVE = 4
 class Active(NamedTuple):
     """Local models that answer; the slot of a model is that in which a caller remembers it."""
 
-    number: Annotated[NDArray[np.int64], "slots"]  # -1 for a slot not in use
+    number: Annotated[Ints, "slots"]  # -1 for a slot not in use
     weight: Annotated[Array, "slots"]
     gradient: Annotated[Array, "slots, 3"]  # 1/mm, of the weights in the place
     distance: Annotated[Array, "p"]  # mm^2, squared, of all centres

@@ -1,14 +1,12 @@
 """Newton steps of a local model: by secants or by its tangent; see ``reduced.problem``."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from palpate.shared.arrays import Array, Field
 from palpate.shared.compiled import methods
 from palpate.shared.reduced.points import (
     FAST,
@@ -20,9 +18,6 @@ from palpate.shared.reduced.points import (
     lower_products,
     superpose,
 )
-
-Array = NDArray[np.float64]
-Field = NDArray[np.float32]
 
 LEAST_CURVATURE = 1e-2
 """Cosine between a step and the change of force it causes, below which it is not a secant."""

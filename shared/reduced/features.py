@@ -1,7 +1,5 @@
 """Polynomials in a load, in a position of the tip, and in their places on a local model."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

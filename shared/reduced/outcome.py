@@ -1,18 +1,15 @@
 """What a compiled query reads and writes; its outcome is one array, kept by one copy."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate.shared.arrays import Array
 from palpate.shared.geometry.surface import SurfaceIndex
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS
 from palpate.shared.reduced.blend import Active
 
-Array = NDArray[np.float64]
 Number = Any
 
 PRESS_FEATURES, TOUCH_FEATURES, HISTORY_FEATURES = 11, 10, 9

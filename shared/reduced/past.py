@@ -12,15 +12,13 @@ Stat. Assoc. 58 (1963) 236-244).  The new points' histories are the weighted sum
 drive them to, with the linear part corrected to the exact means.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from palpate.shared.arrays import Array, Field, Ints
 from palpate.shared.compiled import methods, room
 from palpate.shared.mechanics import viscosity
 from palpate.shared.mechanics.viscosity import Weights
@@ -39,9 +37,6 @@ from palpate.shared.reduced.points import (
     predict_points,
     superpose,
 )
-
-Array = NDArray[np.float64]
-Field = NDArray[np.float32]
 
 KNOTS = 8
 """Of the path of answers; the last is the last answer."""
@@ -140,7 +135,7 @@ class Elastic(NamedTuple):
 class Step(NamedTuple):
     """What the past does at the end of a time step, and working memory; see ``problem``."""
 
-    model: Annotated[NDArray[np.int64], "1"]  # that it is known of
+    model: Annotated[Ints, "1"]  # that it is known of
     mean: Annotated[Array, "r"]  # h
     exerted: Annotated[Array, "r"]  # D h
     loss: Annotated[Array, "1"]  # l

@@ -4,15 +4,13 @@ Points lie in *tiles* of ``LANES``: the nine components of a gradient or stress 
 ``LANES`` points each, so that loops over the points of a tile compile to vector code.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from palpate.shared.arrays import Array, Field
 from palpate.shared.compiled import methods
 from palpate.shared.mechanics import tissue, viscosity
 from palpate.shared.mechanics.tensors import (
@@ -38,9 +36,6 @@ from palpate.shared.mechanics.tensors import (
     unpacked,
 )
 from palpate.shared.mechanics.tissue import Law
-
-Array = NDArray[np.float64]
-Field = NDArray[np.float32]
 
 LANES = 16
 """Points in a tile: two vectors of single precision, so that their latencies overlap."""

@@ -19,15 +19,13 @@ Between the centres the answers of the nearest local models are blended (``reduc
 array of mesh size is touched to solve a query.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from palpate.shared.arrays import Array, Field, Ints
 from palpate.shared.compiled import bind_compiled
 from palpate.shared.geometry.surface import locate
 from palpate.shared.mechanics import newton
@@ -38,10 +36,6 @@ from palpate.shared.reduced.features import estimate_errors, load_features, log_
 from palpate.shared.reduced.points import FAST, Points, back_substitute, cholesky, superpose
 from palpate.shared.reduced.problem import Problem, Work, newton_method
 from palpate.shared.reduced.terms import Dead
-
-Array = NDArray[np.float64]
-Field = NDArray[np.float32]
-Ints = NDArray[np.int64]
 
 TOLERANCE, TOLERANCE_IN_TIME = 1.5e-3, 2e-3
 """Residual at equilibrium relative to load and past: in the energy norm of the rest state both are

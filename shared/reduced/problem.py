@@ -22,20 +22,14 @@ correction by the inverse tangent that ``Secants`` make up or by a factorised ``
 further past, load or correction is a named tuple with the same methods.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Any, NamedTuple
 
-import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from palpate.shared.arrays import Array, Field
 from palpate.shared.compiled import methods
 from palpate.shared.mechanics import newton, tissue
 from palpate.shared.reduced.points import Points, added_energy, nonlinear_stress, project
-
-Array = NDArray[np.float64]
-Field = NDArray[np.float32]
 
 
 class Work(NamedTuple):

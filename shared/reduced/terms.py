@@ -1,19 +1,14 @@
 """Loads of a local model as terms of its potential; see ``reduced.problem``."""
 
-from __future__ import annotations
-
 from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from palpate.shared.arrays import Array, Field, Numbers
 from palpate.shared.compiled import methods
 from palpate.shared.mechanics import sphere
 from palpate.shared.reduced.points import FAST, back_substitute, distance
-
-Array = NDArray[np.float64]
-Field = NDArray[np.float32]
 
 
 @methods()
@@ -53,10 +48,10 @@ class Contact(NamedTuple):
     tip: sphere.Tip
     surface: sphere.TipSurface
     x: Array  # (3,) mm, centre of the tip
-    nodes: NDArray[np.int32]  # (s,) of the surface
+    nodes: Numbers  # (s,) of the surface
     modes: Field  # (s, 3, r) mm
-    faces: NDArray[np.int32]  # (t,) of the surface
-    corners: NDArray[np.int32]  # (t, k) their nodes, counted from the model's first
+    faces: Numbers  # (t,) of the surface
+    corners: Numbers  # (t, k) their nodes, counted from the model's first
     work: ContactWork
 
     def push(self, q, residual):

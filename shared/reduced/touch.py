@@ -14,15 +14,13 @@ tissue remembers, or from a polynomial in place and depth.  Forces of neighbouri
 blended; the tangent has the derivatives of the weights, too.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from palpate.shared.arrays import Array, Field, Ints, Numbers
 from palpate.shared.compiled import bind_compiled
 from palpate.shared.geometry.surface import UPRIGHT, locate
 from palpate.shared.mechanics import newton
@@ -45,10 +43,6 @@ from palpate.shared.reduced.features import (
 from palpate.shared.reduced.points import Points, project
 from palpate.shared.reduced.problem import Problem, Work
 from palpate.shared.reduced.terms import Contact, ContactWork, reaction
-
-Array = NDArray[np.float64]
-Field = NDArray[np.float32]
-Ints = NDArray[np.int64]
 
 LEAST_SHARE = 0.1
 """Weight of a model below which its residual may not be larger still: that counts by weight."""
@@ -76,13 +70,13 @@ class TouchModels(NamedTuple):
     tip: Tip
     surface: TipSurface
     node_from: Ints  # (p + 1,)
-    nodes: NDArray[np.int32]  # (s,) of the surface, near the model
+    nodes: Numbers  # (s,) of the surface, near the model
     modes: Field  # (s, 3, r) mm
     face_from: Ints  # (p + 1,)
-    faces: NDArray[np.int32]  # (t,) of the surface, near the model
-    corners: NDArray[np.int32]  # (t, k) their nodes, counted from the model's first
+    faces: Numbers  # (t,) of the surface, near the model
+    corners: Numbers  # (t, k) their nodes, counted from the model's first
     neighbour_from: Ints  # (p + 1,)
-    neighbours: NDArray[np.int32]  # (o,) models whose answers can be projected
+    neighbours: Numbers  # (o,) models whose answers can be projected
     transfer: Field  # (o, r, r) from their modes to the model's
     residuals: Array  # (p, RESIDUAL_FEATURES) log of the residual; the load is the depth
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from palpate.shared.arrays import Array, Field, Numbers
 from palpate.shared.reduced.features import estimate_errors
 from palpate.shared.reduced.outcome import HISTORY_FEATURES
 from palpate.shared.reduced.past import Memory, Remembering, opened, recall_points, remembering
@@ -23,8 +23,6 @@ from palpate.shared.reduced.past import Memory, Remembering, opened, recall_poin
 if TYPE_CHECKING:
     from palpate.shared.reduced.workspace import Workspace
 
-Array = NDArray[np.float64]
-Field = NDArray[np.float32]
 
 FORGOTTEN = 1e-3
 """Size of what is left behind, over the largest, below which it is dropped."""
@@ -135,7 +133,7 @@ class Transfer:
     def __init__(
         self,
         deviatoric: Field,
-        pairs: NDArray[np.int32],
+        pairs: Numbers,
         matrices: Field,
         prony: Sequence[tuple[float, float]],
         points: int,

@@ -4,15 +4,13 @@ It is disposable: without it an answer is sought from the trained first guess.  
 itself remembers is a value of its own, ``transfer.Past``.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate.shared.arrays import Array
 from palpate.shared.compiled import bind, room
 from palpate.shared.geometry.surface import SurfaceIndex
 from palpate.shared.mechanics.sphere import BLOCK
@@ -31,8 +29,6 @@ from palpate.shared.reduced.past import Elastic, Remembering
 from palpate.shared.reduced.points import LANES, STATE
 from palpate.shared.reduced.press import PressModels, PressScratch, PressWarm
 from palpate.shared.reduced.touch import TouchModels, TouchScratch, TouchWarm
-
-Array = NDArray[np.float64]
 
 
 class Workspace:
