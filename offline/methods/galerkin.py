@@ -108,7 +108,7 @@ def _step(content, nodes, forces, accurate):
         problem, q, work, target, np.inf, MAX_ITERATIONS, True, ROUND_OFF
     )
     if status == newton.CONVERGED:
-        past.end_step(points, content.work, 0, q)
+        past.end_step(points, content.work, 0, q, False)
         return True
     forget_secants(secants.inverse, secants.origin)
     return False

@@ -31,7 +31,6 @@ from palpate.shared.reduced.points import (
     add_past_increments,
     add_past_stress,
     contract,
-    distance,
     drive_points,
     increments,
     predict_points,
@@ -40,11 +39,6 @@ from palpate.shared.reduced.points import (
 
 KNOTS = 8
 """Of the path of answers; the last is the last answer."""
-
-
-CORRECTED = 5e-3
-"""Change of an answer, relative to it, that its last correction may make without points being
-evaluated again: what is linear in the displacement does not need them."""
 
 
 class Memory(NamedTuple):
@@ -90,7 +84,7 @@ class Elastic(NamedTuple):
     def begin_step(self, mu, k, slot):
         """Nothing is known."""
 
-    def end_step(self, points, work, slot, q):
+    def end_step(self, points, work, slot, q, again):
         """Nothing is remembered."""
 
     def last_answer(self, slot, q):
@@ -167,10 +161,13 @@ class Remembering(NamedTuple):
         superpose(self.deviatoric[k], step.mean, step.exerted)
         step.model[0] = k
 
-    def end_step(self, points, work, slot, q):
-        """Take the memory of a slot to the end of a step that ``q`` is the answer of."""
+    def end_step(self, points, work, slot, q, again):
+        """Take the memory of a slot to the end of a step that ``q`` is the answer of.
+
+        Points that are not evaluated ``again`` keep the strains of the last evaluation.
+        """
         memory, time, driven, linear = memory_of(self, slot), self.time, self.step.B, self.step.S
-        if distance(q, work.latest) > CORRECTED**2:  # the last evaluation was of another model
+        if again:
             points.strain(q, work.stepped, work.H)
         drive_points(work.H, driven, linear)
         viscosity.advance(driven, time, memory.points)

@@ -271,7 +271,7 @@ def _solve(solver, k, slot):
     if found and past.in_time:
         problem.correct(scratch.newton[0], scratch.newton[1])
         q += scratch.newton[1]
-        past.end_step(problem.points, scratch.work, slot, q)
+        past.end_step(problem.points, scratch.work, slot, q, False)
     past.note_answer(q, attempt == 0, warm.past[slot], missed)
     length = departure = 0.0
     for i in range(len(q)):

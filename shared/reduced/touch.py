@@ -311,7 +311,7 @@ def _remember(solver, x):
                 warm.q[slot] = scratch.q[slot]
                 warm.slope[slot] = scratch.slope[slot]
                 points = solver.models.points.of(k)
-                solver.past.end_step(points, scratch.work, slot, scratch.q[slot])
+                solver.past.end_step(points, scratch.work, slot, scratch.q[slot], True)
             elif k != warm.number[slot]:
                 warm.formed[slot] = np.inf  # of another model, or far off
     if found:

@@ -51,7 +51,7 @@ def begin(past, mu):
 
 @njit(cache=True)
 def end(past, points, work, q):
-    past.end_step(points, work, 0, q)
+    past.end_step(points, work, 0, q, True)
 
 
 @njit(cache=True)
