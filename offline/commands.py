@@ -273,8 +273,8 @@ def chart(scene: str, artifact: Path | None, **settings: Any) -> Report:
     """Set speed and accuracy of many methods side by side.
 
     Some learn from full solutions of SNAPSHOTS random loads; all answer the QUERIES that palpate
-    validate asks with this seed, on one core. Table, picture and page go to NAME/report/chart.csv,
-    .png and .html beside the artifact. Takes half an hour; a stopped run continues where it was.
+    validate asks with this seed, on one core. Table and picture go to NAME/report/chart.csv and
+    .png beside the artifact. Takes half an hour; a stopped run continues where it was.
     """
     from palpate.offline.scenes import default_artifact, find_scene
     from palpate.offline.studies.chart import chart
@@ -293,8 +293,8 @@ def chart_in_time(artifact: Path, histories: int, snapshots: int, seed: int) -> 
     """Set speed and accuracy of methods over histories side by side.
 
     The visco-elastic artifact, its twin without memory, the full model and Galerkin models in
-    modal, Ritz and POD bases answer the HISTORIES that palpate validate asks with this seed. Table,
-    picture and page go to NAME/report/chart_in_time.csv, .png and .html beside the artifact.
+    modal, Ritz and POD bases answer the HISTORIES that palpate validate asks with this seed. Table
+    and picture go to NAME/report/chart_in_time.csv and .png beside the artifact.
     """
     from palpate.offline.studies.chart import chart
 

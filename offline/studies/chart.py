@@ -143,7 +143,6 @@ def chart(
     report = artifact.parent / atlas.name / "report"
     write_csv(report / f"{layout.name}.csv", rows)
     drawing.draw(report / f"{layout.name}.png", rows, atlas.scene, layout)
-    drawing.write_page(report / f"{layout.name}.html", rows, atlas.scene, layout)
     checkpoint.remove()
     return _summary(rows) | {"without_equilibrium": queries - len(asked)}
 

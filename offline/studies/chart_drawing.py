@@ -1,4 +1,4 @@
-"""The speed-accuracy chart as a picture and as a page to explore.
+"""The speed-accuracy chart as a picture.
 
 Colours stand for groups of methods (palette of Okabe and Ito, safe for colour-blind eyes), markers
 for the methods of a group; a line joins the sizes of one method.
@@ -33,11 +33,6 @@ STATISTICS = ("median", "p95", "max")
 
 ACCENT, DARK_ACCENT = "#D55E00", "#A34700"
 """Of what is Palpate's; the second for letters."""
-
-PAGE_MARKERS = {
-    "o": "circle", "s": "square", "^": "triangle-up", "D": "diamond", "*": "star", "P": "cross",
-}  # fmt: skip
-"""Plotly's names of Matplotlib's markers."""
 
 
 class Look(NamedTuple):
@@ -269,71 +264,3 @@ def _draw_legend(axes: Axes, rows: Sequence[Row]) -> None:
             text.set_fontweight("bold")
     for artist in (legend, words):
         artist.set_in_layout(False)
-
-
-# --- page ----------------------------------------------------------------------------------------
-
-
-def write_page(path: Path, rows: Sequence[Row], scene: Scene, layout: Layout) -> None:
-    """Write the chart as a page that needs no network: every point tells its figures."""
-    from plotly.subplots import make_subplots
-
-    down, across = layout.grid
-    titles = [f"<b>{panel.title}</b>" for panel in layout.panels]
-    figure = make_subplots(down, across, subplot_titles=titles)
-    dashed = {"color": "#404040", "width": 1, "dash": "dash", "shape": "hv"}
-    for number, panel in enumerate(layout.panels):
-        where = {"row": 1 + number // across, "col": 1 + number % across}
-        kept, front = panel.plotted(rows), pareto(panel.plotted(rows), panel.error)
-        for look, own in looks(rows):
-            known = [row for row in own if row in kept]
-            named = panel is layout.panels[-1]
-            figure.add_scatter(**_points(known, panel), **_style(look), showlegend=named, **where)
-        line = {"mode": "lines", "line": dashed, "showlegend": False, "hoverinfo": "skip"}
-        figure.add_scatter(**_points(front, panel) | {"error_y": None} | line, **where)
-        title = f"time per {layout.per} on one core"
-        figure.update_xaxes(type="log", title=title, tickformat="~s", ticksuffix="s", **where)
-        figure.update_yaxes(type="log", title=panel.axis, tickformat="~%", **where)
-        if panel.field != "refined":
-            left, bottom = (min(row[x] for row in kept) / 2 for x in ("time_us", panel.error))
-            figure.add_shape(
-                type="rect", x0=1e-6 * left, x1=scene.budget.query, y0=bottom,
-                y1=getattr(scene.tolerance, panel.field),
-                fillcolor=ACCENT, opacity=0.12, line_width=0, **where,
-            )  # fmt: skip
-    title, height = TITLE.format(scene.name), 500 * down
-    figure.update_layout(title=title, template="plotly_white", height=height)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.write_html(path, include_plotlyjs=True)
-
-
-def _points(rows: Sequence[Row], panel: Panel) -> dict[str, Any]:
-    """Times and errors of points of the page, up to the largest, and all that is known of them."""
-    above = [row[f"{panel.field}_max"] - row[panel.error] for row in rows]
-    return {
-        "x": [1e-6 * row["time_us"] for row in rows],
-        "y": [row[panel.error] for row in rows],
-        "error_y": {"array": above, "arrayminus": [0.0] * len(above), "thickness": 0.6, "width": 0},
-        "text": [_hover(row, panel.field) for row in rows],
-    }
-
-
-def _style(look: Look) -> dict[str, Any]:
-    return {
-        "mode": "lines+markers",
-        "line": {"color": look.colour, "width": 1},
-        "name": look.name,
-        "legendgroup": look.group,
-        "legendgrouptitle": {"text": look.group},
-        "hovertemplate": f"<b>{look.name}</b><br>%{{text}}<extra></extra>",
-        "marker": {"symbol": PAGE_MARKERS[look.marker], "size": max(look.size, 9.0)},
-        "zorder": look.above,
-    }
-
-
-def _hover(row: Row, field: str) -> str:
-    errors = [f"{percent(row[f'{field}_{name}'])} ({name})" for name in STATISTICS]
-    return (
-        f"{row['label']}; {row['unknowns']} unknowns<br>{duration(1e-6 * row['time_us'])}<br>"
-        f"error {', '.join(errors)}<br>{row['unconverged']} queries without an answer"
-    )
