@@ -38,11 +38,12 @@ from palpate.offline.fem.terms import DeadLoad
 from palpate.offline.reduce.ritz import energy_pod, ritz_vectors
 from palpate.offline.reduce.sampling import cone, random_points_and_rim, tangents
 from palpate.offline.run.streams import Stage
+from palpate.offline.validate.queries import Place
 from palpate.shared.answer import Answer
 from palpate.shared.errors import QueryError
 from palpate.shared.local_models import Estimators, LocalModels
 from palpate.shared.mechanics import newton
-from palpate.shared.mechanics.footprint import TIP_DEPTH, pressure_limit
+from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.model import ReducedModel
 
 Array = NDArray[np.float64]
@@ -266,25 +267,19 @@ def path_independent_share(model: ReducedModel, x: Array, turn: float = 0.0) -> 
 
 def _depends_on_way(model: ReducedModel, x: Array, share: float, turn: float) -> bool:
     """Whether a tip that comes sliding finds another equilibrium than one pressed in."""
-    pressed = model.touch(_over(model, x, share))
+    pressed = model.touch(Place.at(model, x).touch(share).position)
     state = model.new_warm()
     for angle in turn + 2.0 * np.pi * np.arange(WAYS) / WAYS:
         state.forget()
         slid = None
         for place in reversed(_way(model, x, angle)):
             try:
-                slid = model.touch(_over(model, place, share), warm=state)
+                slid = model.touch(Place.at(model, place).touch(share).position, warm=state)
             except QueryError:  # in a fold the tip's centre can be below the other side
                 continue
         if slid is not None and _apart(pressed, slid):
             return True
     return False
-
-
-def _over(model: ReducedModel, x: Array, share: float) -> Array:
-    """Centre of a tip pressed in at a point of the surface by a share of the depth limit."""
-    x, normal, _, fields = model.surface.locate(x, model.limits)
-    return x + (model.scene.endoscope.radius - share * fields[TIP_DEPTH]) * normal
 
 
 def _way(model: ReducedModel, x: Array, angle: float) -> list[Array]:
@@ -316,9 +311,9 @@ def _largest_load(
     model: ReducedModel, i: int, point: Array, rng: np.random.Generator
 ) -> tuple[Array, Array, float]:
     """Contact, direction and largest pressure of a load, every other one at the largest tilt."""
-    x, normal, _, fields = model.surface.locate(point, model.limits)
-    direction = cone(normal, model.scene.endoscope.max_tilt, 1, rng, border=i % 2 == 0)[0]
-    return x, direction, pressure_limit(fields, normal, direction)
+    place = Place.at(model, point)
+    direction = cone(place.normal, model.scene.endoscope.max_tilt, 1, rng, border=i % 2 == 0)[0]
+    return place.position, direction, place.limit(direction)
 
 
 def _contact(

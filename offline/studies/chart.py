@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -71,8 +72,8 @@ REPEATS = 3
 SLOW = 100e-3  # seconds of a step beyond which it is timed only once
 
 
-Queries = Sequence[tuple[Steps, Fields]]
-"""What methods are asked, and the full model's answers."""
+Queries = Sequence[tuple[Steps, Fields, Array | None]]
+"""What methods are asked, the full model's answers, and displacements (n, 3) in a refined mesh."""
 
 
 def chart(
@@ -130,13 +131,14 @@ def chart(
     loads = [] if scene is None else [steps[0][0].contacts[0] for steps, _ in asked]
     tasks = {"refined": [(full.refined, scene, REFINEMENT, x) for x in loads[:REFINED_LOADS]]}
     finer = full.in_parallel(artifact, checkpoint, "refined mesh", tasks)["refined"]
+    questions = [(*query, fine) for query, fine in zip_longest(asked, finer)]
     training = Training(problem, full.snapshots(learnt), atlas, seed, in_time)
     measured: dict[str, Mapping[str, Any]] = {}
     # in this process: times are those of one core, and methods share what they learn from
     for name, size in tqdm([(name, size) for name, sizes in plan.items() for size in sizes]):
         key = f"{name} {size:g}"
         if key not in checkpoint:
-            checkpoint.store(key, measure(training, asked, finer, name, size))
+            checkpoint.store(key, measure(training, questions, name, size))
         measured[key] = checkpoint.load(key)
     usual = float(np.median([np.median(found["beside"]) for found in measured.values()]))
     rows = [_row(key, found, usual) for key, found in measured.items()]
@@ -150,9 +152,7 @@ def chart(
 # --- measuring -----------------------------------------------------------------------------------
 
 
-def measure(
-    training: Training, queries: Queries, finer: Sequence[Array], name: str, size: float
-) -> dict[str, Any]:
+def measure(training: Training, queries: Queries, name: str, size: float) -> dict[str, Any]:
     """Build a method and have it answer the queries.
 
     Errors (``displacement``, ``von_mises``, ``refined``) are by query, nan where nothing is known,
@@ -161,12 +161,11 @@ def measure(
     problem = training.problem
     method, yardstick = build(name, size, training), build("artifact", 1, training)
     other_mesh = type(method) is Remeshed
-    if other_mesh:
-        queries = queries[: len(finer)]
+    queries = [query for query in queries if query[2] is not None or not other_mesh]
     for one in (method, yardstick):  # compiled code comes in from disk
         one.step(one.at_rest(), *queries[0][0][0])
     errors, times, unconverged = np.ones((len(queries), 3)), [], 0
-    for i, (steps, exact) in enumerate(queries):
+    for i, (steps, exact, finer) in enumerate(queries):
         states, seconds, missed = play(method, steps)
         times.append(seconds[_pressing(steps)])
         unconverged += missed > 0
@@ -176,10 +175,9 @@ def measure(
                 elastic = Full(full.of_tissue(problem, prony=()))
                 exact = Fields.of(elastic, play(elastic, steps)[0])
             errors[i, :2] = fields.errors(problem, exact)
-            if i < len(finer):
-                errors[i, 2] = relative(fields.displacements[-1], finer[i])
-    known = [bool(np.isfinite(u).all()) for u in finer] + [False] * (len(queries) - len(finer))
-    errors[~np.array(known), 2] = np.nan
+            if finer is not None:
+                errors[i, 2] = relative(fields.displacements[-1], finer)
+    errors[[finer is None for *_, finer in queries], 2] = np.nan
     if other_mesh:
         errors[:, :2] = np.nan
     least, beside = _times(method, yardstick, queries, np.concatenate(times))
@@ -210,7 +208,7 @@ def _times(
     """Seconds that a method needs for each step, and the yardstick in turns with it."""
 
     def run(one: Method) -> Array:
-        return np.concatenate([play(one, steps)[1][_pressing(steps)] for steps, _ in queries])
+        return np.concatenate([play(one, steps)[1][_pressing(steps)] for steps, *_ in queries])
 
     times, beside = first, run(yardstick)
     slow = np.median(first) > SLOW

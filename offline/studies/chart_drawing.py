@@ -132,7 +132,6 @@ MESH_PANEL = Panel(
 )  # fmt: skip
 OF_LOADS = Layout("chart", "query", (*FIELD_PANELS, MESH_PANEL), (2, 2))
 IN_TIME = Layout("chart_in_time", "step", FIELD_PANELS, (1, 3))
-TITLE = "Speed and accuracy of methods on the scene {!r}: lower left is better"
 NOTE = """\
 A point is a method of one size; a line joins its sizes.
 Errors are relative L2 norms against the full model over
@@ -159,7 +158,8 @@ def draw(path: Path, rows: Sequence[Row], scene: Scene, layout: Layout) -> None:
     down, across = layout.grid
     figure = Figure(figsize=(6.25 * across, 5.4 * down), layout="constrained")
     grid = figure.subplots(down, across).ravel()
-    figure.suptitle(TITLE.format(scene.name), fontsize=15, fontweight="bold")
+    title = f"Speed and accuracy of methods on the scene {scene.name!r}: lower left is better"
+    figure.suptitle(title, fontsize=15, fontweight="bold")
     for axes, panel in zip(grid, layout.panels, strict=False):
         _draw_panel(axes, panel, rows, layout.per)
         _draw_goals(axes, panel, rows, scene, layout.per)
@@ -219,16 +219,15 @@ def _draw_goals(axes: Axes, panel: Panel, rows: Sequence[Row], scene: Scene, per
 def _draw_names(axes: Axes, panel: Panel, rows: Sequence[Row]) -> None:
     kept = panel.plotted(rows)
     twin = [row["time_us"] for row in kept if row["key"] == TWIN]
-    for look, own in looks(kept):
-        for row in own:
-            at = time, error = row["time_us"], row[panel.error]
-            if row["key"] in NAMES:
-                text, offset, side = NAMES[row["key"]]
-                _write(axes, text, at, offset, ha=side, color=look.colour)
-            elif row["key"] == SHIPPED:
-                text = f"Palpate: {percent(error)}\nin {duration(1e-6 * time)}"
-                text += "".join(f",\n{time / x:.1f} x that without memory" for x in twin)
-                _write(axes, text, at, (12, -32), color=DARK_ACCENT, fontweight="bold")
+    for row in kept:
+        at = time, error = row["time_us"], row[panel.error]
+        if row["key"] in NAMES:
+            text, offset, side = NAMES[row["key"]]
+            _write(axes, text, at, offset, ha=side, color=LOOKS[row["family"]].colour)
+        elif row["key"] == SHIPPED:
+            text = f"Palpate: {percent(error)}\nin {duration(1e-6 * time)}"
+            text += "".join(f",\n{time / x:.1f} x that without memory" for x in twin)
+            _write(axes, text, at, (12, -32), color=DARK_ACCENT, fontweight="bold")
 
 
 def _write(

@@ -127,13 +127,11 @@ def _remeshed(text: str, folder: Path | None, factor: float) -> Remeshed:
     return Remeshed(FullProblem(parse_scene(text, folder)), factor)
 
 
-def refined(problem: FullProblem, scene: Scene, factor: float, load: Load) -> Array:
-    """Displacement (n, 3) mm of a scene's nodes in a finer mesh, nan without an equilibrium.
+def refined(problem: FullProblem, scene: Scene, factor: float, load: Load) -> Array | None:
+    """Displacement (n, 3) mm of a scene's nodes in a finer mesh, if there is an equilibrium.
 
     A task for ``run.workers``.
     """
     method = _remeshed(scene.text, scene.folder, factor)
     answer = method.solve(Case.of(problem, load))
-    if answer.converged:
-        return method.displacement(answer.state)
-    return np.full((len(problem.mesh.nodes), 3), np.nan)
+    return method.displacement(answer.state) if answer.converged else None

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from palpate.offline.fem.norms import relative, statistics
 from palpate.offline.fem.problem import FullProblem, Load, Reference, Step
 from palpate.offline.run.tables import write_csv
-from palpate.offline.run.workers import completed, open_artifact, worker_pool
+from palpate.offline.run.workers import open_artifact, run, worker_pool
 from palpate.offline.validate.queries import LOADS, Kind, held_out
 from palpate.shared.answer import Answer
 from palpate.shared.artifact import read_artifact
@@ -274,18 +274,19 @@ def against_full(
     """
     model, problem = opened(artifact, kind)
     queries = kind.random(model, count, held_out(model, seed))
-    tasks = {str(i): reference_task(model, query) for i, query in enumerate(queries)}
-    rows = {}
+    tasks = [reference_task(model, query) for query in queries]
     with worker_pool(open_artifact, artifact) as pool:
-        for name, full in tqdm(completed(pool, tasks), "full solutions", count):
-            if full is not None:
-                rows[int(name)] = compare(kind, problem, model, queries[int(name)], full)
+        solved = tqdm(pool.map(run, *zip(*tasks, strict=True)), "full solutions", count)
+        rows = [
+            compare(kind, problem, model, query, full)
+            for query, full in zip(queries, solved, strict=True)
+            if full is not None
+        ]
     if not rows:
         raise PalpateError(f"{artifact}: the full model has no equilibrium under any of the loads")
-    ordered = [rows[i] for i in sorted(rows)]
     if csv:
-        write_rows(csv, kind, ordered)
-    return summarise(kind, ordered) | {"without_equilibrium": count - len(ordered)}
+        write_rows(csv, kind, rows)
+    return summarise(kind, rows) | {"without_equilibrium": count - len(rows)}
 
 
 def reference_task(model: ReducedModel, query: Sequence[Step]) -> tuple[Any, ...]:
