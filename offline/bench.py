@@ -4,8 +4,6 @@ A query's time is that of ``ReducedModel.press`` as a caller sees it, from a pos
 answer with its error estimate; fields are recovered after a cold query of their own.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Sequence

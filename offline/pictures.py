@@ -5,8 +5,6 @@ rest.  The endoscope is drawn as a ball of the footprint's radius on a shaft, as
 deformed surface lets it: the model knows its pressure only.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -4,8 +4,6 @@ The file is VTK's XML (.vtu), which ParaView and its kin read: VTK file formats,
 https://docs.vtk.org/en/latest/design_documents/VTKFileFormats.html
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from base64 import b64encode

@@ -9,8 +9,6 @@
 Every finished task is on disk before it counts; see ``run.workers``.
 """
 
-from __future__ import annotations
-
 import os
 import platform
 import subprocess

@@ -5,8 +5,6 @@ twice their divisions.  In linear elasticity: that costs one factorisation each,
 footprint the mesh's error is much the same there as under large loads.
 """
 
-from __future__ import annotations
-
 import re
 import sys
 from typing import Any

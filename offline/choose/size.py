@@ -6,13 +6,11 @@ says where to begin, and each trial how far from there to go on: a loose toleran
 pay for trials of large models.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,7 +103,7 @@ class Trial:
     solve_us: float
 
     @classmethod
-    def of(cls, size: Size, results: Sequence[TrialResult]) -> Trial:
+    def of(cls, size: Size, results: Sequence[TrialResult]) -> Self:
         """Gather the results of the patches, without the one of the largest error.
 
         Where the tissue gives way the load range is lowered only after training: loads beyond that

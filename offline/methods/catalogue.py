@@ -4,8 +4,6 @@ A new method is a file in this folder and a line in ``BUILDERS``.  ``Training`` 
 learn from, and computes what several of them share only once.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial

@@ -1,7 +1,5 @@
 """The full model as a method, on the scene's mesh and on others: exact on its mesh, and slow."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix

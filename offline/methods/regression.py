@@ -1,7 +1,5 @@
 """Methods that solve nothing: the linear response, and regression on full solutions."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 

@@ -4,8 +4,6 @@ It finds the contact and its load by itself; the other methods are given them.  
 contact at a time and refuses several.
 """
 
-from __future__ import annotations
-
 from typing import Any, Literal
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Training of one local model: modes, cubature, first guess and first tangent."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple

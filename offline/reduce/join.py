@@ -1,7 +1,5 @@
 """From tables of one local model each to those of all, and what neighbours have in common."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any, TypeVar

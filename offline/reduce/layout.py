@@ -1,7 +1,5 @@
 """Where local models, their regions and the footprints that they learn from lie on the surface."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -18,8 +18,6 @@ the tip came: reduced and full model need not part from the same one at the same
 model is asked everywhere whether its answers depend on the way, and depths are lowered likewise.
 """
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Callable, Iterable
 from functools import lru_cache

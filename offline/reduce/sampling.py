@@ -1,7 +1,5 @@
 """Space-filling points and loads on a surface."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

@@ -9,8 +9,6 @@ a kill, a result is there or it is not.  The folder is named by a hash of everyt
 depend on, so stale ones are never read.
 """
 
-from __future__ import annotations
-
 import hashlib
 import multiprocessing
 import os

@@ -19,8 +19,6 @@ of the same local models at the same loads.  They are compared with the full mod
 answers at once, and show what memory costs.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from itertools import zip_longest

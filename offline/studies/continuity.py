@@ -1,7 +1,5 @@
 """Whether the answer changes smoothly as the contact glides, step by step beside the full model."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -5,8 +5,6 @@ holds the last report of each, with the commit and the day it was made at.  In a
 ``{displacement/mean|p95:%}`` stands for two entries of the report's ``displacement`` in percent.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

@@ -7,8 +7,6 @@ The same holds where a load that was raised beyond the range and lowered again l
 elsewhere than one raised from nothing: there the right answer is the one that the path led to.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -7,8 +7,6 @@ the nodes happen to lie.  Another fine mesh says how far the reference can be tr
 edge slows every element's convergence, so that a few per cent between fine meshes remain.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, NamedTuple
 

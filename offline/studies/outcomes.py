@@ -6,8 +6,6 @@ is told apart and counted with the others: where a load has several equilibria, 
 path does not lead to.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence

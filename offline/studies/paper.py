@@ -29,8 +29,6 @@ largest value in the history.  On the cube the relaxed tissue is softer and woul
 the pressure is smaller by the share of the shear modulus that is lost.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import itemgetter

@@ -1,7 +1,5 @@
 """Charts and contours of ``offline.studies.paper``; the contours need the extra ``pictures``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,13 +1,11 @@
 """Full solutions that studies learn from and compare with, computed by worker processes."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,14 +31,14 @@ class Fields(NamedTuple):
     stresses: NDArray[Any]  # (t, n) kPa
 
     @classmethod
-    def of(cls, method: Method, states: Sequence[Any]) -> Fields:
+    def of(cls, method: Method, states: Sequence[Any]) -> Self:
         """Recover the fields of a method's states."""
         return cls(
             np.array([method.displacement(state) for state in states]),
             np.array([method.von_mises(state) for state in states]),
         )
 
-    def errors(self, problem: FullProblem, exact: Fields) -> tuple[float, float]:
+    def errors(self, problem: FullProblem, exact: Self) -> tuple[float, float]:
         """Relative L2 errors over the moments and all nodes, or those beyond the clamped layer."""
         kept = problem.beyond_clamped_layer
         u, s = (field.astype(float) for field in exact)

@@ -1,7 +1,5 @@
 """Press, hold, release: the depth of the dent and the force over time, of both models."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

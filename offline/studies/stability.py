@@ -11,8 +11,6 @@ start from its last answer: no other method is asked under a moving tool.  In ti
 Galerkin models with every quadrature point and the full model in larger steps.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

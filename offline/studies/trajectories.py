@@ -6,8 +6,6 @@ periods repeat.  Then only the ends are compared.  Each kind is tried with footp
 scene has one, with the rigid tip, in the same places.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache, partial
 

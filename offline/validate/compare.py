@@ -4,8 +4,6 @@ A query is a list of time steps; without time its length is one.  The errors fou
 reduced model's estimate of them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,9 +1,7 @@
 """Random queries of every kind, over the whole surface and range of loads."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +39,7 @@ class Place(NamedTuple):
     radius: float  # mm, of the endoscope
 
     @classmethod
-    def at(cls, model: ReducedModel, point: Array) -> Place:
+    def at(cls, model: ReducedModel, point: Array) -> Self:
         """The place nearest to a point (3,) mm."""
         x, normal, _, limits = model.surface.locate(point, model.limits)
         return cls(x, normal, limits, model.scene.endoscope.radius)
