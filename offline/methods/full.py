@@ -49,14 +49,8 @@ class Remeshed(Method):
 
     It finds the nodes that a contact loads by itself; other methods are given them.  The state is
     the displacement (m, 3) mm of the other mesh's nodes, from which ``to_scene`` (n, m)
-    interpolates.
-
-    Parameters
-    ----------
-    problem : FullProblem
-        Of a scene with its files.
-    factor : float
-        By which the divisions of the mesh are multiplied, rounded up.
+    interpolates.  The problem's scene comes with its files; the divisions of its mesh are
+    multiplied by the factor and rounded up.
     """
 
     def __init__(

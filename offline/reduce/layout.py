@@ -40,16 +40,7 @@ class Patch:
 
 
 class Layout:
-    """Local models of a size spread over the surface.
-
-    Parameters
-    ----------
-    scene : Scene
-    surface : Surface
-    limits : ndarray, shape (v, LIMIT_FIELDS)
-        Load range at the vertices.
-    size : Size
-    """
+    """Local models of a size all over a surface with a load range (v, LIMIT_FIELDS) at vertices."""
 
     def __init__(self, scene: Scene, surface: Surface, limits: Array, size: Size) -> None:
         rng, blend = stream(scene.seed, Stage.LAYOUT), scene.training.blend

@@ -80,13 +80,9 @@ class Compared(NamedTuple):
 
 @dataclass
 class KnownAnswer:
-    """An answer of the reduced model whose errors are known.
+    """An answer of the reduced model whose errors are known."""
 
-    The errors are the largest until then, relative to the largest norms until then, which do not
-    vanish where an error changes its sign.
-    """
-
-    errors: Array  # (quantities,)
+    errors: Array  # (quantities,), the largest so far: see ``Compared.so_far``
     features: Array  # of the error estimate
     converged: bool
     comparable: bool  # counts for the estimate: both models rest in the same equilibrium
