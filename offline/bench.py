@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.problem import Load
@@ -23,8 +22,6 @@ from palpate.offline.validate.queries import Place, held_out_loads
 from palpate.shared.answer import Answer
 from palpate.shared.model import ReducedModel, Region
 from palpate.shared.reduced.workspace import Warm
-
-Array = NDArray[np.float64]
 
 ROUNDS = 20
 QUERIES = 100  # of each kind in a round, beside one full solution

@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 from scipy.spatial import cKDTree
 from tqdm import tqdm
@@ -32,6 +31,7 @@ from tqdm import tqdm
 from palpate.offline.choose.mesh import with_mesh
 from palpate.offline.choose.size import Trial, choose, first_place, ladder, try_patch
 from palpate.offline.fem.mesh import mesh_quality
+from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.info import duration
 from palpate.offline.reduce.footprint_models import compile_query, train_patch
@@ -58,8 +58,6 @@ from palpate.shared.local_models import ESTIMATORS, Estimator, LocalModels
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.model import ReducedModel
 from palpate.shared.scene import Scene, Size, divisions_of
-
-Array = NDArray[np.float64]
 
 MODEL, MODEL_AND_DOF = 0.35, 1.75e-4
 """Core seconds that training takes for a local model, and more for each degree of freedom; all

@@ -10,16 +10,14 @@ import sys
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from palpate.offline.fem.mesh import build_mesh
+from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.sampling import spread_points
 from palpate.offline.run.streams import Stage, stream
 from palpate.shared.scene import Block, Divisions, Scene, SceneError, divisions_of, parse_scene
-
-Array = NDArray[np.float64]
 
 SHARE = 3.0
 """Multiple of the tolerance of displacement that the mesh's error may have."""

@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from palpate.offline.fem.norms import relative, statistics
+from palpate.offline.fem.norms import Array, relative, statistics
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.footprint_models import LocalTrainer, RandomLoads, train_patch
 from palpate.offline.reduce.join import nodal_modes
@@ -25,8 +24,6 @@ from palpate.offline.run.streams import Stage, stream
 from palpate.shared.mechanics.laws import AnyTissue
 from palpate.shared.mechanics.tissue import lame
 from palpate.shared.scene import Budget, Size, Tolerance
-
-Array = NDArray[np.float64]
 
 LADDER = (
     Size(patch_spacing=2.6, modes=28, cubature_points=64, region_modes=120),

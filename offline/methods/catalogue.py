@@ -10,10 +10,10 @@ from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from palpate.offline.fem.model import FullModel
+from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods import hyper_reduction as hyper
 from palpate.offline.methods.full import Full, Remeshed
@@ -26,8 +26,6 @@ from palpate.offline.methods.tetrahedra import MassSpring, TensorMass
 from palpate.offline.reduce.ritz import TANGENTIAL
 from palpate.offline.reduce.sampling import spread_points, tangents
 from palpate.shared.model import ReducedModel
-
-Array = NDArray[np.float64]
 
 FOOTPRINTS = 128
 """Footprints whose loads make bases: spread over the surface, and so are the first few of them."""

@@ -1,17 +1,15 @@
 """The full model as a method, on the scene's mesh and on others: exact on its mesh, and slow."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from palpate.offline.fem.model import NoEquilibrium
+from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.terms import Past
 from palpate.offline.methods.method import Answer, Case, Method
 from palpate.shared.geometry.elements import hexahedron, shape
 from palpate.shared.scene import ElementName, Extrusion, Scene, divisions_of
-
-Array = NDArray[np.float64]
 
 SAME = 1e-9  # coordinates in the unit cube that differ by less are equal
 

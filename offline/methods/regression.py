@@ -4,15 +4,14 @@ import itertools
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 
+from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.methods.galerkin import reduce_load
 from palpate.offline.methods.method import Answer, Case, Method, Snapshots
 from palpate.offline.reduce.ritz import energy_pod
 
-Array = NDArray[np.float64]
 Interpolant = Callable[[Array], Array]
 """Values (q, m) at features (q, 7) of loads."""
 

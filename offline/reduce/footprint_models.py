@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.reduce import cubature
 from palpate.offline.reduce.join import deviatoric_of, half, nodal_modes, with_points
@@ -31,8 +32,6 @@ from palpate.shared.reduced.press import place, press
 from palpate.shared.reduced.workspace import Workspace
 from palpate.shared.scene import Scene
 from palpate.shared.tables import press_models
-
-Array = NDArray[np.float64]
 
 LOADS = 20
 """Training loads of the cubature; each gives an equilibrium and a state off equilibrium."""

@@ -6,13 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from palpate.offline.fem.norms import Array
 from palpate.offline.reduce.ritz import Footprint
 from palpate.offline.reduce.sampling import random_points, spacing_count, spread_points
 from palpate.offline.run.streams import Stage, stream
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.scene import Scene, Size
-
-Array = NDArray[np.float64]
 
 RITZ_SPACING = 0.455
 """Of the footprints whose Ritz vectors are taken, in units of the patch spacing."""

@@ -25,11 +25,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from palpate.offline.fem.mesh import local_thickness
 from palpate.offline.fem.model import FullModel, NoEquilibrium
+from palpate.offline.fem.norms import Array
 from palpate.offline.fem.potential import Projected
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.terms import DeadLoad
@@ -43,8 +43,6 @@ from palpate.shared.local_models import Estimators, LocalModels
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.model import ReducedModel
-
-Array = NDArray[np.float64]
 
 NEAR = 0.1
 """Relative distance from the wanted displacement at which the pressure is interpolated."""

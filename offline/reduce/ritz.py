@@ -26,12 +26,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from palpate.offline.fem.model import FullModel
+from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.sampling import tangents
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.scene import SceneError
-
-Array = NDArray[np.float64]
 
 RITZ_VECTORS = 19
 SECOND_STEP, THIRD_STEP = 0.01, 0.03

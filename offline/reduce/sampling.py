@@ -4,12 +4,10 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate.offline.fem.norms import Array
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.scene import Tolerance
-
-Array = NDArray[np.float64]
 
 CANDIDATES = 20
 """Random candidates per point wanted, from which the farthest are taken."""

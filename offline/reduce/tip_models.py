@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.offline.fem.model import NoEquilibrium
+from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem, TipPosition
 from palpate.offline.reduce import cubature
 from palpate.offline.reduce.join import deviatoric_of, half, nodal_modes, with_points
@@ -32,8 +33,6 @@ from palpate.shared.reduced.points import SYMMETRIC, predict_points
 from palpate.shared.reduced.touch import MAX_ITERATIONS, TouchModels, place, touch
 from palpate.shared.reduced.workspace import Workspace
 from palpate.shared.tables import touch_models
-
-Array = NDArray[np.float64]
 
 SIZES, SIZES_IN_TIME = (32, 80, 36), (52, 120, 64)
 """Modes, cubature points, and directions that responses to forces at nodes add to the modes of the

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from palpate.offline.fem.norms import relative
+from palpate.offline.fem.norms import Array, relative
 from palpate.offline.methods.catalogue import Training, build
 from palpate.offline.methods.full import Full, Remeshed
 from palpate.offline.methods.method import Method, Steps
@@ -43,7 +43,6 @@ from palpate.offline.studies.references import Fields
 from palpate.shared.errors import PalpateError
 from palpate.shared.scene import Scene
 
-Array = NDArray[np.float64]
 Plan = Mapping[str, Sequence[float]]
 """Sizes of every method; see ``offline.methods.catalogue.build``."""
 

@@ -13,12 +13,11 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.offline.bench import walk
 from palpate.offline.fem.mesh import accessible_surface
 from palpate.offline.fem.model import NoEquilibrium
-from palpate.offline.fem.norms import relative
+from palpate.offline.fem.norms import Array, relative
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.methods.method import Case, Steps
 from palpate.offline.reduce.sampling import cone, random_points
@@ -27,7 +26,6 @@ from palpate.offline.studies.references import Fields, followed, of_tissue
 from palpate.offline.validate.queries import Place, random_loads
 from palpate.shared.model import ReducedModel
 
-Array = NDArray[np.float64]
 Rng = np.random.Generator
 
 CONTROL, SEVERAL = "inside the range", "several equilibria"

@@ -11,17 +11,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from palpate.offline.fem.mesh import local_thickness
+from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.sampling import spread_points
 from palpate.offline.run.tables import write_csv
 from palpate.offline.scenes import find_scene
 from palpate.shared.scene import ElementName
-
-Array = NDArray[np.float64]
 
 POINTS = 12
 INDENTATION = 0.25  # displacement under the footprint over the local thickness

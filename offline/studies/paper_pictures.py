@@ -4,13 +4,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate.offline.fem.norms import Array
 from palpate.offline.methods.galerkin import TOLERANCE
 from palpate.offline.pictures import INK, body, new_plotter, ring, save
 from palpate.shared.local_models import Mesh
-
-Array = NDArray[np.float64]
 
 STYLES = {"MOD": ("#0072B2", "o"), "RITZ": ("#E69F00", "s"), "POD": ("#009E73", "D")}
 """Colours that the colour-blind tell apart (Okabe & Ito), and marks for print."""

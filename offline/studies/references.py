@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.fem.norms import relative
+from palpate.offline.fem.norms import Array, relative
 from palpate.offline.fem.problem import FullProblem, Load, TipPosition
 from palpate.offline.methods.full import Remeshed
 from palpate.offline.methods.method import Case, Method, Snapshots, Steps
@@ -20,8 +20,6 @@ from palpate.offline.validate.queries import HISTORIES, LOADS
 from palpate.shared.errors import PalpateError
 from palpate.shared.model import ReducedModel
 from palpate.shared.scene import Scene, parse_scene
-
-Array = NDArray[np.float64]
 
 
 class Fields(NamedTuple):

@@ -5,14 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
+from palpate.offline.fem.norms import Array
 from palpate.offline.run.tables import write_csv
 from palpate.offline.validate.compare import opened, play
 from palpate.offline.validate.queries import HISTORIES, Place
-
-Array = NDArray[np.float64]
 
 PRESSED = 0.8  # pressure over its limit
 

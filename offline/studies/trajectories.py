@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache, partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods.method import Case
 from palpate.offline.reduce.sampling import random_points_and_rim, tangents
@@ -21,8 +21,6 @@ from palpate.offline.studies.relaxation import load_steps
 from palpate.offline.validate.queries import Place
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.model import ReducedModel
-
-Array = NDArray[np.float64]
 
 CONTROL = "press, hold, let go"
 

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
-from palpate.offline.fem.norms import relative, statistics
+from palpate.offline.fem.norms import Array, relative, statistics
 from palpate.offline.fem.problem import FullProblem, Load, Reference, Step
 from palpate.offline.run.tables import write_csv
 from palpate.offline.run.workers import open_artifact, run, worker_pool
@@ -24,8 +23,6 @@ from palpate.shared.errors import PalpateError, QueryError
 from palpate.shared.local_models import Estimator
 from palpate.shared.model import ReducedModel
 from palpate.shared.reduced.transfer import REST
-
-Array = NDArray[np.float64]
 
 OTHER_EQUILIBRIUM = 0.1
 """Displacement error beyond which the models rest in different equilibria: a free edge can slip off

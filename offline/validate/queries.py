@@ -4,8 +4,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import Load, Step, TipPosition
 from palpate.offline.reduce.sampling import (
     cone,
@@ -17,8 +17,6 @@ from palpate.offline.run.streams import Stage, stream
 from palpate.shared.local_models import LocalModels
 from palpate.shared.mechanics.footprint import TIP_DEPTH, pressure_limit
 from palpate.shared.model import ReducedModel
-
-Array = NDArray[np.float64]
 
 MOVEMENTS = 4
 """Of the tool in a history, after it has been pressed on."""
