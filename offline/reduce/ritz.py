@@ -16,10 +16,9 @@ along the lines ``t = s d`` of as many directions ``d`` as there are vectors.
 The vectors of all footprints of a region are compressed to one basis.
 """
 
-from __future__ import annotations
-
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +61,7 @@ class Footprint:
     pressure: float  # kPa, scale of the load
 
     @classmethod
-    def of(cls, surface: Surface, point: Array, limits: Array) -> Footprint:
+    def of(cls, surface: Surface, point: Array, limits: Array) -> Self:
         """At a point near the surface, with the load range ``limits`` at its vertices."""
         x, normal, _, fields = surface.locate(point, limits)
         return cls(x, normal, float(fields[0]))
@@ -200,10 +199,11 @@ class Region:
     orthonormal: NDArray[np.float32]  # (M, M) columns, in the basis: orthonormal in energy at rest
     ritz: NDArray[np.float32]  # (k, M, 19 or more) in those, of the relaxed tissue last
 
-    def truncate(self, modes: int) -> Region:
+    def truncate(self, modes: int) -> Self:
         """The leading modes; ``orthonormal`` is triangular, so its leading block stays right."""
         basis, steps, ritz = self.basis[:modes], self.steps[:modes], self.ritz[:, :modes]
-        return Region(basis, steps, self.orthonormal[:modes, :modes], ritz)
+        block = self.orthonormal[:modes, :modes]
+        return replace(self, basis=basis, steps=steps, orthonormal=block, ritz=ritz)
 
 
 def region(problem: FullProblem, footprints: list[Footprint], modes: int) -> Region:

@@ -74,12 +74,7 @@ Queries = Sequence[tuple[Steps, Fields, Array | None]]
 
 
 def chart(
-    artifact: Path,
-    scene: Scene | None,
-    snapshots: int,
-    queries: int,
-    seed: int,
-    plan: Plan | None = None,
+    artifact: Path, scene: Scene | None, snapshots: int, queries: int, seed: int
 ) -> dict[str, Any]:
     """Measure and draw speed and accuracy of every method.
 
@@ -90,9 +85,6 @@ def chart(
         histories of visco-elastic tissue.
     snapshots, queries, seed : int
         Loads or histories to learn from, and to answer: those of ``palpate validate``.
-    plan : mapping, optional
-        Sizes of every method; those of the artifact and the full model are needed.  Under loads POD
-        is measured with as many modes as the artifact has unknowns, too.
 
     Returns
     -------
@@ -106,8 +98,8 @@ def chart(
     in_time = scene is None
     layout = drawing.IN_TIME if in_time else drawing.OF_LOADS
     atlas, problem = full.opened(artifact, scene)
-    plan = plan or (PLAN_IN_TIME if in_time else PLAN)
-    if not in_time:
+    plan = PLAN_IN_TIME if in_time else PLAN
+    if not in_time:  # as many modes as the artifact has unknowns, too
         plan = {**plan, "pod": sorted({*plan["pod"], Shipped(problem, atlas).unknowns})}
     settings = snapshots, queries, seed
     checkpoint = full.kept_results(artifact, atlas.scene, layout.name, settings)

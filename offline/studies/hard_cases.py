@@ -67,7 +67,6 @@ class HardCase:
     tip: bool = False  # whether the rigid tip presses
     follow: bool = False  # whether the full model follows the load path
     brief: Steps = ()  # fewer steps to the same end, which the full model follows instead
-    nonsense: bool = False  # whether the right answer is to refuse
 
     @property
     def end_only(self) -> bool:
@@ -103,7 +102,8 @@ def ask_full_model(problem: FullProblem, case: HardCase) -> Question:
     """Full solutions of a hard case; a task for ``run.workers``."""
     own = of_tissue(problem, poisson=case.poisson)
     if case.history:
-        found = None if case.nonsense else followed(own, case.brief or case.steps, case.tip)
+        sensible = all(dt >= 0.0 for _, dt in case.steps)
+        found = followed(own, case.brief or case.steps, case.tip) if sensible else None
         return Question(case, found, found)
     path = [step.load(len(own.mesh.nodes)) for step, _ in case.steps]
     load = path[-1]

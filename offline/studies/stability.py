@@ -196,8 +196,6 @@ def _answer(method: Method, problem: FullProblem, question: Question, every: int
             states, trusted, refused = _play(method, steps, ends, len(counted))
             if refused:
                 return Result(outcomes.REFUSED)
-            if case.nonsense and states:
-                return Result(outcomes.SILENT if trusted else outcomes.WRONG_FLAGGED)
             if exact is not None:
                 exact = Fields(*(field[counted] for field in exact))
             found = Fields.of(method, states) if states else None

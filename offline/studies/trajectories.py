@@ -53,26 +53,21 @@ def histories(
     places = list(random_points_and_rim(atlas.surface, cases, rng))
     press, tissue = _presser(atlas, problem, tip), atlas.scene.tissue
     large = SHORT * max(tau for _, tau in tissue.prony)
-
-    def case(steps: Sequence[Step], brief: Sequence[Step] = (), nonsense: bool = False) -> HardCase:
-        return HardCase(
-            steps, tissue.poisson, history=True, tip=tip, brief=brief, nonsense=nonsense
-        )
-
+    case = partial(HardCase, poisson=tissue.poisson, history=True, tip=tip)
     found = {
-        name: [case(list(course(at)), nonsense=name.startswith("time ")) for at in places]
+        name: [case(list(course(at))) for at in places]
         for name, course in _courses(press, large, rng, places, atlas.surface).items()
         if not (tip and "direction" in name)
     }
     at, few = places[-1], many // 10
     for seconds, steps, shown in ((LONG, few, "10 000"), (large, many, f"{large:g}")):
-        held = _levels(press, np.full(steps, DEEP), seconds / steps, at)
-        brief = list(_growing(press, seconds, at))
-        found[f"held for {shown} s, {steps} steps"] = [case([*_pressed(press, at), *held], brief)]
+        levels = _levels(press, np.full(steps, DEEP), seconds / steps, at)
+        held = case([*_pressed(press, at), *levels], brief=list(_growing(press, seconds, at)))
+        found[f"held for {shown} s, {steps} steps"] = [held]
     phase = 2 * np.pi * np.arange(1, PERIOD + 1) / PERIOD
     period = list(_levels(press, 0.5 + 0.3 * np.cos(phase), 0.02, at))
     repeats = max(many // PERIOD, 1)
-    periodic = case(repeats * period, min(repeats, PERIODS) * period)
+    periodic = case(repeats * period, brief=min(repeats, PERIODS) * period)
     return found | {f"moves periodically, {many} steps": [periodic]}
 
 

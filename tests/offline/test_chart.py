@@ -18,7 +18,9 @@ SIZES = (5, 40)
 
 
 def run(artifact):
-    return study.chart(artifact, find_scene("quick"), 20, QUERIES, 1, PLAN)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(study, "PLAN", PLAN)
+        return study.chart(artifact, find_scene("quick"), 20, QUERIES, 1)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +45,9 @@ def report(artifact):
 @pytest.fixture(scope="module")
 def in_time(visco_artifact):
     plan = {name: sizes if sizes == (1,) else SIZES for name, sizes in study.PLAN_IN_TIME.items()}
-    return study.chart(visco_artifact, None, 1, 2, 1, plan)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(study, "PLAN_IN_TIME", plan)
+        return study.chart(visco_artifact, None, 1, 2, 1)
 
 
 def test_the_artifact_is_on_the_front_and_linear_elasticity_below_it(report, atlas):
