@@ -252,10 +252,7 @@ class Pipeline:
         return np.concatenate(self._stage(title, tasks))
 
     def _validate(self, kind: Kind, model: ReducedModel) -> tuple[Estimator, list[Row]]:
-        """Validate on random queries of a kind, and calibrate its error estimate with them.
-
-        What validation says of the estimate is of one calibrated on the other half of the queries.
-        """
+        """Calibrate the error estimate of a kind on random queries, each half for the other."""
         samples = self.scene.training.samples
         count = TIP_SAMPLES if kind.tip else fewer(samples, self.scene.tolerance)
         if kind.in_time:

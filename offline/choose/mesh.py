@@ -88,10 +88,7 @@ def _candidates(scene: Scene) -> list[Divisions]:
 
 
 def _try(scene: Scene) -> tuple[int, float]:
-    """Degrees of freedom of a mesh, and the 95th percentile of its errors over some places.
-
-    They are relative to a mesh of more than six times its degrees of freedom.
-    """
+    """Degrees of freedom of a mesh, and the 95th percentile of its errors beside a finer one."""
     finer = tuple(2 * n for n in divisions_of(scene.geometry))
     problem, reference = FullProblem(scene), FullProblem(_changed(scene, divisions=finer))
     rng = stream(scene.seed, Stage.MESH_CHOICE)

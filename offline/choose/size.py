@@ -140,12 +140,9 @@ def ladder(tissue: AnyTissue) -> tuple[Size, ...]:
     """
     (mu, lam), (usual_mu, usual_lam) = (lame(1.0, p) for p in (tissue.poisson, COMPRESSIBLE))
     more = max(1.0, (lam / mu) / (usual_lam / usual_mu)) ** (1 / 3)
-    return tuple(
-        size.model_copy(
-            update={"cubature_points": 16 * math.ceil(more * size.cubature_points / 16)}
-        )
-        for size in LADDER
-    )
+    points = [16 * math.ceil(more * size.cubature_points / 16) for size in LADDER]
+    pairs = zip(LADDER, points, strict=True)
+    return tuple(size.model_copy(update={"cubature_points": most}) for size, most in pairs)
 
 
 def first_place(tolerance: Tolerance) -> int:

@@ -256,11 +256,7 @@ def _expected(scene: Scene, region: Region, patch: Patch, rng: np.random.Generat
 
 
 def _training_forces(trainer: LocalTrainer, loads: RandomLoads) -> NDArray[np.float32]:
-    """See ``cubature.training_forces``.
-
-    A force is taken times the square root of the compliance in equilibrium, so that its error is
-    one of displacement in the energy norm.
-    """
+    """``cubature.training_forces`` whose errors are those of displacement in the energy norm."""
     samples = trainer.answers(loads.training, fewer(LOADS, loads.scene.tolerance))
     states = [(s.q, np.linalg.cholesky(s.compliance) / np.linalg.norm(s.q), None) for s in samples]
     return cubature.training_forces(
@@ -289,10 +285,7 @@ def _fit_guess(samples: Sequence[Sample]) -> Array:
 
 
 def _fit_tangent(reduced: LocalTrainer, samples: Sequence[Sample]) -> tuple[Array, Array]:
-    """Directions (CHANGING, r) in which equilibria change the tangent most, and how.
-
-    The change (TANGENT_FEATURES, CHANGES) is that of ``shared.local_models.LocalModels``.
-    """
+    """``directions`` (CHANGING, r) and ``change`` (TANGENT_FEATURES, CHANGES) of a local model."""
     changes = reduced.tangent_changes(np.array([s.q for s in samples]))
     U = np.linalg.svd(np.hstack(list(changes)), full_matrices=False)[0][:, :CHANGING]
     rows, columns = np.tril_indices(CHANGING)

@@ -88,10 +88,7 @@ class Layout:
 
 
 def _centred_points(surface: Surface, count: int, rng: np.random.Generator) -> Array:
-    """Points whose cells on the surface are as compact as can be, (count, 3) mm.
-
-    Lloyd's relaxation of evenly spread points; unlike those, none is left on the rim.
-    """
+    """Points (count, 3) mm by Lloyd's relaxation of evenly spread ones: none is left on the rim."""
     points = spread_points(surface, count, rng)
     sample = random_points(surface, LLOYD_SAMPLE * count, rng)
     for _ in range(LLOYD_STEPS):

@@ -292,10 +292,7 @@ def _generous(
 
 
 def _press(trainer: TipTrainer, patch: Patch, rng: np.random.Generator) -> list[_State]:
-    """Push the tip in at contacts far apart, step by step to about the largest depth.
-
-    On tissue that remembers it is also held, slid to another contact, and lifted.
-    """
+    """Push the tip in step by step; on tissue that remembers it is also held, slid, and lifted."""
     contacts, states = patch.contacts, list[_State]()
     in_time = isinstance(trainer.past, Remembering)
     for i in farthest(contacts, min(PRESSED, len(contacts))):

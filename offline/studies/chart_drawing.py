@@ -4,19 +4,19 @@ Colours stand for groups of methods (palette of Okabe and Ito, safe for colour-b
 for the methods of a group; a line joins the sizes of one method.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
 
 from palpate.offline.info import duration, percent
 from palpate.shared.scene import Scene
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 Row = Mapping[str, Any]
 """A method of one size: ``key``, ``family``, ``label``, ``unknowns``, ``time_us``, ``unconverged``
@@ -153,8 +153,6 @@ def looks(rows: Sequence[Row]) -> Iterator[tuple[Look, list[Row]]]:
 
 def draw(path: Path, rows: Sequence[Row], scene: Scene, layout: Layout) -> None:
     """Draw the chart; its legend takes the place of a last panel."""
-    from matplotlib.figure import Figure
-
     down, across = layout.grid
     figure = Figure(figsize=(6.25 * across, 5.4 * down), layout="constrained")
     grid = figure.subplots(down, across).ravel()
@@ -234,8 +232,6 @@ def _write(
     axes: Axes, text: str, where: tuple[float, float], offset: tuple[float, float], **how: Any
 ) -> None:
     """Write next to a point, on white so that lines do not cross the letters."""
-    from matplotlib.patheffects import withStroke
-
     halo = [withStroke(linewidth=2.5, foreground="white", alpha=0.8)]
     style: dict[str, Any] = {"fontsize": 9.5, "path_effects": halo, "zorder": 6} | how
     axes.annotate(text, where, offset, textcoords="offset points", **style)
@@ -243,8 +239,6 @@ def _write(
 
 def _draw_legend(axes: Axes, rows: Sequence[Row]) -> None:
     """Groups with their methods in two columns, and what the chart shows."""
-    from matplotlib.lines import Line2D
-
     axes.axis("off")
     handles: list[Line2D] = []
     for title, own in groupby((look for look, _ in looks(rows)), lambda look: look.group):

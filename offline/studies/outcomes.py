@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.info import percent
@@ -166,9 +168,6 @@ def _draw(
     path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str], asked: str
 ) -> None:
     """Draw a bar of outcomes for each method and kind of case, its median error below."""
-    from matplotlib.figure import Figure
-    from matplotlib.patches import Patch
-
     methods = list(dict.fromkeys(row["method"] for row in rows))
     size = 3.2 + 0.72 * len(columns), 2.8 + 0.44 * len(methods)
     figure = Figure(figsize=size, layout="constrained")

@@ -4,6 +4,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 from palpate.offline.fem.norms import Array
 from palpate.offline.methods.galerkin import TOLERANCE
@@ -26,9 +28,6 @@ DECADES = 4  # most powers of ten that a scale of colours shows
 
 def chart(path: Path, rows: list[dict[str, Any]], title: str) -> None:
     """Figures 1a and 1b: error at P and ratio of CPU times against the number of bases."""
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import LogLocator
-
     figure = Figure(figsize=(9.6, 4.4), layout="constrained")
     figure.suptitle(title, fontsize=12)
     errors, ratios = figure.subplots(1, 2)

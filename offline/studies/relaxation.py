@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from palpate.offline.fem.norms import Array
@@ -73,8 +74,6 @@ def load_steps(phases: Phases) -> list[tuple[float, float]]:
 
 def _draw(path: Path, times: Array, force: Array, full: Array, reduced: Array) -> None:
     """Force above, depth below, over time."""
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(8, 4.8), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1, 2))
     ends = np.cumsum([seconds for seconds, _, _ in PHASES])
