@@ -78,6 +78,7 @@ WAYS, FAR, STRIDE = 4, 1.5, 0.5
 SAME = 0.1
 """Difference of answers, relative to them, that is not one of equilibria."""
 
+Rng = np.random.Generator
 Places = list[tuple[Any, ...]]
 Ask = Callable[[str, Callable[..., float], Places], Iterable[float]]
 """Values of a function of the reduced model at places, its further arguments; under a title."""
@@ -193,9 +194,7 @@ class Search(NamedTuple):
     reach: float  # mm from there up to which the range is lowered
 
 
-def bearable_shares(
-    search: Search, model: ReducedModel, ask: Ask, rng: np.random.Generator
-) -> Array:
+def bearable_shares(search: Search, model: ReducedModel, ask: Ask, rng: Rng) -> Array:
     """Shares of the range at the vertices (v,) that the reduced model bears, at most 1."""
     surface, vertices = model.surface, cKDTree(model.surface.vertices)
 
@@ -304,7 +303,7 @@ def _apart(one: Answer, other: Answer) -> bool:
 
 
 def _largest_load(
-    model: ReducedModel, i: int, point: Array, rng: np.random.Generator
+    model: ReducedModel, i: int, point: Array, rng: Rng
 ) -> tuple[Array, Array, float]:
     """Contact, direction and largest pressure of a load, every other one at the largest tilt."""
     place = Place.at(model, point)
@@ -312,9 +311,7 @@ def _largest_load(
     return place.position, direction, place.limit(direction)
 
 
-def _contact(
-    model: ReducedModel, i: int, point: Array, rng: np.random.Generator
-) -> tuple[Array, float]:
+def _contact(model: ReducedModel, _: int, point: Array, rng: Rng) -> tuple[Array, float]:
     """Contact of the tip, and the angle of the ways there."""
     return model.surface.project(point)[0], rng.uniform(0.0, 2.0 * np.pi)
 

@@ -94,14 +94,10 @@ def mesh_error(report: Path) -> dict[str, Any]:
         solved = [body.press_at(*load) for load in loads]
         moved = np.array([[np.linalg.norm(u, axis=1).max(), np.linalg.norm(v)] for u, v in solved])
         exact = moved if exact is None else exact
-        rows[str(how)] = {
-            "dofs": body.mesh.nodes.size,
-            "points": 8 * len(body.mesh.elements),
-        } | {
+        errors = zip(("largest", "under_footprint"), (moved / exact - 1).T, strict=True)
+        rows[str(how)] = {"dofs": body.mesh.nodes.size, "points": 8 * len(body.mesh.elements)} | {
             f"{name}_{key}": float(of(error))
-            for name, error in zip(
-                ("largest", "under_footprint"), (moved / exact - 1).T, strict=True
-            )
+            for name, error in errors
             for key, of in (("least", np.min), ("mean", np.mean), ("greatest", np.max))
         }
     write_csv(report / "mesh_error.csv", [{"mesh": name} | row for name, row in rows.items()])
