@@ -4,8 +4,6 @@ A query's time is that of ``ReducedModel.press`` as a caller sees it, from a pos
 answer with its error estimate; fields are recovered after a cold query of their own.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -15,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.problem import Load
@@ -25,8 +22,6 @@ from palpate.offline.validate.queries import Place, held_out_loads
 from palpate.shared.answer import Answer
 from palpate.shared.model import ReducedModel, Region
 from palpate.shared.reduced.workspace import Warm
-
-Array = NDArray[np.float64]
 
 ROUNDS = 20
 QUERIES = 100  # of each kind in a round, beside one full solution

@@ -72,8 +72,7 @@ def _leaves(report: Report, prefix: str) -> Iterator[tuple[str, object]]:
 def count_option(name: str, default: int | None, help: str, least: int = 1) -> Option:
     """Option of a whole number."""
     kind = click.IntRange(min=least)
-    shown = default is not None
-    return click.option(name, type=kind, default=default, show_default=shown, help=help)
+    return click.option(name, type=kind, default=default, show_default=True, help=help)
 
 
 seed_option = count_option("--seed", 0, "Number that the random loads follow from.", least=0)
@@ -204,11 +203,10 @@ def validate(tip: bool, queries: int, histories: int | None, **settings: Any) ->
     of the artifact. Errors are relative L2 norms as fractions; of histories over all moments.
     """
     from palpate.offline.validate.compare import against_full
-    from palpate.offline.validate.queries import HISTORIES, LOADS, TIP, TIP_HISTORIES
+    from palpate.offline.validate.queries import KINDS
 
-    if histories is not None:
-        return against_full(kind=TIP_HISTORIES if tip else HISTORIES, count=histories, **settings)
-    return against_full(kind=TIP if tip else LOADS, count=queries, **settings)
+    (kind,) = (kind for kind in KINDS if (kind.tip, kind.in_time) == (tip, histories is not None))
+    return against_full(kind=kind, count=histories or queries, **settings)
 
 
 @click.command()
@@ -273,8 +271,8 @@ def chart(scene: str, artifact: Path | None, **settings: Any) -> Report:
     """Set speed and accuracy of many methods side by side.
 
     Some learn from full solutions of SNAPSHOTS random loads; all answer the QUERIES that palpate
-    validate asks with this seed, on one core. Table, picture and page go to NAME/report/chart.csv,
-    .png and .html beside the artifact. Takes half an hour; a stopped run continues where it was.
+    validate asks with this seed, on one core. Table and picture go to NAME/report/chart.csv and
+    .png beside the artifact. Takes half an hour; a stopped run continues where it was.
     """
     from palpate.offline.scenes import default_artifact, find_scene
     from palpate.offline.studies.chart import chart
@@ -293,8 +291,8 @@ def chart_in_time(artifact: Path, histories: int, snapshots: int, seed: int) -> 
     """Set speed and accuracy of methods over histories side by side.
 
     The visco-elastic artifact, its twin without memory, the full model and Galerkin models in
-    modal, Ritz and POD bases answer the HISTORIES that palpate validate asks with this seed. Table,
-    picture and page go to NAME/report/chart_in_time.csv, .png and .html beside the artifact.
+    modal, Ritz and POD bases answer the HISTORIES that palpate validate asks with this seed. Table
+    and picture go to NAME/report/chart_in_time.csv and .png beside the artifact.
     """
     from palpate.offline.studies.chart import chart
 

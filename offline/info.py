@@ -1,7 +1,5 @@
 """What an artifact holds, read without building the model: for people or, as a whole, for JSON."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path

@@ -5,8 +5,6 @@ rest.  The endoscope is drawn as a ball of the footprint's radius on a shaft, as
 deformed surface lets it: the model knows its pressure only.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.offline.fem.norms import Array
 from palpate.offline.solve import CELL_TYPES
 from palpate.shared.answer import Answer
 from palpate.shared.errors import PalpateError
 from palpate.shared.model import ReducedModel
 
-Array = NDArray[np.float64]
 Fields = Mapping[str, NDArray[np.floating[Any]]]
 
 SIZE = (1500, 720)

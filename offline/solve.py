@@ -4,8 +4,6 @@ The file is VTK's XML (.vtu), which ParaView and its kin read: VTK file formats,
 https://docs.vtk.org/en/latest/design_documents/VTKFileFormats.html
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from base64 import b64encode
@@ -18,13 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.offline.fem.model import NoEquilibrium
-from palpate.offline.fem.norms import relative
+from palpate.offline.fem.norms import Array, relative
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.shared.answer import describe
 from palpate.shared.artifact import read_artifact
 from palpate.shared.model import ReducedModel
-
-Array = NDArray[np.float64]
 
 CELL_TYPES = {8: 12, 20: 25}  # VTK_HEXAHEDRON and VTK_QUADRATIC_HEXAHEDRON, by nodes per element
 TYPE_NAMES = {"f": "Float64", "i": "Int64", "u": "UInt8"}

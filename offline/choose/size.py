@@ -6,18 +6,15 @@ says where to begin, and each trial how far from there to go on: a loose toleran
 pay for trials of large models.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from palpate.offline.fem.norms import relative, statistics
+from palpate.offline.fem.norms import Array, relative, statistics
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.footprint_models import LocalTrainer, RandomLoads, train_patch
 from palpate.offline.reduce.join import nodal_modes
@@ -27,8 +24,6 @@ from palpate.offline.run.streams import Stage, stream
 from palpate.shared.mechanics.laws import AnyTissue
 from palpate.shared.mechanics.tissue import lame
 from palpate.shared.scene import Budget, Size, Tolerance
-
-Array = NDArray[np.float64]
 
 LADDER = (
     Size(patch_spacing=2.6, modes=28, cubature_points=64, region_modes=120),
@@ -105,7 +100,7 @@ class Trial:
     solve_us: float
 
     @classmethod
-    def of(cls, size: Size, results: Sequence[TrialResult]) -> Trial:
+    def of(cls, size: Size, results: Sequence[TrialResult]) -> Self:
         """Gather the results of the patches, without the one of the largest error.
 
         Where the tissue gives way the load range is lowered only after training: loads beyond that
@@ -145,12 +140,9 @@ def ladder(tissue: AnyTissue) -> tuple[Size, ...]:
     """
     (mu, lam), (usual_mu, usual_lam) = (lame(1.0, p) for p in (tissue.poisson, COMPRESSIBLE))
     more = max(1.0, (lam / mu) / (usual_lam / usual_mu)) ** (1 / 3)
-    return tuple(
-        size.model_copy(
-            update={"cubature_points": 16 * math.ceil(more * size.cubature_points / 16)}
-        )
-        for size in LADDER
-    )
+    points = [16 * math.ceil(more * size.cubature_points / 16) for size in LADDER]
+    pairs = zip(LADDER, points, strict=True)
+    return tuple(size.model_copy(update={"cubature_points": most}) for size, most in pairs)
 
 
 def first_place(tolerance: Tolerance) -> int:

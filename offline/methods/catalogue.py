@@ -4,29 +4,20 @@ A new method is a file in this folder and a line in ``BUILDERS``.  ``Training`` 
 learn from, and computes what several of them share only once.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from palpate.offline.fem.model import FullModel
+from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem
+from palpate.offline.methods import hyper_reduction as hyper
 from palpate.offline.methods.full import Full, Remeshed
 from palpate.offline.methods.galerkin import Galerkin, GalerkinAtHand
-from palpate.offline.methods.hyper_reduction import (
-    Deim,
-    PlainNewton,
-    contributions,
-    fit_cubature,
-    force_modes,
-    sample,
-)
 from palpate.offline.methods.method import Case, Method, Snapshots
 from palpate.offline.methods.regression import Linear, Regression, compliance
 from palpate.offline.methods.shipped import Shipped, Way
@@ -35,8 +26,6 @@ from palpate.offline.methods.tetrahedra import MassSpring, TensorMass
 from palpate.offline.reduce.ritz import TANGENTIAL
 from palpate.offline.reduce.sampling import spread_points, tangents
 from palpate.shared.model import ReducedModel
-
-Array = NDArray[np.float64]
 
 FOOTPRINTS = 128
 """Footprints whose loads make bases: spread over the surface, and so are the first few of them."""
@@ -110,16 +99,16 @@ def _cubature(
 ) -> Method:
     problem, basis, rng = training.problem, training.pod(size), training.rng(size)
     cases = (Case.of(problem, load) for load in training.snapshots.loads[:CASES])
-    forces = contributions(Galerkin(problem, basis), cases, rng)
-    cubature = fit_cubature(problem.model, forces, most * basis.shape[1], rng, by_element)
+    forces = hyper.contributions(Galerkin(problem, basis), cases, rng)
+    cubature = hyper.fit_cubature(problem.model, forces, most * basis.shape[1], rng, by_element)
     return Galerkin(problem, basis, cubature)
 
 
 def _deim(size: int, training: Training, per_mode: int = 1) -> Method:
     model, basis = training.model, training.pod(size)
     snapshots = training.snapshots.displacements[:, model.free].astype(float)
-    modes = force_modes(model, snapshots, basis.shape[1])
-    return Deim(training.problem, basis, modes, sample(modes, per_mode))
+    modes = hyper.force_modes(model, snapshots, basis.shape[1])
+    return hyper.Deim(training.problem, basis, modes, hyper.sample(modes, per_mode))
 
 
 # --- a basis for the load at hand ----------------------------------------------------------------
@@ -172,7 +161,7 @@ BUILDERS: dict[str, Callable[[Any, Training], Method]] = {
     "krylov": _krylov,
     "pod": lambda size, t: _every_point(t, t.pod(size)),
     "pod-euclidean": lambda size, t: _every_point(t, t.pod(size, "euclidean")),
-    "pod, no line search": lambda size, t: PlainNewton(t.problem, t.pod(size)),
+    "pod, no line search": lambda size, t: hyper.PlainNewton(t.problem, t.pod(size)),
     "pod-ecm": _cubature,
     "pod-ecm, 1 point a mode": partial(_cubature, most=1),
     "pod-ecsw": partial(_cubature, most=ELEMENTS_PER_MODE, by_element=True),

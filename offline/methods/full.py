@@ -1,19 +1,15 @@
 """The full model as a method, on the scene's mesh and on others: exact on its mesh, and slow."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from palpate.offline.fem.model import NoEquilibrium
+from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.terms import Past
 from palpate.offline.methods.method import Answer, Case, Method
 from palpate.shared.geometry.elements import hexahedron, shape
 from palpate.shared.scene import ElementName, Extrusion, Scene, divisions_of
-
-Array = NDArray[np.float64]
 
 SAME = 1e-9  # coordinates in the unit cube that differ by less are equal
 
@@ -51,14 +47,8 @@ class Remeshed(Method):
 
     It finds the nodes that a contact loads by itself; other methods are given them.  The state is
     the displacement (m, 3) mm of the other mesh's nodes, from which ``to_scene`` (n, m)
-    interpolates.
-
-    Parameters
-    ----------
-    problem : FullProblem
-        Of a scene with its files.
-    factor : float
-        By which the divisions of the mesh are multiplied, rounded up.
+    interpolates.  The problem's scene comes with its files; the divisions of its mesh are
+    multiplied by the factor and rounded up.
     """
 
     def __init__(

@@ -1,19 +1,19 @@
 """Methods that solve nothing: the linear response, and regression on full solutions."""
 
-from __future__ import annotations
-
 import itertools
+from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 
+from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.methods.galerkin import reduce_load
 from palpate.offline.methods.method import Answer, Case, Method, Snapshots
 from palpate.offline.reduce.ritz import energy_pod
 
-Array = NDArray[np.float64]
+Interpolant = Callable[[Array], Array]
+"""Values (q, m) at features (q, 7) of loads."""
 
 KERNELS = ("linear", "thin_plate_spline", "cubic")
 
@@ -68,27 +68,21 @@ class Linear(_InModes):
         return Answer(q)
 
 
-class Interpolant:
-    """Values (k, m) per unit of pressure, which removes the main trend, at features (k, 7).
+def interpolant(
+    features: Array, values: Array, kernel: str, lengths: tuple[float, float]
+) -> Interpolant:
+    """Interpolate values (k, m) per unit of pressure, which removes the main trend.
 
     Lengths are millimetres that weigh as much as a unit of direction, and of median pressure.
     """
-
-    def __init__(
-        self, features: Array, values: Array, kernel: str, lengths: tuple[float, float]
-    ) -> None:
-        scales = np.repeat([1.0, *lengths], [3, 3, 1])
-        scales[-1] /= np.median(features[:, -1])
-        scaled = features * scales
-        # on a flat surface a coordinate never changes, and polynomials in it cannot be told apart
-        _, spread, axes = np.linalg.svd(scaled - scaled.mean(axis=0), full_matrices=False)
-        self._axes = scales[:, None] * axes[spread > 1e-6 * spread[0]].T
-        per_pressure = values / features[:, -1:]
-        self._found = RBFInterpolator(features @ self._axes, per_pressure, kernel=kernel, degree=1)
-
-    def __call__(self, features: Array) -> Array:
-        """Values (q, m) at features (q, 7)."""
-        return np.asarray(features[:, -1:] * self._found(features @ self._axes))
+    scales = np.repeat([1.0, *lengths], [3, 3, 1])
+    scales[-1] /= np.median(features[:, -1])
+    scaled = features * scales
+    # on a flat surface a coordinate never changes, and polynomials in it cannot be told apart
+    _, spread, axes = np.linalg.svd(scaled - scaled.mean(axis=0), full_matrices=False)
+    axes = scales[:, None] * axes[spread > 1e-6 * spread[0]].T
+    found = RBFInterpolator(features @ axes, values / features[:, -1:], kernel=kernel, degree=1)
+    return lambda asked: np.asarray(asked[:, -1:] * found(asked @ axes))
 
 
 def fit_interpolant(features: Array, values: Array) -> Interpolant:
@@ -96,11 +90,11 @@ def fit_interpolant(features: Array, values: Array) -> Interpolant:
     back = np.arange(len(features)) % HELD_BACK == 0
 
     def error(choice: tuple[str, tuple[float, float]]) -> float:
-        off = Interpolant(features[~back], values[~back], *choice)(features[back]) - values[back]
+        off = interpolant(features[~back], values[~back], *choice)(features[back]) - values[back]
         return float(np.mean(np.linalg.norm(off, axis=1) / np.linalg.norm(values[back], axis=1)))
 
     choices = itertools.product(KERNELS, itertools.product(LENGTHS, LENGTHS))
-    return Interpolant(features, values, *min(choices, key=error))
+    return interpolant(features, values, *min(choices, key=error))
 
 
 class Regression(_InModes):

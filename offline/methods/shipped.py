@@ -4,13 +4,11 @@ It finds the contact and its load by itself; the other methods are given them.  
 contact at a time and refuses several.
 """
 
-from __future__ import annotations
-
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods.method import Answer, Case, Method
 from palpate.shared.answer import Answer as Found
@@ -18,7 +16,6 @@ from palpate.shared.errors import QueryError
 from palpate.shared.model import ReducedModel
 from palpate.shared.reduced.transfer import REST
 
-Array = NDArray[np.float64]
 Way = Literal["cold", "warm", "in time", "tip"]
 
 

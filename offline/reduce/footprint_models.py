@@ -1,7 +1,5 @@
 """Training of one local model: modes, cubature, first guess and first tangent."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -9,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.reduce import cubature
 from palpate.offline.reduce.join import deviatoric_of, half, nodal_modes, with_points
@@ -33,8 +32,6 @@ from palpate.shared.reduced.press import place, press
 from palpate.shared.reduced.workspace import Workspace
 from palpate.shared.scene import Scene
 from palpate.shared.tables import press_models
-
-Array = NDArray[np.float64]
 
 LOADS = 20
 """Training loads of the cubature; each gives an equilibrium and a state off equilibrium."""
@@ -259,11 +256,7 @@ def _expected(scene: Scene, region: Region, patch: Patch, rng: np.random.Generat
 
 
 def _training_forces(trainer: LocalTrainer, loads: RandomLoads) -> NDArray[np.float32]:
-    """See ``cubature.training_forces``.
-
-    A force is taken times the square root of the compliance in equilibrium, so that its error is
-    one of displacement in the energy norm.
-    """
+    """``cubature.training_forces`` whose errors are those of displacement in the energy norm."""
     samples = trainer.answers(loads.training, fewer(LOADS, loads.scene.tolerance))
     states = [(s.q, np.linalg.cholesky(s.compliance) / np.linalg.norm(s.q), None) for s in samples]
     return cubature.training_forces(
@@ -292,10 +285,7 @@ def _fit_guess(samples: Sequence[Sample]) -> Array:
 
 
 def _fit_tangent(reduced: LocalTrainer, samples: Sequence[Sample]) -> tuple[Array, Array]:
-    """Directions (CHANGING, r) in which equilibria change the tangent most, and how.
-
-    The change (TANGENT_FEATURES, CHANGES) is that of ``shared.local_models.LocalModels``.
-    """
+    """``directions`` (CHANGING, r) and ``change`` (TANGENT_FEATURES, CHANGES) of a local model."""
     changes = reduced.tangent_changes(np.array([s.q for s in samples]))
     U = np.linalg.svd(np.hstack(list(changes)), full_matrices=False)[0][:, :CHANGING]
     rows, columns = np.tril_indices(CHANGING)

@@ -1,7 +1,5 @@
 """From tables of one local model each to those of all, and what neighbours have in common."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any, TypeVar
@@ -11,10 +9,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from palpate.offline.fem.model import FullModel
+from palpate.offline.fem.norms import Array
 from palpate.offline.reduce.ritz import Region
 from palpate.shared.local_models import LocalModels, LocalTips, ViscousModels
 
-Array = NDArray[np.float64]
 Field = NDArray[np.float32]
 Tables = TypeVar("Tables", LocalModels, LocalTips)
 

@@ -1,20 +1,17 @@
 """Where local models, their regions and the footprints that they learn from lie on the surface."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from palpate.offline.fem.norms import Array
 from palpate.offline.reduce.ritz import Footprint
 from palpate.offline.reduce.sampling import random_points, spacing_count, spread_points
 from palpate.offline.run.streams import Stage, stream
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.scene import Scene, Size
-
-Array = NDArray[np.float64]
 
 RITZ_SPACING = 0.455
 """Of the footprints whose Ritz vectors are taken, in units of the patch spacing."""
@@ -42,16 +39,7 @@ class Patch:
 
 
 class Layout:
-    """Local models of a size spread over the surface.
-
-    Parameters
-    ----------
-    scene : Scene
-    surface : Surface
-    limits : ndarray, shape (v, LIMIT_FIELDS)
-        Load range at the vertices.
-    size : Size
-    """
+    """Local models of a size all over a surface with a load range (v, LIMIT_FIELDS) at vertices."""
 
     def __init__(self, scene: Scene, surface: Surface, limits: Array, size: Size) -> None:
         rng, blend = stream(scene.seed, Stage.LAYOUT), scene.training.blend
@@ -100,10 +88,7 @@ class Layout:
 
 
 def _centred_points(surface: Surface, count: int, rng: np.random.Generator) -> Array:
-    """Points whose cells on the surface are as compact as can be, (count, 3) mm.
-
-    Lloyd's relaxation of evenly spread points; unlike those, none is left on the rim.
-    """
+    """Points (count, 3) mm by Lloyd's relaxation of evenly spread ones: none is left on the rim."""
     points = spread_points(surface, count, rng)
     sample = random_points(surface, LLOYD_SAMPLE * count, rng)
     for _ in range(LLOYD_STEPS):

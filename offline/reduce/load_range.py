@@ -18,8 +18,6 @@ the tip came: reduced and full model need not part from the same one at the same
 model is asked everywhere whether its answers depend on the way, and depths are lowered likewise.
 """
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Callable, Iterable
 from functools import lru_cache
@@ -27,25 +25,24 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from palpate.offline.fem.mesh import local_thickness
 from palpate.offline.fem.model import FullModel, NoEquilibrium
+from palpate.offline.fem.norms import Array
 from palpate.offline.fem.potential import Projected
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.terms import DeadLoad
 from palpate.offline.reduce.ritz import energy_pod, ritz_vectors
 from palpate.offline.reduce.sampling import cone, random_points_and_rim, tangents
 from palpate.offline.run.streams import Stage
+from palpate.offline.validate.queries import Place
 from palpate.shared.answer import Answer
 from palpate.shared.errors import QueryError
 from palpate.shared.local_models import Estimators, LocalModels
 from palpate.shared.mechanics import newton
-from palpate.shared.mechanics.footprint import TIP_DEPTH, pressure_limit
+from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.model import ReducedModel
-
-Array = NDArray[np.float64]
 
 NEAR = 0.1
 """Relative distance from the wanted displacement at which the pressure is interpolated."""
@@ -81,6 +78,7 @@ WAYS, FAR, STRIDE = 4, 1.5, 0.5
 SAME = 0.1
 """Difference of answers, relative to them, that is not one of equilibria."""
 
+Rng = np.random.Generator
 Places = list[tuple[Any, ...]]
 Ask = Callable[[str, Callable[..., float], Places], Iterable[float]]
 """Values of a function of the reduced model at places, its further arguments; under a title."""
@@ -196,9 +194,7 @@ class Search(NamedTuple):
     reach: float  # mm from there up to which the range is lowered
 
 
-def bearable_shares(
-    search: Search, model: ReducedModel, ask: Ask, rng: np.random.Generator
-) -> Array:
+def bearable_shares(search: Search, model: ReducedModel, ask: Ask, rng: Rng) -> Array:
     """Shares of the range at the vertices (v,) that the reduced model bears, at most 1."""
     surface, vertices = model.surface, cKDTree(model.surface.vertices)
 
@@ -266,25 +262,19 @@ def path_independent_share(model: ReducedModel, x: Array, turn: float = 0.0) -> 
 
 def _depends_on_way(model: ReducedModel, x: Array, share: float, turn: float) -> bool:
     """Whether a tip that comes sliding finds another equilibrium than one pressed in."""
-    pressed = model.touch(_over(model, x, share))
+    pressed = model.touch(Place.at(model, x).touch(share).position)
     state = model.new_warm()
     for angle in turn + 2.0 * np.pi * np.arange(WAYS) / WAYS:
         state.forget()
         slid = None
         for place in reversed(_way(model, x, angle)):
             try:
-                slid = model.touch(_over(model, place, share), warm=state)
+                slid = model.touch(Place.at(model, place).touch(share).position, warm=state)
             except QueryError:  # in a fold the tip's centre can be below the other side
                 continue
         if slid is not None and _apart(pressed, slid):
             return True
     return False
-
-
-def _over(model: ReducedModel, x: Array, share: float) -> Array:
-    """Centre of a tip pressed in at a point of the surface by a share of the depth limit."""
-    x, normal, _, fields = model.surface.locate(x, model.limits)
-    return x + (model.scene.endoscope.radius - share * fields[TIP_DEPTH]) * normal
 
 
 def _way(model: ReducedModel, x: Array, angle: float) -> list[Array]:
@@ -313,17 +303,15 @@ def _apart(one: Answer, other: Answer) -> bool:
 
 
 def _largest_load(
-    model: ReducedModel, i: int, point: Array, rng: np.random.Generator
+    model: ReducedModel, i: int, point: Array, rng: Rng
 ) -> tuple[Array, Array, float]:
     """Contact, direction and largest pressure of a load, every other one at the largest tilt."""
-    x, normal, _, fields = model.surface.locate(point, model.limits)
-    direction = cone(normal, model.scene.endoscope.max_tilt, 1, rng, border=i % 2 == 0)[0]
-    return x, direction, pressure_limit(fields, normal, direction)
+    place = Place.at(model, point)
+    direction = cone(place.normal, model.scene.endoscope.max_tilt, 1, rng, border=i % 2 == 0)[0]
+    return place.position, direction, place.limit(direction)
 
 
-def _contact(
-    model: ReducedModel, i: int, point: Array, rng: np.random.Generator
-) -> tuple[Array, float]:
+def _contact(model: ReducedModel, _: int, point: Array, rng: Rng) -> tuple[Array, float]:
     """Contact of the tip, and the angle of the ways there."""
     return model.surface.project(point)[0], rng.uniform(0.0, 2.0 * np.pi)
 

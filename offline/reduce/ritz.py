@@ -16,22 +16,20 @@ along the lines ``t = s d`` of as many directions ``d`` as there are vectors.
 The vectors of all footprints of a region are compressed to one basis.
 """
 
-from __future__ import annotations
-
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from palpate.offline.fem.model import FullModel
+from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.sampling import tangents
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.scene import SceneError
-
-Array = NDArray[np.float64]
 
 RITZ_VECTORS = 19
 SECOND_STEP, THIRD_STEP = 0.01, 0.03
@@ -63,7 +61,7 @@ class Footprint:
     pressure: float  # kPa, scale of the load
 
     @classmethod
-    def of(cls, surface: Surface, point: Array, limits: Array) -> Footprint:
+    def of(cls, surface: Surface, point: Array, limits: Array) -> Self:
         """At a point near the surface, with the load range ``limits`` at its vertices."""
         x, normal, _, fields = surface.locate(point, limits)
         return cls(x, normal, float(fields[0]))
@@ -201,10 +199,11 @@ class Region:
     orthonormal: NDArray[np.float32]  # (M, M) columns, in the basis: orthonormal in energy at rest
     ritz: NDArray[np.float32]  # (k, M, 19 or more) in those, of the relaxed tissue last
 
-    def truncate(self, modes: int) -> Region:
+    def truncate(self, modes: int) -> Self:
         """The leading modes; ``orthonormal`` is triangular, so its leading block stays right."""
         basis, steps, ritz = self.basis[:modes], self.steps[:modes], self.ritz[:, :modes]
-        return Region(basis, steps, self.orthonormal[:modes, :modes], ritz)
+        block = self.orthonormal[:modes, :modes]
+        return replace(self, basis=basis, steps=steps, orthonormal=block, ritz=ritz)
 
 
 def region(problem: FullProblem, footprints: list[Footprint], modes: int) -> Region:

@@ -1,17 +1,13 @@
 """Space-filling points and loads on a surface."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate.offline.fem.norms import Array
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.scene import Tolerance
-
-Array = NDArray[np.float64]
 
 CANDIDATES = 20
 """Random candidates per point wanted, from which the farthest are taken."""

@@ -6,15 +6,14 @@ responses to forces at single nodes of the surface.  Of what it answers at conta
 over its range, and of how that changes with the position, come the few modes that it keeps.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.offline.fem.model import NoEquilibrium
+from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem, TipPosition
 from palpate.offline.reduce import cubature
 from palpate.offline.reduce.join import deviatoric_of, half, nodal_modes, with_points
@@ -32,8 +31,6 @@ from palpate.shared.reduced.points import SYMMETRIC, predict_points
 from palpate.shared.reduced.touch import MAX_ITERATIONS, TouchModels, place, touch
 from palpate.shared.reduced.workspace import Workspace
 from palpate.shared.tables import touch_models
-
-Array = NDArray[np.float64]
 
 SIZES, SIZES_IN_TIME = (32, 80, 36), (52, 120, 64)
 """Modes, cubature points, and directions that responses to forces at nodes add to the modes of the
@@ -72,6 +69,52 @@ def endless(surface: Surface) -> SurfaceIndex:
     """The surface with a load range without end: see ``mechanics.footprint.pressure_limit``."""
     fields = [NO_LIMIT, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, NO_LIMIT]
     return surface.ground(np.tile(fields, (len(surface.vertices), 1)))
+
+
+@dataclass(frozen=True)
+class _State:
+    """Answer of a local model."""
+
+    position: Array  # (3,) mm
+    depth: float  # mm
+    normal: Array  # (3,) of the surface
+    q: Array  # (m,)
+    factor: Array  # (m, m)
+    coupling: Array  # (m, 3)
+    force: Array  # (3,)
+    past: cubature.Past | None  # of tissue that remembers, see ``cubature.point_forces``
+    most: tuple[float, float]  # largest size and force (mN) of its history
+
+    def within(self, V: Array) -> Self:
+        """Its part in orthonormal modes V (m, k)."""
+        factor = np.asarray(np.linalg.cholesky(V.T @ self.factor @ self.factor.T @ V), float)
+        return replace(self, q=V.T @ self.q, factor=factor, coupling=V.T @ self.coupling)
+
+    @property
+    def size(self) -> float:
+        """What its errors count against, in the energy norm."""
+        return max(norm(self.q), self.most[0])
+
+    @property
+    def slope(self) -> Array:
+        """Derivative (m, 3) of the answer in the position."""
+        L = self.factor
+        return np.linalg.solve(L.T, np.linalg.solve(L, self.coupling))
+
+    @property
+    def looks(self) -> Array:
+        """What an error of the internal force counts for (m, m + 3).
+
+        Times the square root of the compliance, it counts by the displacement that it causes in the
+        energy norm; times the slope, by the change of the force on the tool.
+        """
+        pushed = max(norm(self.force), self.most[1])
+        return np.hstack([np.linalg.inv(self.factor).T / self.size, self.slope / pushed])
+
+
+def norm(vector: Array) -> float:
+    """Euclidean norm."""
+    return float(np.linalg.norm(vector))
 
 
 class TipTrainer:
@@ -146,52 +189,6 @@ class TipTrainer:
         B, S = np.zeros((2, SYMMETRIC * points.weights.shape[1]), np.float32)
         predict_points(self._memory.points, self._memory.linear, now, points.law.mu[0], B, S)
         return B, S
-
-
-@dataclass(frozen=True)
-class _State:
-    """Answer of a local model."""
-
-    position: Array  # (3,) mm
-    depth: float  # mm
-    normal: Array  # (3,) of the surface
-    q: Array  # (m,)
-    factor: Array  # (m, m)
-    coupling: Array  # (m, 3)
-    force: Array  # (3,)
-    past: cubature.Past | None  # of tissue that remembers, see ``cubature.point_forces``
-    most: tuple[float, float]  # largest size and force (mN) of its history
-
-    def within(self, V: Array) -> _State:
-        """Its part in orthonormal modes V (m, k)."""
-        factor = np.asarray(np.linalg.cholesky(V.T @ self.factor @ self.factor.T @ V), float)
-        return replace(self, q=V.T @ self.q, factor=factor, coupling=V.T @ self.coupling)
-
-    @property
-    def size(self) -> float:
-        """What its errors count against, in the energy norm."""
-        return max(norm(self.q), self.most[0])
-
-    @property
-    def slope(self) -> Array:
-        """Derivative (m, 3) of the answer in the position."""
-        L = self.factor
-        return np.linalg.solve(L.T, np.linalg.solve(L, self.coupling))
-
-    @property
-    def looks(self) -> Array:
-        """What an error of the internal force counts for (m, m + 3).
-
-        Times the square root of the compliance, it counts by the displacement that it causes in the
-        energy norm; times the slope, by the change of the force on the tool.
-        """
-        pushed = max(norm(self.force), self.most[1])
-        return np.hstack([np.linalg.inv(self.factor).T / self.size, self.slope / pushed])
-
-
-def norm(vector: Array) -> float:
-    """Euclidean norm."""
-    return float(np.linalg.norm(vector))
 
 
 def train_tip(
@@ -295,10 +292,7 @@ def _generous(
 
 
 def _press(trainer: TipTrainer, patch: Patch, rng: np.random.Generator) -> list[_State]:
-    """Push the tip in at contacts far apart, step by step to about the largest depth.
-
-    On tissue that remembers it is also held, slid to another contact, and lifted.
-    """
+    """Push the tip in step by step; on tissue that remembers it is also held, slid, and lifted."""
     contacts, states = patch.contacts, list[_State]()
     in_time = isinstance(trainer.past, Remembering)
     for i in farthest(contacts, min(PRESSED, len(contacts))):

@@ -3,8 +3,6 @@
 What validates must not share a stream with what shaped the model.
 """
 
-from __future__ import annotations
-
 from enum import IntEnum, unique
 
 import numpy as np

@@ -9,8 +9,6 @@ a kill, a result is there or it is not.  The folder is named by a hash of everyt
 depend on, so stale ones are never read.
 """
 
-from __future__ import annotations
-
 import hashlib
 import multiprocessing
 import os
@@ -18,7 +16,7 @@ import pickle
 import shutil
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
@@ -92,17 +90,6 @@ def worker_pool(
     return pool
 
 
-def completed(executor: Executor, tasks: Tasks) -> Iterator[tuple[str, Any]]:
-    """Run tasks; yield name and result of each as soon as it is done."""
-    futures = {executor.submit(run, *task): name for name, task in tasks.items()}
-    try:
-        for future in as_completed(futures):
-            yield futures[future], future.result()
-    finally:
-        for future in futures:
-            future.cancel()
-
-
 def content_key(scene: Scene) -> str:
     """Hash of the scene, the files it names and the code that trains it."""
     root = Path(__file__).parents[2]
@@ -153,11 +140,16 @@ class Checkpoint:
 
     def resume(self, title: str, executor: Executor, tasks: Tasks) -> dict[str, Any]:
         """Results of tasks by name; those that are not there yet are run, with a bar."""
-        missing = {name: task for name, task in tasks.items() if name not in self}
-        with tqdm(total=len(tasks), initial=len(tasks) - len(missing), desc=title) as bar:
-            for name, result in completed(executor, missing):
-                self.store(name, result)
-                bar.update()
+        missing = {
+            executor.submit(run, *task): name for name, task in tasks.items() if name not in self
+        }
+        done = len(tasks) - len(missing)
+        try:
+            for future in tqdm(as_completed(missing), title, len(tasks), initial=done):
+                self.store(missing[future], future.result())
+        finally:
+            for future in missing:
+                future.cancel()
         return {name: self.load(name) for name in tasks}
 
     def remove(self) -> None:

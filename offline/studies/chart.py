@@ -19,10 +19,9 @@ of the same local models at the same loads.  They are compared with the full mod
 answers at once, and show what memory costs.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from palpate.offline.fem.norms import relative
+from palpate.offline.fem.norms import Array, relative
 from palpate.offline.methods.catalogue import Training, build
 from palpate.offline.methods.full import Full, Remeshed
 from palpate.offline.methods.method import Method, Steps
@@ -44,7 +43,6 @@ from palpate.offline.studies.references import Fields
 from palpate.shared.errors import PalpateError
 from palpate.shared.scene import Scene
 
-Array = NDArray[np.float64]
 Plan = Mapping[str, Sequence[float]]
 """Sizes of every method; see ``offline.methods.catalogue.build``."""
 
@@ -71,17 +69,12 @@ REPEATS = 3
 SLOW = 100e-3  # seconds of a step beyond which it is timed only once
 
 
-Queries = Sequence[tuple[Steps, Fields]]
-"""What methods are asked, and the full model's answers."""
+Queries = Sequence[tuple[Steps, Fields, Array | None]]
+"""What methods are asked, the full model's answers, and displacements (n, 3) in a refined mesh."""
 
 
 def chart(
-    artifact: Path,
-    scene: Scene | None,
-    snapshots: int,
-    queries: int,
-    seed: int,
-    plan: Plan | None = None,
+    artifact: Path, scene: Scene | None, snapshots: int, queries: int, seed: int
 ) -> dict[str, Any]:
     """Measure and draw speed and accuracy of every method.
 
@@ -92,9 +85,6 @@ def chart(
         histories of visco-elastic tissue.
     snapshots, queries, seed : int
         Loads or histories to learn from, and to answer: those of ``palpate validate``.
-    plan : mapping, optional
-        Sizes of every method; those of the artifact and the full model are needed.  Under loads POD
-        is measured with as many modes as the artifact has unknowns, too.
 
     Returns
     -------
@@ -108,8 +98,8 @@ def chart(
     in_time = scene is None
     layout = drawing.IN_TIME if in_time else drawing.OF_LOADS
     atlas, problem = full.opened(artifact, scene)
-    plan = plan or (PLAN_IN_TIME if in_time else PLAN)
-    if not in_time:
+    plan = PLAN_IN_TIME if in_time else PLAN
+    if not in_time:  # as many modes as the artifact has unknowns, too
         plan = {**plan, "pod": sorted({*plan["pod"], Shipped(problem, atlas).unknowns})}
     settings = snapshots, queries, seed
     checkpoint = full.kept_results(artifact, atlas.scene, layout.name, settings)
@@ -130,20 +120,20 @@ def chart(
     loads = [] if scene is None else [steps[0][0].contacts[0] for steps, _ in asked]
     tasks = {"refined": [(full.refined, scene, REFINEMENT, x) for x in loads[:REFINED_LOADS]]}
     finer = full.in_parallel(artifact, checkpoint, "refined mesh", tasks)["refined"]
+    questions = [(*query, fine) for query, fine in zip_longest(asked, finer)]
     training = Training(problem, full.snapshots(learnt), atlas, seed, in_time)
     measured: dict[str, Mapping[str, Any]] = {}
     # in this process: times are those of one core, and methods share what they learn from
     for name, size in tqdm([(name, size) for name, sizes in plan.items() for size in sizes]):
         key = f"{name} {size:g}"
         if key not in checkpoint:
-            checkpoint.store(key, measure(training, asked, finer, name, size))
+            checkpoint.store(key, measure(training, questions, name, size))
         measured[key] = checkpoint.load(key)
     usual = float(np.median([np.median(found["beside"]) for found in measured.values()]))
     rows = [_row(key, found, usual) for key, found in measured.items()]
     report = artifact.parent / atlas.name / "report"
     write_csv(report / f"{layout.name}.csv", rows)
     drawing.draw(report / f"{layout.name}.png", rows, atlas.scene, layout)
-    drawing.write_page(report / f"{layout.name}.html", rows, atlas.scene, layout)
     checkpoint.remove()
     return _summary(rows) | {"without_equilibrium": queries - len(asked)}
 
@@ -151,9 +141,7 @@ def chart(
 # --- measuring -----------------------------------------------------------------------------------
 
 
-def measure(
-    training: Training, queries: Queries, finer: Sequence[Array], name: str, size: float
-) -> dict[str, Any]:
+def measure(training: Training, queries: Queries, name: str, size: float) -> dict[str, Any]:
     """Build a method and have it answer the queries.
 
     Errors (``displacement``, ``von_mises``, ``refined``) are by query, nan where nothing is known,
@@ -162,12 +150,11 @@ def measure(
     problem = training.problem
     method, yardstick = build(name, size, training), build("artifact", 1, training)
     other_mesh = type(method) is Remeshed
-    if other_mesh:
-        queries = queries[: len(finer)]
+    queries = [query for query in queries if query[2] is not None or not other_mesh]
     for one in (method, yardstick):  # compiled code comes in from disk
         one.step(one.at_rest(), *queries[0][0][0])
     errors, times, unconverged = np.ones((len(queries), 3)), [], 0
-    for i, (steps, exact) in enumerate(queries):
+    for i, (steps, exact, finer) in enumerate(queries):
         states, seconds, missed = play(method, steps)
         times.append(seconds[_pressing(steps)])
         unconverged += missed > 0
@@ -177,10 +164,9 @@ def measure(
                 elastic = Full(full.of_tissue(problem, prony=()))
                 exact = Fields.of(elastic, play(elastic, steps)[0])
             errors[i, :2] = fields.errors(problem, exact)
-            if i < len(finer):
-                errors[i, 2] = relative(fields.displacements[-1], finer[i])
-    known = [bool(np.isfinite(u).all()) for u in finer] + [False] * (len(queries) - len(finer))
-    errors[~np.array(known), 2] = np.nan
+            if finer is not None:
+                errors[i, 2] = relative(fields.displacements[-1], finer)
+    errors[[finer is None for *_, finer in queries], 2] = np.nan
     if other_mesh:
         errors[:, :2] = np.nan
     least, beside = _times(method, yardstick, queries, np.concatenate(times))
@@ -211,7 +197,7 @@ def _times(
     """Seconds that a method needs for each step, and the yardstick in turns with it."""
 
     def run(one: Method) -> Array:
-        return np.concatenate([play(one, steps)[1][_pressing(steps)] for steps, _ in queries])
+        return np.concatenate([play(one, steps)[1][_pressing(steps)] for steps, *_ in queries])
 
     times, beside = first, run(yardstick)
     slow = np.median(first) > SLOW

@@ -1,22 +1,22 @@
-"""The speed-accuracy chart as a picture and as a page to explore.
+"""The speed-accuracy chart as a picture.
 
 Colours stand for groups of methods (palette of Okabe and Ito, safe for colour-blind eyes), markers
 for the methods of a group; a line joins the sizes of one method.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
 
 from palpate.offline.info import duration, percent
 from palpate.shared.scene import Scene
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 Row = Mapping[str, Any]
 """A method of one size: ``key``, ``family``, ``label``, ``unknowns``, ``time_us``, ``unconverged``
@@ -33,11 +33,6 @@ STATISTICS = ("median", "p95", "max")
 
 ACCENT, DARK_ACCENT = "#D55E00", "#A34700"
 """Of what is Palpate's; the second for letters."""
-
-PAGE_MARKERS = {
-    "o": "circle", "s": "square", "^": "triangle-up", "D": "diamond", "*": "star", "P": "cross",
-}  # fmt: skip
-"""Plotly's names of Matplotlib's markers."""
 
 
 class Look(NamedTuple):
@@ -137,7 +132,6 @@ MESH_PANEL = Panel(
 )  # fmt: skip
 OF_LOADS = Layout("chart", "query", (*FIELD_PANELS, MESH_PANEL), (2, 2))
 IN_TIME = Layout("chart_in_time", "step", FIELD_PANELS, (1, 3))
-TITLE = "Speed and accuracy of methods on the scene {!r}: lower left is better"
 NOTE = """\
 A point is a method of one size; a line joins its sizes.
 Errors are relative L2 norms against the full model over
@@ -159,12 +153,11 @@ def looks(rows: Sequence[Row]) -> Iterator[tuple[Look, list[Row]]]:
 
 def draw(path: Path, rows: Sequence[Row], scene: Scene, layout: Layout) -> None:
     """Draw the chart; its legend takes the place of a last panel."""
-    from matplotlib.figure import Figure
-
     down, across = layout.grid
     figure = Figure(figsize=(6.25 * across, 5.4 * down), layout="constrained")
     grid = figure.subplots(down, across).ravel()
-    figure.suptitle(TITLE.format(scene.name), fontsize=15, fontweight="bold")
+    title = f"Speed and accuracy of methods on the scene {scene.name!r}: lower left is better"
+    figure.suptitle(title, fontsize=15, fontweight="bold")
     for axes, panel in zip(grid, layout.panels, strict=False):
         _draw_panel(axes, panel, rows, layout.per)
         _draw_goals(axes, panel, rows, scene, layout.per)
@@ -224,24 +217,21 @@ def _draw_goals(axes: Axes, panel: Panel, rows: Sequence[Row], scene: Scene, per
 def _draw_names(axes: Axes, panel: Panel, rows: Sequence[Row]) -> None:
     kept = panel.plotted(rows)
     twin = [row["time_us"] for row in kept if row["key"] == TWIN]
-    for look, own in looks(kept):
-        for row in own:
-            at = time, error = row["time_us"], row[panel.error]
-            if row["key"] in NAMES:
-                text, offset, side = NAMES[row["key"]]
-                _write(axes, text, at, offset, ha=side, color=look.colour)
-            elif row["key"] == SHIPPED:
-                text = f"Palpate: {percent(error)}\nin {duration(1e-6 * time)}"
-                text += "".join(f",\n{time / x:.1f} x that without memory" for x in twin)
-                _write(axes, text, at, (12, -32), color=DARK_ACCENT, fontweight="bold")
+    for row in kept:
+        at = time, error = row["time_us"], row[panel.error]
+        if row["key"] in NAMES:
+            text, offset, side = NAMES[row["key"]]
+            _write(axes, text, at, offset, ha=side, color=LOOKS[row["family"]].colour)
+        elif row["key"] == SHIPPED:
+            text = f"Palpate: {percent(error)}\nin {duration(1e-6 * time)}"
+            text += "".join(f",\n{time / x:.1f} x that without memory" for x in twin)
+            _write(axes, text, at, (12, -32), color=DARK_ACCENT, fontweight="bold")
 
 
 def _write(
     axes: Axes, text: str, where: tuple[float, float], offset: tuple[float, float], **how: Any
 ) -> None:
     """Write next to a point, on white so that lines do not cross the letters."""
-    from matplotlib.patheffects import withStroke
-
     halo = [withStroke(linewidth=2.5, foreground="white", alpha=0.8)]
     style: dict[str, Any] = {"fontsize": 9.5, "path_effects": halo, "zorder": 6} | how
     axes.annotate(text, where, offset, textcoords="offset points", **style)
@@ -249,8 +239,6 @@ def _write(
 
 def _draw_legend(axes: Axes, rows: Sequence[Row]) -> None:
     """Groups with their methods in two columns, and what the chart shows."""
-    from matplotlib.lines import Line2D
-
     axes.axis("off")
     handles: list[Line2D] = []
     for title, own in groupby((look for look, _ in looks(rows)), lambda look: look.group):
@@ -269,71 +257,3 @@ def _draw_legend(axes: Axes, rows: Sequence[Row]) -> None:
             text.set_fontweight("bold")
     for artist in (legend, words):
         artist.set_in_layout(False)
-
-
-# --- page ----------------------------------------------------------------------------------------
-
-
-def write_page(path: Path, rows: Sequence[Row], scene: Scene, layout: Layout) -> None:
-    """Write the chart as a page that needs no network: every point tells its figures."""
-    from plotly.subplots import make_subplots
-
-    down, across = layout.grid
-    titles = [f"<b>{panel.title}</b>" for panel in layout.panels]
-    figure = make_subplots(down, across, subplot_titles=titles)
-    dashed = {"color": "#404040", "width": 1, "dash": "dash", "shape": "hv"}
-    for number, panel in enumerate(layout.panels):
-        where = {"row": 1 + number // across, "col": 1 + number % across}
-        kept, front = panel.plotted(rows), pareto(panel.plotted(rows), panel.error)
-        for look, own in looks(rows):
-            known = [row for row in own if row in kept]
-            named = panel is layout.panels[-1]
-            figure.add_scatter(**_points(known, panel), **_style(look), showlegend=named, **where)
-        line = {"mode": "lines", "line": dashed, "showlegend": False, "hoverinfo": "skip"}
-        figure.add_scatter(**_points(front, panel) | {"error_y": None} | line, **where)
-        title = f"time per {layout.per} on one core"
-        figure.update_xaxes(type="log", title=title, tickformat="~s", ticksuffix="s", **where)
-        figure.update_yaxes(type="log", title=panel.axis, tickformat="~%", **where)
-        if panel.field != "refined":
-            left, bottom = (min(row[x] for row in kept) / 2 for x in ("time_us", panel.error))
-            figure.add_shape(
-                type="rect", x0=1e-6 * left, x1=scene.budget.query, y0=bottom,
-                y1=getattr(scene.tolerance, panel.field),
-                fillcolor=ACCENT, opacity=0.12, line_width=0, **where,
-            )  # fmt: skip
-    title, height = TITLE.format(scene.name), 500 * down
-    figure.update_layout(title=title, template="plotly_white", height=height)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.write_html(path, include_plotlyjs=True)
-
-
-def _points(rows: Sequence[Row], panel: Panel) -> dict[str, Any]:
-    """Times and errors of points of the page, up to the largest, and all that is known of them."""
-    above = [row[f"{panel.field}_max"] - row[panel.error] for row in rows]
-    return {
-        "x": [1e-6 * row["time_us"] for row in rows],
-        "y": [row[panel.error] for row in rows],
-        "error_y": {"array": above, "arrayminus": [0.0] * len(above), "thickness": 0.6, "width": 0},
-        "text": [_hover(row, panel.field) for row in rows],
-    }
-
-
-def _style(look: Look) -> dict[str, Any]:
-    return {
-        "mode": "lines+markers",
-        "line": {"color": look.colour, "width": 1},
-        "name": look.name,
-        "legendgroup": look.group,
-        "legendgrouptitle": {"text": look.group},
-        "hovertemplate": f"<b>{look.name}</b><br>%{{text}}<extra></extra>",
-        "marker": {"symbol": PAGE_MARKERS[look.marker], "size": max(look.size, 9.0)},
-        "zorder": look.above,
-    }
-
-
-def _hover(row: Row, field: str) -> str:
-    errors = [f"{percent(row[f'{field}_{name}'])} ({name})" for name in STATISTICS]
-    return (
-        f"{row['label']}; {row['unknowns']} unknowns<br>{duration(1e-6 * row['time_us'])}<br>"
-        f"error {', '.join(errors)}<br>{row['unconverged']} queries without an answer"
-    )

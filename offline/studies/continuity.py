@@ -1,24 +1,19 @@
 """Whether the answer changes smoothly as the contact glides, step by step beside the full model."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from palpate.offline.bench import STEP, walk
 from palpate.offline.fem.model import NoEquilibrium
-from palpate.offline.fem.norms import relative
+from palpate.offline.fem.norms import Array, relative
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.validate.compare import OTHER_EQUILIBRIUM, opened
 from palpate.offline.validate.queries import Place, held_out_loads
 from palpate.shared.model import ReducedModel
-
-Array = NDArray[np.float64]
 
 STATISTICS = {"median": 50, "p95": 95, "max": 100}
 

@@ -5,12 +5,9 @@ holds the last report of each, with the commit and the day it was made at.  In a
 ``{displacement/mean|p95:%}`` stands for two entries of the report's ``displacement`` in percent.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import shlex
-import string
 import subprocess
 import sys
 import tomllib
@@ -29,6 +26,7 @@ RUN = "from palpate.shared.cli import main; main()"
 UNITS = {"%": (100, 2), "s": (1, 3), "ms": (1e-3, 2), "µs": (1, 3), "MB": (1e-6, 3)}
 """Factor from what reports hold (1, s, µs, bytes), and digits shown."""
 
+ENTRIES = re.compile(r"\{([^:}]*):?([^}]*)\}")
 TABLE = re.compile(r"(?<=<!-- figures -->\n).*?(?=<!-- end of figures -->)", re.DOTALL)
 
 
@@ -92,20 +90,15 @@ def _cells(found: Found, command: str, templates: list[str]) -> list[str]:
     if command not in found:
         return ["not measured"] * len(templates) + [""]
     made = found[command]
-    cells = [_Format().vformat(template, (made["report"],), {}) for template in templates]
-    return [*cells, f"{made['commit']}, {made['date']}"]
 
-
-class _Format(string.Formatter):
-    def get_field(self, field_name: str, args: Any, kwargs: Any) -> Any:
-        *path, last = field_name.split("/")
-        entry = args[0]
+    def told(entries: re.Match[str]) -> str:
+        (*path, last), entry = entries[1].split("/"), made["report"]
         for key in path:
             entry = entry.get(key, {})
-        return [entry.get(key) for key in last.split("|")], field_name
+        return " / ".join(_text(entry.get(key), entries[2]) for key in last.split("|"))
 
-    def format_field(self, value: Any, format_spec: str) -> str:
-        return " / ".join(_text(entry, format_spec) for entry in value)
+    cells = [ENTRIES.sub(told, template) for template in templates]
+    return [*cells, f"{made['commit']}, {made['date']}"]
 
 
 def _text(value: Any, spec: str) -> str:

@@ -7,20 +7,17 @@ The same holds where a load that was raised beyond the range and lowered again l
 elsewhere than one raised from nothing: there the right answer is the one that the path led to.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.offline.bench import walk
 from palpate.offline.fem.mesh import accessible_surface
 from palpate.offline.fem.model import NoEquilibrium
-from palpate.offline.fem.norms import relative
+from palpate.offline.fem.norms import Array, relative
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.methods.method import Case, Steps
 from palpate.offline.reduce.sampling import cone, random_points
@@ -29,7 +26,6 @@ from palpate.offline.studies.references import Fields, followed, of_tissue
 from palpate.offline.validate.queries import Place, random_loads
 from palpate.shared.model import ReducedModel
 
-Array = NDArray[np.float64]
 Rng = np.random.Generator
 
 CONTROL, SEVERAL = "inside the range", "several equilibria"
@@ -71,7 +67,6 @@ class HardCase:
     tip: bool = False  # whether the rigid tip presses
     follow: bool = False  # whether the full model follows the load path
     brief: Steps = ()  # fewer steps to the same end, which the full model follows instead
-    nonsense: bool = False  # whether the right answer is to refuse
 
     @property
     def end_only(self) -> bool:
@@ -107,7 +102,8 @@ def ask_full_model(problem: FullProblem, case: HardCase) -> Question:
     """Full solutions of a hard case; a task for ``run.workers``."""
     own = of_tissue(problem, poisson=case.poisson)
     if case.history:
-        found = None if case.nonsense else followed(own, case.brief or case.steps, case.tip)
+        sensible = all(dt >= 0.0 for _, dt in case.steps)
+        found = followed(own, case.brief or case.steps, case.tip) if sensible else None
         return Question(case, found, found)
     path = [step.load(len(own.mesh.nodes)) for step, _ in case.steps]
     load = path[-1]

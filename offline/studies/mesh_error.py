@@ -7,23 +7,19 @@ the nodes happen to lie.  Another fine mesh says how far the reference can be tr
 edge slows every element's convergence, so that a few per cent between fine meshes remain.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from palpate.offline.fem.mesh import local_thickness
+from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.sampling import spread_points
 from palpate.offline.run.tables import write_csv
 from palpate.offline.scenes import find_scene
 from palpate.shared.scene import ElementName
-
-Array = NDArray[np.float64]
 
 POINTS = 12
 INDENTATION = 0.25  # displacement under the footprint over the local thickness
@@ -98,14 +94,10 @@ def mesh_error(report: Path) -> dict[str, Any]:
         solved = [body.press_at(*load) for load in loads]
         moved = np.array([[np.linalg.norm(u, axis=1).max(), np.linalg.norm(v)] for u, v in solved])
         exact = moved if exact is None else exact
-        rows[str(how)] = {
-            "dofs": body.mesh.nodes.size,
-            "points": 8 * len(body.mesh.elements),
-        } | {
+        errors = zip(("largest", "under_footprint"), (moved / exact - 1).T, strict=True)
+        rows[str(how)] = {"dofs": body.mesh.nodes.size, "points": 8 * len(body.mesh.elements)} | {
             f"{name}_{key}": float(of(error))
-            for name, error in zip(
-                ("largest", "under_footprint"), (moved / exact - 1).T, strict=True
-            )
+            for name, error in errors
             for key, of in (("least", np.min), ("mean", np.mean), ("greatest", np.max))
         }
     write_csv(report / "mesh_error.csv", [{"mesh": name} | row for name, row in rows.items()])

@@ -6,8 +6,6 @@ is told apart and counted with the others: where a load has several equilibria, 
 path does not lead to.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -16,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.info import percent
@@ -168,9 +168,6 @@ def _draw(
     path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str], asked: str
 ) -> None:
     """Draw a bar of outcomes for each method and kind of case, its median error below."""
-    from matplotlib.figure import Figure
-    from matplotlib.patches import Patch
-
     methods = list(dict.fromkeys(row["method"] for row in rows))
     size = 3.2 + 0.72 * len(columns), 2.8 + 0.44 * len(methods)
     figure = Figure(figsize=size, layout="constrained")

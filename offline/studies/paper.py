@@ -29,8 +29,6 @@ largest value in the history.  On the cube the relaxed tissue is softer and woul
 the pressure is smaller by the share of the shear modulus that is lost.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import itemgetter
@@ -42,7 +40,7 @@ from numpy.typing import NDArray
 from scipy.stats import spearmanr
 from tqdm import tqdm
 
-from palpate.offline.fem.norms import relative
+from palpate.offline.fem.norms import Array, relative
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods.full import Full
 from palpate.offline.methods.galerkin import Galerkin
@@ -59,7 +57,6 @@ from palpate.offline.studies.relaxation import Phases, load_steps
 from palpate.shared.geometry.quadrature import surface_quadrature
 from palpate.shared.scene import Block
 
-Array = NDArray[np.float64]
 Claims = dict[str, dict[str, Any]]
 Nodes = dict[str, tuple[Array, Array]]
 """Values (n,) by name, mm or kPa, and their relative errors, nan where there is no value."""

@@ -1,18 +1,16 @@
 """Charts and contours of ``offline.studies.paper``; the contours need the extra ``pictures``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
+from palpate.offline.fem.norms import Array
 from palpate.offline.methods.galerkin import TOLERANCE
 from palpate.offline.pictures import INK, body, new_plotter, ring, save
 from palpate.shared.local_models import Mesh
-
-Array = NDArray[np.float64]
 
 STYLES = {"MOD": ("#0072B2", "o"), "RITZ": ("#E69F00", "s"), "POD": ("#009E73", "D")}
 """Colours that the colour-blind tell apart (Okabe & Ito), and marks for print."""
@@ -30,9 +28,6 @@ DECADES = 4  # most powers of ten that a scale of colours shows
 
 def chart(path: Path, rows: list[dict[str, Any]], title: str) -> None:
     """Figures 1a and 1b: error at P and ratio of CPU times against the number of bases."""
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
     figure = Figure(figsize=(9.6, 4.4), layout="constrained")
     figure.suptitle(title, fontsize=12)
     errors, ratios = figure.subplots(1, 2)
@@ -49,16 +44,15 @@ def chart(path: Path, rows: list[dict[str, Any]], title: str) -> None:
     ticks = sorted({row["bases"] for row in rows})
     words = {"va": "top", "color": "0.3", "fontsize": 9}
     errors.text(ticks[0], 80 * TOLERANCE, "tolerance of the solver", **words)
-    plain = FuncFormatter(lambda value, _: f"{value:g}")
     for axes in (errors, ratios):
         axes.set(xscale="log", yscale="log", xlim=(0.9 * ticks[0], 1.1 * ticks[-1]))
         axes.set_xticks(ticks, [str(tick) for tick in ticks])
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.yaxis.set_major_formatter(plain)
+        axes.xaxis.set_minor_formatter("")
+        axes.yaxis.set_major_formatter("{x:g}")
         axes.set_xlabel("number of bases", fontsize=12)
         axes.grid(color="0.9")
     ratios.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
-    ratios.yaxis.set_minor_formatter(plain)
+    ratios.yaxis.set_minor_formatter("{x:g}")
     errors.set_ylabel("(a) relative error of displacement at P, %", fontsize=12)
     ratios.set_ylabel("(b) CPU time, full model / reduced", fontsize=12)
     ratios.legend(fontsize=11, loc="lower left")

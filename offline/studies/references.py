@@ -1,18 +1,16 @@
 """Full solutions that studies learn from and compare with, computed by worker processes."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.fem.norms import relative
+from palpate.offline.fem.norms import Array, relative
 from palpate.offline.fem.problem import FullProblem, Load, TipPosition
 from palpate.offline.methods.full import Remeshed
 from palpate.offline.methods.method import Case, Method, Snapshots, Steps
@@ -23,8 +21,6 @@ from palpate.shared.errors import PalpateError
 from palpate.shared.model import ReducedModel
 from palpate.shared.scene import Scene, parse_scene
 
-Array = NDArray[np.float64]
-
 
 class Fields(NamedTuple):
     """Displacements and von Mises stresses at the moments of a history."""
@@ -33,14 +29,14 @@ class Fields(NamedTuple):
     stresses: NDArray[Any]  # (t, n) kPa
 
     @classmethod
-    def of(cls, method: Method, states: Sequence[Any]) -> Fields:
+    def of(cls, method: Method, states: Sequence[Any]) -> Self:
         """Recover the fields of a method's states."""
         return cls(
             np.array([method.displacement(state) for state in states]),
             np.array([method.von_mises(state) for state in states]),
         )
 
-    def errors(self, problem: FullProblem, exact: Fields) -> tuple[float, float]:
+    def errors(self, problem: FullProblem, exact: Self) -> tuple[float, float]:
         """Relative L2 errors over the moments and all nodes, or those beyond the clamped layer."""
         kept = problem.beyond_clamped_layer
         u, s = (field.astype(float) for field in exact)
@@ -127,13 +123,11 @@ def _remeshed(text: str, folder: Path | None, factor: float) -> Remeshed:
     return Remeshed(FullProblem(parse_scene(text, folder)), factor)
 
 
-def refined(problem: FullProblem, scene: Scene, factor: float, load: Load) -> Array:
-    """Displacement (n, 3) mm of a scene's nodes in a finer mesh, nan without an equilibrium.
+def refined(problem: FullProblem, scene: Scene, factor: float, load: Load) -> Array | None:
+    """Displacement (n, 3) mm of a scene's nodes in a finer mesh, if there is an equilibrium.
 
     A task for ``run.workers``.
     """
     method = _remeshed(scene.text, scene.folder, factor)
     answer = method.solve(Case.of(problem, load))
-    if answer.converged:
-        return method.displacement(answer.state)
-    return np.full((len(problem.mesh.nodes), 3), np.nan)
+    return method.displacement(answer.state) if answer.converged else None

@@ -1,24 +1,17 @@
 """Press, hold, release: the depth of the dent and the force over time, of both models."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from matplotlib.figure import Figure
 from tqdm import tqdm
 
-from palpate.offline.methods.full import Full
-from palpate.offline.methods.method import Case
-from palpate.offline.methods.shipped import Shipped
+from palpate.offline.fem.norms import Array
 from palpate.offline.run.tables import write_csv
-from palpate.offline.studies.chart import play
-from palpate.offline.validate.compare import opened
+from palpate.offline.validate.compare import opened, play
 from palpate.offline.validate.queries import HISTORIES, Place
-
-Array = NDArray[np.float64]
 
 PRESSED = 0.8  # pressure over its limit
 
@@ -42,19 +35,15 @@ def relaxation(artifact: Path, position: Sequence[float] | None = None) -> dict[
     vertices = atlas.surface.vertices
     middle = vertices[np.linalg.norm(vertices - vertices.mean(axis=0), axis=1).argmin()]
     place = Place.at(atlas, middle if position is None else np.array(position))
-    steps = [
-        (Case.of(problem, place.press(-place.normal, share * PRESSED)), dt)
-        for dt, share in load_steps(PHASES)
-    ]
-    reduced, full = Shipped(problem, atlas, "in time"), Full(problem)
-    reduced.solve(steps[0][0])  # compiles
-    answers, *_ = play(reduced, steps)
-    exact = [
-        problem.under(place.position, past.displacement)
-        for past in play(full, tqdm(steps, "full"))[0]
-    ]
-    moved = list(zip(exact, [answer.contact_displacement for answer in answers], strict=True))
-    times, depth = np.cumsum([dt for _, dt in steps]), -np.array(moved) @ place.normal
+    steps = load_steps(PHASES)
+    loads = [place.press(-place.normal, share * PRESSED, dt) for dt, share in steps]
+    play(atlas, loads[:1])  # compiles
+    answers, moved, past = play(atlas, loads), [], None
+    for load, answer in zip(tqdm(loads, "full"), answers, strict=True):
+        found = problem.solve(load, past)
+        past, under = found.past, problem.under(place.position, found.displacement)
+        moved.append((under, answer.contact_displacement))
+    times, depth = np.cumsum([dt for dt, _ in steps]), -np.array(moved) @ place.normal
     force = np.array([np.linalg.norm(answer.force) for answer in answers])
     report = artifact.parent / atlas.name / "report"
     names = "time_s", "force_mN", "depth_full_mm", "depth_reduced_mm"
@@ -85,8 +74,6 @@ def load_steps(phases: Phases) -> list[tuple[float, float]]:
 
 def _draw(path: Path, times: Array, force: Array, full: Array, reduced: Array) -> None:
     """Force above, depth below, over time."""
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(8, 4.8), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1, 2))
     ends = np.cumsum([seconds for seconds, _, _ in PHASES])

@@ -11,8 +11,6 @@ start from its last answer: no other method is asked under a moving tool.  In ti
 Galerkin models with every quadrature point and the full model in larger steps.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -28,17 +26,10 @@ from palpate.offline.methods.catalogue import Training, build
 from palpate.offline.methods.method import Method, Steps
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.studies import hard_cases, outcomes
+from palpate.offline.studies import references as full
 from palpate.offline.studies.hard_cases import HardCase, Question
 from palpate.offline.studies.outcomes import Result
-from palpate.offline.studies.references import (
-    Fields,
-    in_parallel,
-    kept_results,
-    of_tissue,
-    opened,
-    random_steps,
-    snapshots,
-)
+from palpate.offline.studies.references import Fields
 from palpate.offline.studies.trajectories import histories
 from palpate.shared.model import ReducedModel
 from palpate.shared.scene import Scene
@@ -113,7 +104,7 @@ def stability(
         has no answer to.
     """
     in_time = scene is None
-    atlas, problem = opened(artifact, scene)
+    atlas, problem = full.opened(artifact, scene)
     title, rows, stage, most = (
         ("stability_in_time", METHODS_IN_TIME, Stage.STABILITY_IN_TIME_SNAPSHOTS, SNAPSHOTS_IN_TIME)
         if in_time
@@ -129,22 +120,22 @@ def stability(
     asked = {kind: asked[kind] for kind in kinds or asked}
     poissons = sorted({case.poisson for own in asked.values() for case in own})
     random = stream(atlas.scene.seed, stage)
-    given = random_steps(atlas, problem, learnt or most, random, in_time)
+    given = full.random_steps(atlas, problem, learnt or most, random, in_time)
     learning = {f"snapshots {p:g}": [HardCase(x, p, in_time) for x in given] for p in poissons}
     settings = cases, seed, many, len(given), list(asked), wanted
-    checkpoint = kept_results(artifact, atlas.scene, title, settings)
+    checkpoint = full.kept_results(artifact, atlas.scene, title, settings)
     tasks = {
         kind: [(hard_cases.ask_full_model, case) for case in own]
         for kind, own in (asked | learning).items()
     }
-    solved = in_parallel(artifact, checkpoint, "full solutions", tasks)
+    solved = full.in_parallel(artifact, checkpoint, "full solutions", tasks)
     questions = {kind: solved[kind] for kind in asked}
     questions |= hard_cases.several(questions, cases)
     table: dict[str, dict[str, list[Result]]] = {name: {} for name in wanted}
     for poisson, solutions in zip(poissons, learning, strict=True):
         pairs = [(question.case.steps, question.jump) for question in solved[solutions]]
-        own_tissue = of_tissue(problem, poisson=poisson)
-        training = Training(own_tissue, snapshots(pairs), atlas, in_time=in_time)
+        own_tissue = full.of_tissue(problem, poisson=poisson)
+        training = Training(own_tissue, full.snapshots(pairs), atlas, in_time=in_time)
         for name in tqdm(wanted, f"methods, Poisson {poisson:g}"):
             label = f"answers {name} {poisson:g}"
             if label not in checkpoint:
@@ -205,8 +196,6 @@ def _answer(method: Method, problem: FullProblem, question: Question, every: int
             states, trusted, refused = _play(method, steps, ends, len(counted))
             if refused:
                 return Result(outcomes.REFUSED)
-            if case.nonsense and states:
-                return Result(outcomes.SILENT if trusted else outcomes.WRONG_FLAGGED)
             if exact is not None:
                 exact = Fields(*(field[counted] for field in exact))
             found = Fields.of(method, states) if states else None

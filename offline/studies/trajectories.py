@@ -6,14 +6,12 @@ periods repeat.  Then only the ends are compared.  Each kind is tried with footp
 scene has one, with the rigid tip, in the same places.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache, partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods.method import Case
 from palpate.offline.reduce.sampling import random_points_and_rim, tangents
@@ -23,8 +21,6 @@ from palpate.offline.studies.relaxation import load_steps
 from palpate.offline.validate.queries import Place
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.model import ReducedModel
-
-Array = NDArray[np.float64]
 
 CONTROL = "press, hold, let go"
 
@@ -57,26 +53,21 @@ def histories(
     places = list(random_points_and_rim(atlas.surface, cases, rng))
     press, tissue = _presser(atlas, problem, tip), atlas.scene.tissue
     large = SHORT * max(tau for _, tau in tissue.prony)
-
-    def case(steps: Sequence[Step], brief: Sequence[Step] = (), nonsense: bool = False) -> HardCase:
-        return HardCase(
-            steps, tissue.poisson, history=True, tip=tip, brief=brief, nonsense=nonsense
-        )
-
+    case = partial(HardCase, poisson=tissue.poisson, history=True, tip=tip)
     found = {
-        name: [case(list(course(at)), nonsense=name.startswith("time ")) for at in places]
+        name: [case(list(course(at))) for at in places]
         for name, course in _courses(press, large, rng, places, atlas.surface).items()
         if not (tip and "direction" in name)
     }
     at, few = places[-1], many // 10
     for seconds, steps, shown in ((LONG, few, "10 000"), (large, many, f"{large:g}")):
-        held = _levels(press, np.full(steps, DEEP), seconds / steps, at)
-        brief = list(_growing(press, seconds, at))
-        found[f"held for {shown} s, {steps} steps"] = [case([*_pressed(press, at), *held], brief)]
+        levels = _levels(press, np.full(steps, DEEP), seconds / steps, at)
+        held = case([*_pressed(press, at), *levels], brief=list(_growing(press, seconds, at)))
+        found[f"held for {shown} s, {steps} steps"] = [held]
     phase = 2 * np.pi * np.arange(1, PERIOD + 1) / PERIOD
     period = list(_levels(press, 0.5 + 0.3 * np.cos(phase), 0.02, at))
     repeats = max(many // PERIOD, 1)
-    periodic = case(repeats * period, min(repeats, PERIODS) * period)
+    periodic = case(repeats * period, brief=min(repeats, PERIODS) * period)
     return found | {f"moves periodically, {many} steps": [periodic]}
 
 

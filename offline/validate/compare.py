@@ -4,21 +4,18 @@ A query is a list of time steps; without time its length is one.  The errors fou
 reduced model's estimate of them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
-from palpate.offline.fem.norms import relative, statistics
+from palpate.offline.fem.norms import Array, relative, statistics
 from palpate.offline.fem.problem import FullProblem, Load, Reference, Step
 from palpate.offline.run.tables import write_csv
-from palpate.offline.run.workers import completed, open_artifact, worker_pool
+from palpate.offline.run.workers import open_artifact, run, worker_pool
 from palpate.offline.validate.queries import LOADS, Kind, held_out
 from palpate.shared.answer import Answer
 from palpate.shared.artifact import read_artifact
@@ -26,8 +23,6 @@ from palpate.shared.errors import PalpateError, QueryError
 from palpate.shared.local_models import Estimator
 from palpate.shared.model import ReducedModel
 from palpate.shared.reduced.transfer import REST
-
-Array = NDArray[np.float64]
 
 OTHER_EQUILIBRIUM = 0.1
 """Displacement error beyond which the models rest in different equilibria: a free edge can slip off
@@ -82,13 +77,9 @@ class Compared(NamedTuple):
 
 @dataclass
 class KnownAnswer:
-    """An answer of the reduced model whose errors are known.
+    """An answer of the reduced model whose errors are known."""
 
-    The errors are the largest until then, relative to the largest norms until then, which do not
-    vanish where an error changes its sign.
-    """
-
-    errors: Array  # (quantities,)
+    errors: Array  # (quantities,), the largest so far: see ``Compared.so_far``
     features: Array  # of the error estimate
     converged: bool
     comparable: bool  # counts for the estimate: both models rest in the same equilibrium
@@ -274,18 +265,19 @@ def against_full(
     """
     model, problem = opened(artifact, kind)
     queries = kind.random(model, count, held_out(model, seed))
-    tasks = {str(i): reference_task(model, query) for i, query in enumerate(queries)}
-    rows = {}
+    tasks = [reference_task(model, query) for query in queries]
     with worker_pool(open_artifact, artifact) as pool:
-        for name, full in tqdm(completed(pool, tasks), "full solutions", count):
-            if full is not None:
-                rows[int(name)] = compare(kind, problem, model, queries[int(name)], full)
+        solved = tqdm(pool.map(run, *zip(*tasks, strict=True)), "full solutions", count)
+        rows = [
+            compare(kind, problem, model, query, full)
+            for query, full in zip(queries, solved, strict=True)
+            if full is not None
+        ]
     if not rows:
         raise PalpateError(f"{artifact}: the full model has no equilibrium under any of the loads")
-    ordered = [rows[i] for i in sorted(rows)]
     if csv:
-        write_rows(csv, kind, ordered)
-    return summarise(kind, ordered) | {"without_equilibrium": count - len(ordered)}
+        write_rows(csv, kind, rows)
+    return summarise(kind, rows) | {"without_equilibrium": count - len(rows)}
 
 
 def reference_task(model: ReducedModel, query: Sequence[Step]) -> tuple[Any, ...]:

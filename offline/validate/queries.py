@@ -1,13 +1,11 @@
 """Random queries of every kind, over the whole surface and range of loads."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import Load, Step, TipPosition
 from palpate.offline.reduce.sampling import (
     cone,
@@ -19,8 +17,6 @@ from palpate.offline.run.streams import Stage, stream
 from palpate.shared.local_models import LocalModels
 from palpate.shared.mechanics.footprint import TIP_DEPTH, pressure_limit
 from palpate.shared.model import ReducedModel
-
-Array = NDArray[np.float64]
 
 MOVEMENTS = 4
 """Of the tool in a history, after it has been pressed on."""
@@ -41,7 +37,7 @@ class Place(NamedTuple):
     radius: float  # mm, of the endoscope
 
     @classmethod
-    def at(cls, model: ReducedModel, point: Array) -> Place:
+    def at(cls, model: ReducedModel, point: Array) -> Self:
         """The place nearest to a point (3,) mm."""
         x, normal, _, limits = model.surface.locate(point, model.limits)
         return cls(x, normal, limits, model.scene.endoscope.radius)

@@ -104,7 +104,7 @@ class Plate:
         self.limits = np.tile(np.eye(LIMIT_FIELDS)[1:4].sum(axis=0), (21 * 21, 1))
         self.limits[:, 0] = LIMIT
         self.models = SimpleNamespace(centres=np.zeros((40, 3)))
-        self.scene = SimpleNamespace(endoscope=SimpleNamespace(max_tilt=30.0))
+        self.scene = SimpleNamespace(endoscope=SimpleNamespace(max_tilt=30.0, radius=RADIUS))
         self.snap = snap
 
     def press(self, position, pressure, direction):
@@ -166,7 +166,6 @@ class Edge(Plate):
         super().__init__(np.inf)
         self.limits[:, TIP_DEPTH] = 1.0
         self.models = SimpleNamespace(centres=np.zeros((100, 3)))
-        self.scene = SimpleNamespace(endoscope=SimpleNamespace(radius=RADIUS))
         self.slip = slip
 
     def new_warm(self):
