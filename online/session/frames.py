@@ -85,11 +85,12 @@ class Reason(IntEnum):
     BELOW_SURFACE = 2
 
 
-REASONS_MEAN = {
-    Reason.NONE: "",
-    Reason.NO_EQUILIBRIUM: "no equilibrium was found there",
-    Reason.BELOW_SURFACE: "the tip's centre lies below the surface of the tissue",
-}
+REASONS_MEAN = (
+    "",
+    "no equilibrium was found there",
+    "the tip's centre lies below the surface of the tissue",
+)
+"""By the number of the `Reason`."""
 
 
 class Field(NamedTuple):
@@ -241,14 +242,14 @@ def _check_version(frame: bytes) -> None:
 
 
 class Extras(NamedTuple):
-    """What a reply holds on request; arrays are C-contiguous."""
+    """What a reply holds on request."""
 
     outputs: int = 0  # bits of `Output`: what is there
-    coordinates: Array | None = None  # (MODELS, r), float32
-    displacement: Array | None = None  # (n, 3), mm, float32 or float16
-    von_mises: Array | None = None  # (n,), kPa, float32 or float16
+    coordinates: int = 0  # per local model
+    nodes: int = 0  # of the fields
     max_von_mises: float = 0.0  # kPa
     p99_von_mises: float = 0.0  # kPa
+    fields: Sequence[Array] = ()  # C-contiguous, all that follows in the frame
 
 
 NO_EXTRAS = Extras()
@@ -276,7 +277,6 @@ def encode_reply(
     """Write a reply frame; `received` and `sent` (s) are on the server's clock."""
     touch = answer.touch
     absent = MODELS - len(touch.parts)
-    fields = [field for field in extras[2:4] if field is not None]
     largest = _LARGEST if answer.flags & _IN_RANGE else -1.0  # of an error that is known
     head = _REPLY.pack(
         VERSION,
@@ -304,19 +304,15 @@ def encode_reply(
         *([part[0] for part in touch.parts] + [-1] * absent),
         *([part[1] for part in touch.parts] + [0.0] * absent),
         superseded,
-        len(fields[0]) if fields else 0,
+        extras.nodes,
         touch.iterations,
         answer.steps,
-        0 if extras.coordinates is None else extras.coordinates.shape[1],
+        extras.coordinates,
         extras.outputs,
         touch.depth_limit,
         answer.reason,
     )
-    if extras is NO_EXTRAS:
-        return head
-    if extras.coordinates is not None:
-        fields.insert(0, extras.coordinates)
-    return b"".join((head, *(field.data for field in fields)))
+    return b"".join((head, *(field.data for field in extras.fields)))
 
 
 def decode_reply(frame: bytes) -> Reply:
@@ -376,13 +372,14 @@ def tables() -> str:
         lines += [f"{title.capitalize()}, {frame['size']} bytes:", ""]
         lines += ["| offset | field | type | unit | meaning |", "|---|---|---|---|---|"]
         for f in frame["fields"]:
-            kind = f["type"] + "".join(f"[{n}]" for n in f["shape"])
-            lines.append(f"| {f['offset']} | {f['name']} | {kind} | {f['unit']} | {f['meaning']} |")
+            type_ = f["type"] + "".join(f"[{n}]" for n in f["shape"])
+            columns = f["offset"], f["name"], type_, f["unit"], f["meaning"]
+            lines.append(f"| {' | '.join(map(str, columns))} |")
         lines.append("")
     for title, meanings in (
         ("bit of `outputs`", [(bit, bit.meaning) for bit in Output]),
         ("bit of `flags`", [(bit, bit.meaning) for bit in Flag]),
-        ("`reason`", REASONS_MEAN.items()),
+        ("`reason`", zip(Reason, REASONS_MEAN, strict=True)),
     ):
         lines += [f"| {title} | name | meaning |", "|---|---|---|"]
         lines += [f"| {v.value} | {v.name} | {meaning} |" for v, meaning in meanings]

@@ -4,7 +4,7 @@ A recording is an HDF5 file with one dataset for each field of a reply (`session
 row for each reply in order of arrival, and beside them what was asked for and when. Every dataset
 has ``units`` and a ``description``. Since an answer depends on those before it, and on how many
 positions were solved for each (``steps``), the recording of a whole session is enough to answer it
-again, bit for bit (`session.replay`).
+again, bit for bit (`session.tracker.replay`).
 """
 
 import json

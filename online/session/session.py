@@ -21,8 +21,8 @@ from palpate.online.serve.errors import Refusal, as_refusal, check_json_size
 from palpate.online.serve.schemas import Position, Strict, parse
 from palpate.online.serve.store import ServedModel, Service
 from palpate.online.session import frames
-from palpate.online.session.frames import Flag, Output, Reason, Request
-from palpate.online.session.tracker import LONGEST, Snapshot, ToolTracker, recover
+from palpate.online.session.frames import Flag, Output, Request
+from palpate.online.session.tracker import LONGEST, ToolTracker, recover
 from palpate.online.session.websocket import CONNECTION, LINGER, MOST_FRAMES, STOPPING
 
 logger = logging.getLogger(__name__)
@@ -119,7 +119,6 @@ class Session:
         self._served, self._model = served, served.model
         self._receive, self._send = receive, send
         self._connection = scope["extensions"][CONNECTION]
-        self._snapshots: dict[int, Snapshot] = {}
         self._received = self._full_at = 0.0
         self._superseded = 0
         self._sending, self._since = True, perf_counter()
@@ -245,11 +244,11 @@ class Session:
     def _obey(self, command: str, number: int) -> str:
         """Keep the state of the tissue or go back to one that was kept; echo the command."""
         if command == "snapshot":
-            self._snapshots[number] = self._tracker.snapshot()
-        elif number in self._snapshots:
-            self._tracker.restore(self._snapshots[number])
+            self._tracker.snapshot(number)
+        elif number in self._tracker.snapshots:
+            self._tracker.restore(number)
         else:
-            kept = sorted(self._snapshots)
+            kept = sorted(self._tracker.snapshots)
             raise Refusal("unknown_snapshot", "restore", "None was kept by this number", kept)
         return orjson.dumps({command: number}).decode()
 
@@ -321,5 +320,5 @@ def write_reply(frame: bytes) -> str:
     reply = frames.decode_reply(frame)
     document = {name: value for name, value in reply._asdict().items() if value is not None}
     document["flags"], document["outputs"] = names(Flag(reply.flags)), names(Output(reply.outputs))
-    document["reason"] = frames.REASONS_MEAN[Reason(reply.reason)]
+    document["reason"] = frames.REASONS_MEAN[reply.reason]
     return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY).decode()
