@@ -166,7 +166,7 @@ def _work(settings: Settings, url: str, table: Path) -> FastAPI:
     """Make the application of one worker, in its own process."""
     # Not before: the supervisor has no use for the models' code.
     from palpate.online.serve.app import create_app
-    from palpate.online.serve.store import Service
+    from palpate.online.serve.service import Service
 
     set_up_log(settings)
     # Uvicorn tells of every session that opens; that it starts and ends, the supervisor tells.
@@ -174,7 +174,6 @@ def _work(settings: Settings, url: str, table: Path) -> FastAPI:
     # On systems without file locks there is one worker, which has no use for a table.
     metrics = Metrics(table if settings.workers > 1 else None)
     service = Service(settings, metrics)
-    store = service.store
 
     def greet() -> None:
         if settings.realtime:
@@ -182,10 +181,10 @@ def _work(settings: Settings, url: str, table: Path) -> FastAPI:
         logger.info("worker %d is ready", metrics.worker)
         if metrics.worker or metrics.restarted:
             return  # the first worker says it once
-        for refused in store.refused:
+        for refused in service.refused:
             click.echo(f"Refused {refused['reason']}")
-        click.echo(f"Serving {', '.join(store.models) or 'nothing'} on {url} (API: {url}/docs)")
-        for name, model in list(store.models.items())[:1]:
+        click.echo(f"Serving {', '.join(service.models) or 'nothing'} on {url} (API: {url}/docs)")
+        for name, model in list(service.models.items())[:1]:
             click.echo(
                 f"Try: curl {url}/scenes/{name}/solve -H 'Content-Type: application/json' "
                 f"-d '{json.dumps({'contacts': [model.example]})}'"

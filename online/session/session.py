@@ -19,7 +19,7 @@ from starlette.types import Message, Receive, Scope, Send
 
 from palpate.online.serve.errors import Refusal, as_refusal, check_json_size
 from palpate.online.serve.schemas import Position, Strict, parse
-from palpate.online.serve.store import ServedModel, Service
+from palpate.online.serve.service import ServedModel, Service
 from palpate.online.session import frames
 from palpate.online.session.frames import Flag, Output, Request
 from palpate.online.session.tracker import LONGEST, ToolTracker, recover
@@ -64,7 +64,7 @@ class Sessions:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Refuse a session or run it until it ends."""
-        served = self._service.store.model(scope["path_params"]["name"])
+        served = self._service.model(scope["path_params"]["name"])
         if not served.model.has_tip:
             raise Refusal(
                 "no_tip", "name", "This scene was trained without a tip; it only answers loads"

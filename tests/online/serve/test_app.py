@@ -4,8 +4,14 @@ import pytest
 from starlette.testclient import TestClient
 
 from palpate.online.serve.app import create_app
-from palpate.online.serve.schemas import Accessible, Answer, Mesh, SceneList, SceneSummary
-from palpate.online.serve.store import Service
+from palpate.online.serve.schemas import (
+    AccessibleDocument,
+    Answer,
+    MeshDocument,
+    SceneList,
+    SceneSummary,
+)
+from palpate.online.serve.service import Service
 from palpate.online.serve.wire import BINARY, JSON, MSGPACK
 from palpate.online.settings import Settings
 from palpate.shared.errors import PalpateError
@@ -46,7 +52,7 @@ def test_a_service_that_is_told_to_stop_does_not_wait_for_its_models(slow):
     service, loaded = slow
     with TestClient(create_app(service)) as client:
         assert client.get("/ready").status_code == 503
-    assert not service.store.ready
+    assert not service.ready
     assert not loaded.is_set()
     loaded.set()
 
@@ -80,8 +86,8 @@ def test_answers_are_as_documented(client):
     answer = client.post("/scenes/toy/solve", json={**example, "region": "surface"}).text
     documents = {
         Answer: answer,
-        Accessible: client.get("/scenes/toy/accessible").text,
-        Mesh: client.get("/scenes/toy/mesh").text,
+        AccessibleDocument: client.get("/scenes/toy/accessible").text,
+        MeshDocument: client.get("/scenes/toy/mesh").text,
         SceneList: client.get("/scenes").text,
         SceneSummary: client.get("/scenes/toy").text,
     }
