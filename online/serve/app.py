@@ -107,10 +107,9 @@ def _prepare(here: Service, sessions: Sessions, on_ready: Callable[[], None]) ->
 def _warm(sessions: Sessions, served: ServedModel) -> None:
     """Call every kernel and encoder once, so that no client pays for a first time."""
     uncounted = Metrics()
-    for region in ("none", "surface", "all"):
+    for region, media_type in zip(("surface", "all", "none"), OFFERED, strict=True):
         body = orjson.dumps({"contacts": [served.example], "region": region})
-        for media_type in OFFERED:
-            answer(served.model, parse(SolveRequest, body), media_type, uncounted)
+        answer(served.model, parse(SolveRequest, body), media_type, uncounted)
     models, radius = served.model.models, served.model.scene.endoscope.radius
     tour: list[int] = []
     if models.viscous is not None:  # a history goes from one local model to the next and back

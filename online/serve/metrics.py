@@ -8,6 +8,7 @@ Prometheus' own client takes some 2 µs for every number, of which a frame chang
 milliseconds to write the text, in which nobody is answered. This takes 1.5 µs and 0.2 ms.
 """
 
+import math
 import mmap
 import os
 from bisect import bisect_left
@@ -65,6 +66,7 @@ FAMILIES = (
     Family("counter", "palpate_sessions_opened_total", "Sessions opened"),
     Family("counter", "palpate_worker_starts_total", "Starts of the worker"),
     Family("gauge", "palpate_worker_pid", "Process number of the worker"),
+    Family("gauge", "palpate_worker_resident_bytes", "Memory that the worker holds"),
 )
 _KEYS = [(family, (family.name, *value)) for family in FAMILIES for value in family.values]
 _WIDTHS = (_SUM + 1 if family.type == "histogram" else 1 for family, _ in _KEYS)
@@ -76,7 +78,7 @@ _QUERY_PHASES, _FRAME_PHASES = (_CELLS["palpate_phase_seconds", k, PHASES[0]] fo
 _QUERY_QUEUE, _FRAME_QUEUE = (_CELLS["palpate_queue_seconds", kind] for kind in KINDS)
 _QUERY_OUT_OF_RANGE = _CELLS["palpate_flags_total", "query", "out_of_range"]
 _ANSWERED, _SUPERSEDED, _REFUSED = (_CELLS["palpate_frames_total", name] for name in FRAMES)
-_SESSIONS, _OPENED, _STARTS, _PID = (_CELLS[family.name,] for family in FAMILIES[-4:])
+_SESSIONS, _OPENED, _STARTS, _PID, _RESIDENT = (_CELLS[f.name,] for f in FAMILIES[-5:])
 
 _FRAME_FLAGS = [
     [
@@ -102,7 +104,7 @@ class Metrics:
         self._row = self._rows[self.worker]
         self._row[_SESSIONS] = 0.0  # those of a killed worker are gone
         self._row[_STARTS] += 1.0
-        self._row[_PID] = os.getpid()
+        self._row[_PID], self._row[_RESIDENT] = os.getpid(), math.nan
 
     @property
     def restarted(self) -> bool:
@@ -156,18 +158,16 @@ class Metrics:
 
     def text(self) -> str:
         """Write the numbers of all workers, labelled with theirs, as Prometheus reads them."""
-        rows = {worker: row.tolist() for worker, row in enumerate(self._rows) if row[_PID]}
+        rows = {worker: row for worker, row in enumerate(self._rows) if row[_PID]}
+        for row in rows.values():
+            with suppress(OSError):  # not every system says it
+                pages = Path(f"/proc/{int(row[_PID])}/statm").read_text().split()[1]
+                row[_RESIDENT] = int(pages) * mmap.PAGESIZE
         lines = []
         for family in FAMILIES:
             lines += [f"# HELP {family.name} {family.help}", f"# TYPE {family.name} {family.type}"]
             for worker, row in rows.items():
                 lines += _samples(family, worker, row)
-        name = "palpate_worker_resident_bytes"
-        lines += [f"# HELP {name} Memory that the worker holds", f"# TYPE {name} gauge"]
-        for worker, row in rows.items():
-            with suppress(OSError):  # not every system says it
-                pages = int(Path(f"/proc/{int(row[_PID])}/statm").read_text().split()[1])
-                lines.append(f'{name}{{worker="{worker}"}} {pages * mmap.PAGESIZE}')
         return "\n".join(lines) + "\n"
 
 

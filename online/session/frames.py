@@ -210,7 +210,7 @@ class Request(NamedTuple):
 
     seq: int
     client_time: float
-    position: tuple[float, float, float]
+    position: Sequence[float]  # (3,)
     outputs: int = 0
 
 

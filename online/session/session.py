@@ -88,15 +88,12 @@ class Sessions:
 
     def prepare(self, served: ServedModel, path: Sequence[Sequence[float]]) -> None:
         """Call everything once and make spare trackers; the tip follows `path` (mm)."""
-        x, y, z = served.tip
-        request = Request(0, 0.0, (x, y, z), sum(Output))
+        request = Request(0, 0.0, served.tip, sum(Output))
         spare = self._spare[served.model.name] = []
         for _ in range(SPARE):
             tracker = ToolTracker(served.model)
-            for number, position in enumerate(path):
-                tracker.follow(position, BUDGET, 0.01 * number)
-            tracker.restart()
-            answer = tracker.follow(request.position, BUDGET)
+            for number, position in enumerate([*path, request.position]):
+                answer = tracker.follow(position, BUDGET, 0.01 * number)
             extras = recover(served.model, answer.touch, request.outputs)
             write_reply(frames.encode_reply(request, answer, extras))
             tracker.restart()
@@ -222,10 +219,12 @@ class Session:
     def _answer_text(self, text: str, start: float) -> str:
         """Obey a command or answer a position."""
         if is_command(text):
-            return self._obey(*read_command(text))
-        request = read_request(text)
-        outputs, nodes = names(Output(request.outputs)), len(self._model.surface_nodes)
-        check_json_size(outputs, nodes, self._service.settings.max_json_numbers, "outputs")
+            return self._obey(parse(TextCommand, text).model_dump(exclude_none=True))
+        asked = parse(TextRequest, text)
+        nodes, most = len(self._model.surface_nodes), self._service.settings.max_json_numbers
+        check_json_size(asked.outputs, nodes, most, "outputs")
+        outputs = sum({Output[name.upper()] for name in asked.outputs})
+        request = Request(asked.seq, asked.client_time, asked.position, outputs)
         return write_reply(self._answer(request, start))
 
     def _answer(self, request: Request, start: float) -> bytes:
@@ -241,8 +240,12 @@ class Session:
         self._service.metrics.count_frame(start - received, borders, answer.flags, dropped)
         return frame
 
-    def _obey(self, command: str, number: int) -> str:
+    def _obey(self, given: dict[str, int]) -> str:
         """Keep the state of the tissue or go back to one that was kept; echo the command."""
+        if len(given) != 1:
+            message, allowed = "One of snapshot and restore is wanted", [*TextCommand.model_fields]
+            raise Refusal("invalid_value", "snapshot", message, allowed)
+        ((command, number),) = given.items()
         if command == "snapshot":
             self._tracker.snapshot(number)
         elif number in self._tracker.snapshots:
@@ -250,7 +253,7 @@ class Session:
         else:
             kept = sorted(self._tracker.snapshots)
             raise Refusal("unknown_snapshot", "restore", "None was kept by this number", kept)
-        return orjson.dumps({command: number}).decode()
+        return orjson.dumps(given).decode()
 
     def _greeting(self) -> str:
         """Say what is served and how to speak with it."""
@@ -288,37 +291,16 @@ class TextCommand(Strict):
     restore: int | None = pydantic.Field(None, ge=0, lt=MOST_SNAPSHOTS)
 
 
-def read_request(text: str) -> Request:
-    """Read a position; raise `Refusal` with the field that is wrong."""
-    read = parse(TextRequest, text)
-    x, y, z = read.position
-    outputs = sum(Output[name.upper()] for name in set(read.outputs))
-    return Request(read.seq, read.client_time, (x, y, z), outputs)
-
-
 def is_command(text: str | None) -> bool:
     """Whether a message is a `TextCommand` rather than a position."""
     return text is not None and ('"snapshot"' in text or '"restore"' in text)
-
-
-def read_command(text: str) -> tuple[str, int]:
-    """Read a command: ``snapshot`` or ``restore``, and the number; raise `Refusal` for nonsense."""
-    given = parse(TextCommand, text).model_dump(exclude_none=True)
-    if len(given) != 1:
-        message, allowed = "One of snapshot and restore is wanted", list(TextCommand.model_fields)
-        raise Refusal("invalid_value", "snapshot", message, allowed)
-    return next(iter(given.items()))
-
-
-def names(bits: Output | Flag) -> list[str]:
-    """List bits as messages in JSON have them."""
-    return [str(bit.name).lower() for bit in bits]
 
 
 def write_reply(frame: bytes) -> str:
     """Write a reply in JSON: bits as lists of names, the reason in words, null for infinity."""
     reply = frames.decode_reply(frame)
     document = {name: value for name, value in reply._asdict().items() if value is not None}
-    document["flags"], document["outputs"] = names(Flag(reply.flags)), names(Output(reply.outputs))
+    for name, kind in ("flags", Flag), ("outputs", Output):
+        document[name] = [str(bit.name).lower() for bit in kind(document[name])]
     document["reason"] = frames.REASONS_MEAN[reply.reason]
     return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY).decode()
