@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.online.client.http import Client
-from palpate.online.client.session import Connection, scene_path, split_address
+from palpate.online.client.session import Connection, connect, scene_path, split_address
 from palpate.online.loadtest.paths import tool_path
 from palpate.online.loadtest.streams import (
     ANSWERED,
@@ -129,7 +129,8 @@ def _queries(
         for at, pressure in contacts
     )
     requests = ["\r\n".join([*head, f"content-length: {len(b)}", "", b]).encode() for b in bodies]
-    return QueryStream(kind, due, plan.url, plan.connections, requests)
+    sockets = [connect(plan.url, timeout=10.0) for _ in range(plan.connections)]
+    return QueryStream(kind, due, sockets, requests)
 
 
 def _schedule(plan: Plan, rate: float, shift: float) -> Array:
@@ -145,9 +146,7 @@ def _schedule(plan: Plan, rate: float, shift: float) -> Array:
 def _judge(plan: Plan, machine: Machine, streams: Sequence[Stream]) -> Outcome:
     """Summarize what became of the messages of a plan."""
     every = gather(streams, machine)
-    by_kind: dict[str, list[Stream]] = {}
-    for stream in streams:
-        by_kind.setdefault(stream.kind, []).append(stream)
+    by_kind = {stream.kind: [s for s in streams if s.kind == stream.kind] for stream in streams}
     messages = {kind: gather(alike, machine) for kind, alike in by_kind.items()}
     clean = clean_windows(machine, every)
     summaries = {
