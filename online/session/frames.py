@@ -112,8 +112,6 @@ REQUEST_FIELDS = (
 )
 
 Array = NDArray[Any]
-
-
 _Estimate = Annotated[float, "float32", "", "estimated relative error; infinite: unknown"]
 
 
@@ -128,20 +126,14 @@ class Reply(NamedTuple):
     flags: Annotated[int, "uint16", "", "bits"]
     seq: Annotated[int, "uint32", "", "of the request that is answered"]
     client_time: Annotated[float, "float64", "s", "of the request"]
-    server_received: Annotated[
-        float, "float64", "s", "when the request came, on the server's clock"
-    ]
-    server_sent: Annotated[float, "float64", "s", "when the reply went, on the server's clock"]
+    server_received: Annotated[float, "float64", "s", "when the request came, server's clock"]
+    server_sent: Annotated[float, "float64", "s", "when the reply went, server's clock"]
     position: Annotated[Array, "float64", "mm", "centre of the tip that all below belongs to", (3,)]
     force: Annotated[Array, "float64", "mN", "on the tool", (3,)]
-    tangent: Annotated[
-        Array, "float64", "mN/mm", "derivative of `force` by `position`, by rows", (3, 3)
-    ]
+    tangent: Annotated[Array, "float64", "mN/mm", "d `force` / d `position`, by rows", (3, 3)]
     energy: Annotated[float, "float64", "mN mm", "stored in the tissue"]
     solve_time: Annotated[float, "float32", "s", "spent on solving"]
-    valid_radius: Annotated[
-        float, "float32", "mm", "how far from `position` force and tangent hold"
-    ]
+    valid_radius: Annotated[float, "float32", "mm", "how far from there force and tangent hold"]
     contact_point: Annotated[Array, "float32", "mm", "on the tissue", (3,)]
     normal: Annotated[Array, "float32", "", "outward, unit, at the contact", (3,)]
     depth: Annotated[float, "float32", "mm", "of the tip below the surface at rest"]
@@ -158,9 +150,7 @@ class Reply(NamedTuple):
     nodes: Annotated[int, "uint32", "", "nodes of the fields that follow, or 0"]
     iterations: Annotated[int, "uint16", "", "Newton steps taken"]
     steps: Annotated[int, "uint16", "", "positions solved on the way here"]
-    coordinates: Annotated[
-        Array | None, "uint16", "", "reduced coordinates per local model that follow, or 0"
-    ]
+    coordinates: Annotated[Array | None, "uint16", "", "how many per local model follow, or 0"]
     outputs: Annotated[int, "uint16", "", "what follows or is filled in, bits"]
     depth_limit: Annotated[float, "float32", "mm", "largest trained depth there"]
     reason: Annotated[int, "uint32", "", "why `position` is not the one asked for; 0 if it is"]

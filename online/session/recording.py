@@ -132,9 +132,8 @@ def read_recording(path: Path) -> Recording:
             replies = np.zeros(len(file["seq"]), REPLY)
             for name in REPLY.names or ():
                 replies[name] = file[name][:]
-            columns = replies["seq"], replies["client_time"], file["asked_position"][:]
-            asked = (column.tolist() for column in (*columns, file["asked_outputs"][:]))
-            requests = [Request(*values) for values in zip(*asked, strict=True)]
+            asked = (file[n] for n in ("seq", "client_time", "asked_position", "asked_outputs"))
+            requests = list(map(Request, *(column[:].tolist() for column in asked)))
             commands = [tuple(row) for row in file[COMMANDS.name][:].tolist()]
             scene = str(file.attrs["scene"])
             return Recording(scene, requests, replies, file["received"][:], commands)
