@@ -8,7 +8,7 @@ import os
 import socket
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -72,10 +72,7 @@ def run(plan: Plan) -> Outcome:
     if not (plan.sessions or plan.queries):
         raise PalpateError("nothing to send: ask for --sessions or --queries-per-second")
     with ExitStack() as stack:
-        streams: list[Stream] = []
-        for stream in _streams(plan):
-            stack.callback(stream.close)
-            streams.append(stream)
+        streams = [stack.enter_context(closing(stream)) for stream in _streams(plan)]
         machine = drive(streams)
     return _judge(plan, machine, streams)
 

@@ -203,7 +203,7 @@ async def check(request: Request, name: SceneName, load: SolveRequest) -> Respon
     "/{name}/session",
     response_model=None,
     responses={
-        101: {"description": f"{frames.__doc__}\n\n{frames.tables()}"},
+        101: {"description": frames.document()},
         **_problems(404, 422, 426),
     },
 )

@@ -328,11 +328,6 @@ def decode_reply(frame: bytes) -> Reply:
     return Reply(**head)
 
 
-def document() -> str:
-    """Describe the frames in a Markdown document."""
-    return f"# Frames of a session\n\n{__doc__}\n{tables()}".replace("``", "`")
-
-
 def layout() -> dict[str, Any]:
     """Describe the layout, for the greeting of a session; JSON-able."""
     return {
@@ -354,9 +349,9 @@ def _described(fields: Sequence[Field], dtype: np.dtype[Any]) -> dict[str, Any]:
     }
 
 
-def tables() -> str:
-    """Describe the layout in Markdown."""
-    lines = []
+def document() -> str:
+    """Describe the frames in Markdown."""
+    lines = ["# Frames of a session", "", str(__doc__).replace("``", "`")]
     for title in ("request", "reply"):
         frame = layout()[title]
         lines += [f"{title.capitalize()}, {frame['size']} bytes:", ""]

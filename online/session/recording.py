@@ -35,14 +35,8 @@ ASKED = (
     Field("received", "float64", "s", "when the reply came, on the client's clock"),
 )
 
-COMMANDS = Field(
-    "commands",
-    "uint32",
-    "",
-    "a row per snapshot taken or restored: number of replies before it; "
-    "0 if it was taken, 1 if it was restored; number of the snapshot",
-    (3,),
-)
+_COMMAND = "a row per snapshot: number of replies before it; 0 if taken, 1 if restored; its number"
+COMMANDS = Field("commands", "uint32", "", _COMMAND, (3,))
 
 
 class Recorder:
