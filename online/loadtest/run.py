@@ -153,7 +153,14 @@ def _judge(plan: Plan, machine: Machine, streams: Sequence[Stream]) -> Outcome:
     }
     summary: dict[str, Any] = {"plan": asdict(plan) | {"token": None}}
     summary |= summaries.pop(next(iter(messages))) | summaries
-    summary["machine"] = summarize_machine(machine, clean, every)
+    summary["machine"] = {
+        "window_s": WINDOW,
+        "windows": len(clean),
+        "clean_windows": int(clean.sum()),
+        "steal_s": round(float(machine.steal.sum()), 2),
+        "load_average": os.getloadavg()[0],
+        "lateness_us": quantiles(every.lateness),
+    }
     if plan.echo:
         summary["added"] = {
             kind: summarize_added(messages[kind], messages[empty])
@@ -224,20 +231,6 @@ def summarize_added(messages: Messages, empty: Messages) -> dict[str, float]:
     added = float(np.nanmedian(trip - messages.solve - messages.recover))
     empty_us = float(np.nanmedian(empty_trip))
     return {"added_us": added, "empty_us": empty_us, "ratio": added / empty_us}
-
-
-def summarize_machine(
-    machine: Machine, clean: NDArray[np.bool_], messages: Messages
-) -> dict[str, Any]:
-    """Say how well machine and generator kept the time."""
-    return {
-        "window_s": WINDOW,
-        "windows": len(clean),
-        "clean_windows": int(clean.sum()),
-        "steal_s": round(float(machine.steal.sum()), 2),
-        "load_average": os.getloadavg()[0],
-        "lateness_us": quantiles(messages.lateness),
-    }
 
 
 def summarize_overload(

@@ -47,12 +47,8 @@ class Recorder:
         self._asked: list[tuple[Any, ...]] = []
         self._replies: list[bytes] = []
         self._file = h5py.File(path, "w")
-        self._file.attrs.update(
-            format=FORMAT,
-            format_version=FORMAT_VERSION,
-            scene=greeting["scene"],
-            greeting=json.dumps(greeting),
-        )
+        about = {"format": FORMAT, "format_version": FORMAT_VERSION, "scene": greeting["scene"]}
+        self._file.attrs.update(about, greeting=json.dumps(greeting))
         for name, kind, unit, meaning, shape in (*ASKED, *REPLY_FIELDS, COMMANDS):
             size = {"shape": (0, *shape), "maxshape": (None, *shape), "chunks": (CHUNK, *shape)}
             dataset = self._file.create_dataset(name, dtype=kind, **size)
