@@ -75,14 +75,16 @@ class Sessions:
                 "too_many_sessions", "", f"{self._open} sessions are open", {"max_sessions": most}
             )
         self._open += 1
-        self._service.metrics.count_session(opened=True)
+        count = self._service.metrics.count
+        count("sessions")
+        count("sessions_opened_total")
         spare = self._spare.setdefault(served.model.name, [])
         tracker = spare.pop() if spare else ToolTracker(served.model)
         try:
             await Session(self._service, served, tracker, scope, receive, send).run()
         finally:
             self._open -= 1
-            self._service.metrics.count_session(opened=False)
+            count("sessions", by=-1.0)
             tracker.restart()
             spare.append(tracker)
 
@@ -210,7 +212,7 @@ class Session:
             refusal = as_refusal(error)
             if refusal.code == "internal":
                 logger.error("a session failed", exc_info=error)
-            self._service.metrics.count_refused_frame()
+            self._service.metrics.count("frames_total", "refused")
             reply["text"] = refusal.body().decode()
             if refusal.code in ENDING:
                 ending = ENDING[refusal.code], refusal.message
