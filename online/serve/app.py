@@ -46,9 +46,9 @@ def create_app(here: Service, on_ready: Callable[[], None] = lambda: None) -> Fa
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        prepared = _prepare(here, sessions, on_ready)
+        _prepare(here, sessions, on_ready)
         if settings.workers > 1:
-            await prepared.wait()
+            await here.ready.wait()
         yield
 
     app = FastAPI(
@@ -82,16 +82,15 @@ def create_app(here: Service, on_ready: Callable[[], None] = lambda: None) -> Fa
     return app
 
 
-def _prepare(here: Service, sessions: Sessions, on_ready: Callable[[], None]) -> asyncio.Event:
-    """Load and warm the models in a thread; return what is set when that is over."""
-    loop, prepared = asyncio.get_running_loop(), asyncio.Event()
+def _prepare(here: Service, sessions: Sessions, on_ready: Callable[[], None]) -> None:
+    """Begin to load and warm the models in a thread."""
+    loop = asyncio.get_running_loop()
 
     def finish() -> None:
         gc.collect()
         gc.freeze()  # the collector need not look at the models again
-        here.ready = True
+        here.ready.set()
         on_ready()
-        prepared.set()
 
     def load() -> None:
         here.open(lambda served: _warm(sessions, served))
@@ -101,7 +100,6 @@ def _prepare(here: Service, sessions: Sessions, on_ready: Callable[[], None]) ->
     logger.info("loading models; where kernels are compiled for the first time, it takes minutes")
     # a daemon: a service that has to stop does not wait for it
     threading.Thread(target=load, name="loading", daemon=True).start()
-    return prepared
 
 
 def _warm(sessions: Sessions, served: ServedModel) -> None:
@@ -284,11 +282,7 @@ async def scene(name: SceneName, request: Request) -> Any:
 
 @scenes.get("/{name}/mesh", **_document(schemas.MeshDocument, "The mesh", 406, 422))
 async def mesh(name: SceneName, request: Request, region: MeshRegion = "surface") -> Response:
-    """Get the undeformed mesh that the fields of a region belong to.
-
-    In the binary formats nodes are float32, triangles and surface_nodes int32, clamped uint8
-    (0 or 1, in JSON too).
-    """
+    """Get the undeformed mesh that the fields of a region belong to."""
     model = request.app.state.service.model(name).model
     surface = np.ascontiguousarray(model.surface_nodes, np.int32)
     triangles = np.ascontiguousarray(model.surface_triangles, np.int32)
@@ -307,11 +301,7 @@ async def mesh(name: SceneName, request: Request, region: MeshRegion = "surface"
     **_document(schemas.AccessibleDocument, "The accessible surface", 406, 422),
 )
 async def accessible(name: SceneName, request: Request) -> Response:
-    """Get the part of the surface that the endoscope can touch, undeformed.
-
-    It is finer than the mesh of the fields. In the binary formats triangles are int32, all else
-    float32.
-    """
+    """Get the undeformed surface that the endoscope can touch, finer than the fields' mesh."""
     model = request.app.state.service.model(name).model
     found = schemas.Accessible(
         vertices=model.surface.vertices.astype(np.float32),

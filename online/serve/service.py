@@ -1,5 +1,6 @@
 """What a service works with: settings, counts, and the models that can be trusted."""
 
+import asyncio
 import logging
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -28,7 +29,7 @@ class Service:
         self.settings, self.metrics = settings, metrics or Metrics()
         self.models: dict[str, ServedModel] = {}
         self.refused: list[dict[str, str]] = []  # `file` and `reason` of those that are not served
-        self.ready = False
+        self.ready = asyncio.Event()
 
     def open(self, warm: Callable[[ServedModel], Any]) -> None:
         """Load and warm the model of every ``*.h5``; refuse those that fail, serve the others."""
@@ -52,7 +53,7 @@ class Service:
 
     def require_ready(self) -> None:
         """Raise `Refusal` while models are being loaded."""
-        if not self.ready:
+        if not self.ready.is_set():
             raise Refusal("not_ready", "", "The models are being loaded; try again in a moment")
 
     def model(self, name: str) -> ServedModel:

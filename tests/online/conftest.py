@@ -142,5 +142,5 @@ def error_of(response, status):
 
 
 def _wait_for(service):
-    while not service.ready:
+    while not service.ready.is_set():
         time.sleep(0.005)

@@ -46,7 +46,7 @@ def test_a_service_that_is_told_to_stop_does_not_wait_for_its_models(slow):
     service, loaded = slow
     with TestClient(create_app(service)) as client:
         assert client.get("/ready").status_code == 503
-    assert not service.ready
+    assert not service.ready.is_set()
     assert not loaded.is_set()
     loaded.set()
 

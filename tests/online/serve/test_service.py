@@ -41,7 +41,7 @@ def test_nothing_is_given_out_before_all_are_ready(fake_service):
     service.open(ignore)
     with pytest.raises(Refusal, match="being loaded"):
         service.model("toy")
-    service.ready = True
+    service.ready.set()
     assert service.model("toy").model.name == "toy"
 
 
