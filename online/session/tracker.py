@@ -70,9 +70,11 @@ class ToolTracker:
 
     def restart(self) -> None:
         """Forget where the tool has been: answers are then those of a new tracker."""
-        self.snapshots: dict[int, tuple[Past | None, Answer | None]] = {0: (self._rest, None)}
-        self.restore(0)
-        self.snapshots.clear()
+        self.snapshots: dict[int, tuple[Past | None, Answer | None]] = {}
+        self._past: Past | None = self._rest
+        self._good: Answer | None = None
+        self._lost = 0
+        self._warm.forget()
         self._clock: float | None = None
         self._span = self._reached = 0.0
 
