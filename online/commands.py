@@ -77,7 +77,7 @@ def replay(recording: Path, artifact: Path, as_json: bool) -> None:
     compiled before it was started.
     """
     from palpate.online.session.recording import read_recording
-    from palpate.online.session.replay import replay
+    from palpate.online.session.tracker import replay
     from palpate.shared.model import ReducedModel
 
     report = replay(read_recording(recording), ReducedModel.load(artifact))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from palpate.online.client.session import ServiceError, Session, scene_path, split_address
 from palpate.online.serve import wire
+from palpate.online.serve.schemas import Accessible, Mesh
 from palpate.online.serve.wire import BINARY, JSON
 from palpate.shared.errors import PalpateError
 
@@ -26,25 +27,6 @@ class Answer(NamedTuple):
     contact_displacement: NDArray[np.float64]  # (3,), mm
     displacement: NDArray[np.float32] | None  # (k, 3), mm
     von_mises: NDArray[np.float32] | None  # (k,), kPa
-
-
-class Mesh(NamedTuple):
-    """The mesh that the fields of a region belong to."""
-
-    nodes: NDArray[np.float32]  # (k, 3), mm
-    triangles: NDArray[np.int32]  # (t, 3), indices into the nodes, outward
-    surface_nodes: NDArray[np.int32]  # (s,), the surface nodes among all nodes
-    clamped: NDArray[np.uint8]  # (k,), 1 if held fixed
-
-
-class Accessible(NamedTuple):
-    """The surface that the endoscope can touch, and the limits of training on it."""
-
-    vertices: NDArray[np.float32]  # (v, 3), mm
-    normals: NDArray[np.float32]  # (v, 3), unit, outward
-    pressure_limit: NDArray[np.float32]  # (v,), kPa, along the inward normal
-    triangles: NDArray[np.int32]  # (t, 3), indices into the vertices, outward
-    depth_limit: NDArray[np.float32] | None = None  # (v,), mm, of the tip; None without one
 
 
 class Client:

@@ -122,11 +122,10 @@ class Connection:
         with suppress(ConnectionError):
             self.flush()  # the protocol has answers to pings and to a close message
         for event in self.protocol.events_received():
-            if isinstance(event, Frame) and event.opcode in (Opcode.TEXT, Opcode.BINARY):
-                message = bytes(event.data)
-                self._received.append(
-                    message if event.opcode is Opcode.BINARY else message.decode()
-                )
+            if isinstance(event, Frame) and event.opcode is Opcode.BINARY:
+                self._received.append(bytes(event.data))
+            elif isinstance(event, Frame) and event.opcode is Opcode.TEXT:
+                self._received.append(bytes(event.data).decode())
         if not data and not self._received and self.protocol.handshake_exc is None:
             closed = self.protocol.close_rcvd or Close(1006, "the connection broke")
             raise SessionClosed(closed.code, closed.reason)

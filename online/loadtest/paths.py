@@ -7,7 +7,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-from palpate.online.client.http import Accessible
+from palpate.online.serve.schemas import Accessible
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import os
 import socket
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.online.client.http import Client
-from palpate.online.client.session import Connection, scene_path, split_address
+from palpate.online.client.session import Connection, connect, scene_path, split_address
 from palpate.online.loadtest.paths import tool_path
 from palpate.online.loadtest.streams import (
     ANSWERED,
@@ -72,10 +72,7 @@ def run(plan: Plan) -> Outcome:
     if not (plan.sessions or plan.queries):
         raise PalpateError("nothing to send: ask for --sessions or --queries-per-second")
     with ExitStack() as stack:
-        streams: list[Stream] = []
-        for stream in _streams(plan):
-            stack.callback(stream.close)
-            streams.append(stream)
+        streams = [stack.enter_context(closing(stream)) for stream in _streams(plan)]
         machine = drive(streams)
     return _judge(plan, machine, streams)
 
@@ -129,7 +126,8 @@ def _queries(
         for at, pressure in contacts
     )
     requests = ["\r\n".join([*head, f"content-length: {len(b)}", "", b]).encode() for b in bodies]
-    return QueryStream(kind, due, plan.url, plan.connections, requests)
+    sockets = [connect(plan.url, timeout=10.0) for _ in range(plan.connections)]
+    return QueryStream(kind, due, sockets, requests)
 
 
 def _schedule(plan: Plan, rate: float, shift: float) -> Array:
@@ -145,9 +143,7 @@ def _schedule(plan: Plan, rate: float, shift: float) -> Array:
 def _judge(plan: Plan, machine: Machine, streams: Sequence[Stream]) -> Outcome:
     """Summarize what became of the messages of a plan."""
     every = gather(streams, machine)
-    by_kind: dict[str, list[Stream]] = {}
-    for stream in streams:
-        by_kind.setdefault(stream.kind, []).append(stream)
+    by_kind = {stream.kind: [s for s in streams if s.kind == stream.kind] for stream in streams}
     messages = {kind: gather(alike, machine) for kind, alike in by_kind.items()}
     clean = clean_windows(machine, every)
     summaries = {
@@ -157,7 +153,14 @@ def _judge(plan: Plan, machine: Machine, streams: Sequence[Stream]) -> Outcome:
     }
     summary: dict[str, Any] = {"plan": asdict(plan) | {"token": None}}
     summary |= summaries.pop(next(iter(messages))) | summaries
-    summary["machine"] = summarize_machine(machine, clean, every)
+    summary["machine"] = {
+        "window_s": WINDOW,
+        "windows": len(clean),
+        "clean_windows": int(clean.sum()),
+        "steal_s": round(float(machine.steal.sum()), 2),
+        "load_average": os.getloadavg()[0],
+        "lateness_us": quantiles(every.lateness),
+    }
     if plan.echo:
         summary["added"] = {
             kind: summarize_added(messages[kind], messages[empty])
@@ -228,20 +231,6 @@ def summarize_added(messages: Messages, empty: Messages) -> dict[str, float]:
     added = float(np.nanmedian(trip - messages.solve - messages.recover))
     empty_us = float(np.nanmedian(empty_trip))
     return {"added_us": added, "empty_us": empty_us, "ratio": added / empty_us}
-
-
-def summarize_machine(
-    machine: Machine, clean: NDArray[np.bool_], messages: Messages
-) -> dict[str, Any]:
-    """Say how well machine and generator kept the time."""
-    return {
-        "window_s": WINDOW,
-        "windows": len(clean),
-        "clean_windows": int(clean.sum()),
-        "steal_s": round(float(machine.steal.sum()), 2),
-        "load_average": os.getloadavg()[0],
-        "lateness_us": quantiles(messages.lateness),
-    }
 
 
 def summarize_overload(

@@ -19,6 +19,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
 from functools import partial
+from itertools import count, repeat
 from operator import itemgetter
 from time import perf_counter
 from typing import NamedTuple
@@ -29,8 +30,9 @@ from numpy.typing import NDArray
 from websockets.frames import Frame, Opcode
 from websockets.protocol import Protocol, Side
 
-from palpate.online.client.session import connect
 from palpate.online.session.frames import REPLY, Request, encode_request
+
+Array = NDArray[np.float64]
 
 WINDOW = 0.25
 """Seconds over which it is judged whether machine and generator were on time."""
@@ -69,9 +71,7 @@ _PHASES = re.compile(rb"\bsolve;dur=([\d.]+), recover;dur=([\d.]+)")
 class Stream(ABC):
     """Messages of a kind, with open sockets; `complaint` says what went wrong last."""
 
-    def __init__(
-        self, kind: str, due: NDArray[np.float64], sockets: Sequence[socket.socket]
-    ) -> None:
+    def __init__(self, kind: str, due: Array, sockets: Sequence[socket.socket]) -> None:
         self.kind = kind
         self.log = np.full(len(due), np.array((0, *4 * [np.nan], 0, LOST, 0), MESSAGE))
         self.log["due"] = due
@@ -134,21 +134,12 @@ class FrameStream(Stream):
     """A session or an echo, greeted already, that is sent positions (n, 3) mm when due."""
 
     def __init__(
-        self,
-        kind: str,
-        due: NDArray[np.float64],
-        connection: socket.socket,
-        positions: NDArray[np.float64],
-        outputs: int = 0,
+        self, kind: str, due: Array, connection: socket.socket, positions: Array, outputs: int = 0
     ) -> None:
         super().__init__(kind, due, [connection])
-        requests = (
-            Request(number, time, position, outputs)
-            for number, (time, position) in enumerate(zip(due, positions.tolist(), strict=True))
-        )
         self._messages = [
-            Frame(Opcode.BINARY, encode_request(request)).serialize(mask=True)
-            for request in requests
+            Frame(Opcode.BINARY, encode_request(Request(*request))).serialize(mask=True)
+            for request in zip(count(), due.tolist(), positions.tolist(), repeat(outputs))
         ]
         self._protocol = Protocol(Side.CLIENT, max_size=None)
         self._unsent = b""
@@ -209,17 +200,12 @@ class FrameStream(Stream):
 
 
 class QueryStream(Stream):
-    """HTTP requests to be sent when they are due, over `connections` to the service at `url`."""
+    """HTTP requests to be sent when they are due, each over a socket that is free."""
 
     def __init__(
-        self,
-        kind: str,
-        due: NDArray[np.float64],
-        url: str,
-        connections: int,
-        requests: Sequence[bytes],
+        self, kind: str, due: Array, sockets: Sequence[socket.socket], requests: Sequence[bytes]
     ) -> None:
-        super().__init__(kind, due, [connect(url, timeout=10.0) for _ in range(connections)])
+        super().__init__(kind, due, sockets)
         self._requests = requests
         self._free = deque(self.sockets)
         self._queue: deque[int] = deque()
@@ -290,8 +276,8 @@ class _Answer:
 class Machine(NamedTuple):
     """How the machine did, window by window."""
 
-    borders: NDArray[np.float64]  # (w + 1,), s
-    steal: NDArray[np.float64]  # (w,), s that the host took from all cores; 0 where nobody tells
+    borders: Array  # (w + 1,), s
+    steal: Array  # (w,), s that the host took from all cores; 0 where nobody tells
 
 
 def drive(streams: Sequence[Stream]) -> Machine:

@@ -23,7 +23,7 @@ from palpate.online.serve.answer import answer
 from palpate.online.serve.errors import Refusal
 from palpate.online.serve.metrics import CONTENT_TYPE, Metrics
 from palpate.online.serve.schemas import HistoryRequest, MeshRegion, SolveRequest, parse
-from palpate.online.serve.store import ServedModel, Service, Store
+from palpate.online.serve.service import ServedModel, Service
 from palpate.online.serve.wire import BINARY, JSON, MSGPACK, OFFERED, negotiate
 from palpate.online.session import frames, websocket
 from palpate.online.session.session import Sessions
@@ -46,9 +46,9 @@ def create_app(here: Service, on_ready: Callable[[], None] = lambda: None) -> Fa
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        prepared = _prepare(here.store, sessions, on_ready)
+        _prepare(here, sessions, on_ready)
         if settings.workers > 1:
-            await prepared.wait()
+            await here.ready.wait()
         yield
 
     app = FastAPI(
@@ -82,35 +82,32 @@ def create_app(here: Service, on_ready: Callable[[], None] = lambda: None) -> Fa
     return app
 
 
-def _prepare(store: Store, sessions: Sessions, on_ready: Callable[[], None]) -> asyncio.Event:
-    """Load and warm the models in a thread; return what is set when that is over."""
-    loop, prepared = asyncio.get_running_loop(), asyncio.Event()
+def _prepare(here: Service, sessions: Sessions, on_ready: Callable[[], None]) -> None:
+    """Begin to load and warm the models in a thread."""
+    loop = asyncio.get_running_loop()
 
     def finish() -> None:
         gc.collect()
         gc.freeze()  # the collector need not look at the models again
-        store.ready = True
+        here.ready.set()
         on_ready()
-        prepared.set()
 
     def load() -> None:
-        store.open(lambda served: _warm(sessions, served))
+        here.open(lambda served: _warm(sessions, served))
         with suppress(RuntimeError):  # the service has ended meanwhile
             loop.call_soon_threadsafe(finish)
 
     logger.info("loading models; where kernels are compiled for the first time, it takes minutes")
     # a daemon: a service that has to stop does not wait for it
     threading.Thread(target=load, name="loading", daemon=True).start()
-    return prepared
 
 
 def _warm(sessions: Sessions, served: ServedModel) -> None:
     """Call every kernel and encoder once, so that no client pays for a first time."""
     uncounted = Metrics()
-    for region in ("none", "surface", "all"):
+    for region, media_type in zip(("surface", "all", "none"), OFFERED, strict=True):
         body = orjson.dumps({"contacts": [served.example], "region": region})
-        for media_type in OFFERED:
-            answer(served.model, parse(SolveRequest, body), media_type, uncounted)
+        answer(served.model, parse(SolveRequest, body), media_type, uncounted)
     models, radius = served.model.models, served.model.scene.endoscope.radius
     tour: list[int] = []
     if models.viscous is not None:  # a history goes from one local model to the next and back
@@ -196,7 +193,7 @@ async def history(request: Request, name: SceneName, load: HistoryRequest) -> Re
 )
 async def check(request: Request, name: SceneName, load: SolveRequest) -> Response:
     """Check that a solve request is well-formed, without solving it."""
-    request.app.state.service.store.model(name)
+    request.app.state.service.model(name)
     return Response(b'{"valid":true}', media_type=JSON)
 
 
@@ -204,7 +201,7 @@ async def check(request: Request, name: SceneName, load: SolveRequest) -> Respon
     "/{name}/session",
     response_model=None,
     responses={
-        101: {"description": f"{frames.__doc__}\n\n{frames.tables()}"},
+        101: {"description": frames.document()},
         **_problems(404, 422, 426),
     },
 )
@@ -214,7 +211,7 @@ async def session(name: SceneName, request: Request) -> Response:
     The first message of the service is a greeting in JSON that states the layout of the frames.
     A text message is answered in JSON, a binary one in binary.
     """
-    request.app.state.service.store.model(name)
+    request.app.state.service.model(name)
     raise Refusal("upgrade_required", "upgrade", "A session is opened by a WebSocket handshake")
 
 
@@ -227,10 +224,10 @@ async def health() -> dict[str, str]:
 @service.get("/ready", responses={503: {"model": schemas.Problem}})
 async def ready(request: Request) -> dict[str, str]:
     """Tell whether every model is loaded and warm."""
-    store: Store = request.app.state.service.store
-    store.require_ready()
-    if not store.models:
-        reasons = "; ".join(refused["reason"] for refused in store.refused)
+    here: Service = request.app.state.service
+    here.require_ready()
+    if not here.models:
+        reasons = "; ".join(refused["reason"] for refused in here.refused)
         raise Refusal("not_ready", "", f"No artifact could be loaded: {reasons}")
     return {"status": "ready"}
 
@@ -244,19 +241,19 @@ async def metrics(request: Request) -> Response:
 @scenes.get("", response_model=schemas.SceneList, responses=_problems())
 async def served_scenes(request: Request) -> Any:
     """List the scenes that are served, and the files that had to be refused."""
-    store: Store = request.app.state.service.store
-    store.require_ready()
+    here: Service = request.app.state.service
+    here.require_ready()
     served = [
         {"name": name, "description": served.model.scene.description}
-        for name, served in store.models.items()
+        for name, served in here.models.items()
     ]
-    return _json({"scenes": served, "refused": store.refused})
+    return _json({"scenes": served, "refused": here.refused})
 
 
 @scenes.get("/{name}", response_model=schemas.SceneSummary, responses=_problems(404, 422))
 async def scene(name: SceneName, request: Request) -> Any:
     """Say what may be asked of a scene, and how well it is answered."""
-    served: ServedModel = request.app.state.service.store.model(name)
+    served: ServedModel = request.app.state.service.model(name)
     model, endoscope = served.model, served.model.scene.endoscope
     depth = [0.0, model.limits[:, TIP_DEPTH].max()]
     return _json(
@@ -283,53 +280,48 @@ async def scene(name: SceneName, request: Request) -> Any:
     )
 
 
-@scenes.get("/{name}/mesh", **_document(schemas.Mesh, "The mesh", 406, 422))
+@scenes.get("/{name}/mesh", **_document(schemas.MeshDocument, "The mesh", 406, 422))
 async def mesh(name: SceneName, request: Request, region: MeshRegion = "surface") -> Response:
-    """Get the undeformed mesh that the fields of a region belong to.
-
-    In the binary formats nodes are float32, triangles and surface_nodes int32, clamped uint8
-    (0 or 1, in JSON too).
-    """
-    media_type = _media_type(request)
-    model = request.app.state.service.store.model(name).model
+    """Get the undeformed mesh that the fields of a region belong to."""
+    model = request.app.state.service.model(name).model
     surface = np.ascontiguousarray(model.surface_nodes, np.int32)
     triangles = np.ascontiguousarray(model.surface_triangles, np.int32)
     chosen: Any = slice(None) if region == "all" else surface
-    arrays = {
-        "nodes": model.nodes[chosen].astype(np.float32),
-        "triangles": surface[triangles] if region == "all" else triangles,
-        "surface_nodes": surface,
-        "clamped": model.clamped[chosen].astype(np.uint8),
-    }
-    content = wire.encode(media_type, {"scene": name, "region": region}, arrays)
-    return Response(content, media_type=media_type)
+    found = schemas.Mesh(
+        nodes=model.nodes[chosen].astype(np.float32),
+        triangles=surface[triangles] if region == "all" else triangles,
+        surface_nodes=surface,
+        clamped=model.clamped[chosen].astype(np.uint8),
+    )
+    return _arrays(request, {"scene": name, "region": region}, found)
 
 
 @scenes.get(
-    "/{name}/accessible", **_document(schemas.Accessible, "The accessible surface", 406, 422)
+    "/{name}/accessible",
+    **_document(schemas.AccessibleDocument, "The accessible surface", 406, 422),
 )
 async def accessible(name: SceneName, request: Request) -> Response:
-    """Get the part of the surface that the endoscope can touch, undeformed.
+    """Get the undeformed surface that the endoscope can touch, finer than the fields' mesh."""
+    model = request.app.state.service.model(name).model
+    found = schemas.Accessible(
+        vertices=model.surface.vertices.astype(np.float32),
+        normals=model.surface.normals.astype(np.float32),
+        pressure_limit=model.limits[:, 0].astype(np.float32),
+        triangles=np.ascontiguousarray(model.surface.triangles, np.int32),
+        depth_limit=model.limits[:, TIP_DEPTH].astype(np.float32) if model.has_tip else None,
+    )
+    return _arrays(request, {"scene": name}, found)
 
-    It is finer than the mesh of the fields. In the binary formats triangles are int32, all else
-    float32.
-    """
+
+def _arrays(request: Request, head: wire.Head, arrays: Any) -> Response:
     media_type = _media_type(request)
-    model = request.app.state.service.store.model(name).model
-    arrays = {
-        "vertices": model.surface.vertices.astype(np.float32),
-        "normals": model.surface.normals.astype(np.float32),
-        "pressure_limit": model.limits[:, 0].astype(np.float32),
-        "triangles": np.ascontiguousarray(model.surface.triangles, np.int32),
-    }
-    if model.has_tip:
-        arrays["depth_limit"] = model.limits[:, TIP_DEPTH].astype(np.float32)
-    return Response(wire.encode(media_type, {"scene": name}, arrays), media_type=media_type)
+    present = {name: array for name, array in arrays._asdict().items() if array is not None}
+    return Response(wire.encode(media_type, head, present), media_type=media_type)
 
 
 def _answer(request: Request, name: str, load: SolveRequest | HistoryRequest) -> Response:
     here: Service = request.app.state.service
-    model, media_type = here.store.model(name).model, _media_type(request)
+    model, media_type = here.model(name).model, _media_type(request)
     start, limit = request.scope[DECODING], here.settings.max_json_numbers
     return answer(model, load, media_type, here.metrics, start, limit)
 

@@ -111,7 +111,7 @@ async def refuse(request: Request, error: Exception) -> Response:
     if isinstance(error, ClientDisconnect):
         return Response(status_code=400)  # nobody is there to read it
     refusal = as_refusal(error)
-    request.app.state.service.metrics.count_refusal(refusal.code)
+    request.app.state.service.metrics.count("refusals_total", refusal.code)
     return refusal.response()
 
 

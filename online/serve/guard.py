@@ -58,7 +58,7 @@ class Guard:
                 if scope["path"] != METRICS:
                     self._check_load(scope, perf_counter())
             except Refusal as refusal:
-                self._metrics.count_refusal(refusal.code)
+                self._metrics.count("refusals_total", refusal.code)
                 await refusal.response()(scope, receive, send)
                 return
         await self._app(scope, receive, send)

@@ -166,7 +166,7 @@ def _work(settings: Settings, url: str, table: Path) -> FastAPI:
     """Make the application of one worker, in its own process."""
     # Not before: the supervisor has no use for the models' code.
     from palpate.online.serve.app import create_app
-    from palpate.online.serve.store import Service
+    from palpate.online.serve.service import Service
 
     set_up_log(settings)
     # Uvicorn tells of every session that opens; that it starts and ends, the supervisor tells.
@@ -174,18 +174,17 @@ def _work(settings: Settings, url: str, table: Path) -> FastAPI:
     # On systems without file locks there is one worker, which has no use for a table.
     metrics = Metrics(table if settings.workers > 1 else None)
     service = Service(settings, metrics)
-    store = service.store
 
     def greet() -> None:
         if settings.realtime:
-            logger.info("%s; %s", schedule_in_real_time(), lock_memory())
+            logger.info(run_in_real_time())
         logger.info("worker %d is ready", metrics.worker)
         if metrics.worker or metrics.restarted:
             return  # the first worker says it once
-        for refused in store.refused:
+        for refused in service.refused:
             click.echo(f"Refused {refused['reason']}")
-        click.echo(f"Serving {', '.join(store.models) or 'nothing'} on {url} (API: {url}/docs)")
-        for name, model in list(store.models.items())[:1]:
+        click.echo(f"Serving {', '.join(service.models) or 'nothing'} on {url} (API: {url}/docs)")
+        for name, model in list(service.models.items())[:1]:
             click.echo(
                 f"Try: curl {url}/scenes/{name}/solve -H 'Content-Type: application/json' "
                 f"-d '{json.dumps({'contacts': [model.example]})}'"
@@ -219,33 +218,32 @@ def set_up_log(settings: Settings) -> None:
     logging.basicConfig(level=settings.log_level.upper(), handlers=[handler], force=True)
 
 
-def schedule_in_real_time() -> str:
-    """Let this thread run before all ordinary work; return what the system granted.
+def run_in_real_time() -> str:
+    """Let this thread run before all other work, and its memory stay; return what was granted.
 
     On a busy machine the scheduler lets a ready worker wait for milliseconds; with a
     first-in-first-out priority it runs at once.
     """
-    if not hasattr(os, "sched_setscheduler"):
-        return "real-time scheduling: not known to this system"
-    try:
-        policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
-        os.sched_setscheduler(0, policy, os.sched_param(PRIORITY))
-    except OSError as error:
-        return (
-            f"real-time scheduling: refused ({error.strerror}), running as ordinary work; it takes "
-            f"root, CAP_SYS_NICE or an rtprio limit of {PRIORITY}"
-        )
-    return f"real-time scheduling: on (SCHED_FIFO, priority {PRIORITY})"
+    said = []
+    for what, ask, needs in (
+        ("real-time scheduling", _schedule, f"CAP_SYS_NICE or an rtprio limit of {PRIORITY}"),
+        ("memory lock", _lock_memory, "CAP_IPC_LOCK or a higher memlock limit"),
+    ):
+        try:
+            ask()
+            said.append(f"{what}: on")
+        except OSError as error:
+            said.append(f"{what}: refused ({error.strerror}); it takes root, {needs}")
+        except (AttributeError, TypeError):
+            said.append(f"{what}: not known to this system")
+    return "; ".join(said)
 
 
-def lock_memory() -> str:
-    """Keep what is in memory from being swapped out; return what the system granted."""
-    mlockall = getattr(ctypes.CDLL(None, use_errno=True), "mlockall", None)
-    if mlockall is None:
-        return "memory lock: not known to this system"
-    if mlockall(_MCL_CURRENT | _MCL_ONFAULT) != 0:
-        return (
-            f"memory lock: refused ({os.strerror(ctypes.get_errno())}); it takes root, "
-            "CAP_IPC_LOCK or a higher memlock limit"
-        )
-    return "memory lock: on"
+def _schedule() -> None:
+    policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+    os.sched_setscheduler(0, policy, os.sched_param(PRIORITY))
+
+
+def _lock_memory() -> None:
+    if ctypes.CDLL(None, use_errno=True).mlockall(_MCL_CURRENT | _MCL_ONFAULT) != 0:
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))

@@ -1,11 +1,14 @@
 """What goes over the wire: requests are checked against these models.
 
-Answers are written straight from arrays (`serve.answer`); their models below describe them to the
-reader of the OpenAPI page.
+Answers are written straight from arrays; their models below describe them to the reader of the
+OpenAPI page. Beside an array of a document stand the type of its rows in JSON and its meaning.
 """
 
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_type_hints
 
+import numpy as np
+import pydantic
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, field_validator
 from pydantic_core import PydanticCustomError
 
@@ -23,6 +26,8 @@ Position = Annotated[list[Annotated[float, Field(ge=-1e4, le=1e4)]], _THREE]
 Direction = Annotated[list[Annotated[float, Field(ge=-1e3, le=1e3)]], _THREE]
 Vector = Annotated[list[float], _THREE]
 Triangle = Annotated[list[int], _THREE]
+Floats = NDArray[np.float32]
+Integers = NDArray[np.int32]
 
 MOST_STEPS = 200
 """Largest number of steps of a history: so many keep others waiting for some 50 ms."""
@@ -212,50 +217,41 @@ class HistoryAnswer(BaseModel):
     timing: Timing
 
 
-class MeshFields(BaseModel):
-    """Nodes and the surface they make."""
-
-    nodes: list[Vector] = Field(description="mm; the order of every field of this region.")
-    triangles: list[Triangle] = Field(
-        description="The body's surface: indices into nodes, counter-clockwise from outside."
-    )
-    surface_nodes: list[int] = Field(
-        description="Where the nodes of region surface are among those of region all."
-    )
-    clamped: list[Literal[0, 1]] = Field(description="Per node: 1 if held fixed.")
-
-
-class Mesh(BaseModel):
+class Mesh(NamedTuple):
     """The undeformed mesh of a region."""
 
-    scene: str
-    region: MeshRegion
-    fields: MeshFields
+    nodes: Annotated[Floats, Vector, "(k, 3), mm; the order of every field of this region"]
+    triangles: Annotated[Integers, Triangle, "(t, 3), nodes counter-clockwise from outside"]
+    surface_nodes: Annotated[Integers, int, "(s,), region surface's nodes among those of all"]
+    clamped: Annotated[NDArray[np.uint8], Literal[0, 1], "(k,), 1 if held fixed"]
 
 
-class AccessibleFields(BaseModel):
-    """A triangulated surface with a normal that varies linearly over each triangle."""
+class Accessible(NamedTuple):
+    """The surface that the endoscope can touch; its normal varies linearly over each triangle."""
 
-    vertices: list[Vector] = Field(description="mm")
-    normals: list[Vector] = Field(description="Outward unit normals at the vertices.")
-    pressure_limit: list[float] = Field(
-        description="Per vertex: largest pressure trained for along the inward normal, kPa."
-    )
-    depth_limit: list[float] | None = Field(
-        None,
-        description="Per vertex: largest depth of the tip trained for, mm. Absent if the scene was "
-        "trained without a tip.",
-    )
-    triangles: list[Triangle] = Field(
-        description="Indices into vertices, counter-clockwise from outside."
-    )
+    vertices: Annotated[Floats, Vector, "(v, 3), mm"]
+    normals: Annotated[Floats, Vector, "(v, 3), outward unit normals at the vertices"]
+    pressure_limit: Annotated[Floats, float, "(v,), kPa, largest trained along the inward normal"]
+    triangles: Annotated[Integers, Triangle, "(t, 3), vertices counter-clockwise from outside"]
+    depth_limit: Annotated[
+        Floats | None, float, "(v,), mm, largest trained of the tip; absent without one"
+    ] = None
 
 
-class Accessible(BaseModel):
-    """The surface that the endoscope can touch."""
+def _document(arrays: Any, **head: Any) -> type[BaseModel]:
+    """Describe the JSON of a document with these arrays: by rows, with their meanings."""
+    fields: dict[str, Any] = {}
+    for name, hint in get_type_hints(arrays, include_extras=True).items():
+        row, meaning = hint.__metadata__
+        default = arrays._field_defaults.get(name, ...)
+        fields[name] = list[row], Field(default, description=meaning)  # type: ignore[valid-type]
+    name, told = arrays.__name__, arrays.__doc__
+    described = pydantic.create_model(f"{name}Fields", __doc__=told, **fields)
+    return pydantic.create_model(name, __doc__=told, scene=str, **head, fields=described)
 
-    scene: str
-    fields: AccessibleFields
+
+MeshDocument = _document(Mesh, region=MeshRegion)
+AccessibleDocument = _document(Accessible)
 
 
 class SceneEntry(BaseModel):

@@ -85,11 +85,12 @@ class Reason(IntEnum):
     BELOW_SURFACE = 2
 
 
-REASONS_MEAN = {
-    Reason.NONE: "",
-    Reason.NO_EQUILIBRIUM: "no equilibrium was found there",
-    Reason.BELOW_SURFACE: "the tip's centre lies below the surface of the tissue",
-}
+REASONS_MEAN = (
+    "",
+    "no equilibrium was found there",
+    "the tip's centre lies below the surface of the tissue",
+)
+"""By the number of the `Reason`."""
 
 
 class Field(NamedTuple):
@@ -111,8 +112,6 @@ REQUEST_FIELDS = (
 )
 
 Array = NDArray[Any]
-
-
 _Estimate = Annotated[float, "float32", "", "estimated relative error; infinite: unknown"]
 
 
@@ -127,20 +126,14 @@ class Reply(NamedTuple):
     flags: Annotated[int, "uint16", "", "bits"]
     seq: Annotated[int, "uint32", "", "of the request that is answered"]
     client_time: Annotated[float, "float64", "s", "of the request"]
-    server_received: Annotated[
-        float, "float64", "s", "when the request came, on the server's clock"
-    ]
-    server_sent: Annotated[float, "float64", "s", "when the reply went, on the server's clock"]
+    server_received: Annotated[float, "float64", "s", "when the request came, server's clock"]
+    server_sent: Annotated[float, "float64", "s", "when the reply went, server's clock"]
     position: Annotated[Array, "float64", "mm", "centre of the tip that all below belongs to", (3,)]
     force: Annotated[Array, "float64", "mN", "on the tool", (3,)]
-    tangent: Annotated[
-        Array, "float64", "mN/mm", "derivative of `force` by `position`, by rows", (3, 3)
-    ]
+    tangent: Annotated[Array, "float64", "mN/mm", "d `force` / d `position`, by rows", (3, 3)]
     energy: Annotated[float, "float64", "mN mm", "stored in the tissue"]
     solve_time: Annotated[float, "float32", "s", "spent on solving"]
-    valid_radius: Annotated[
-        float, "float32", "mm", "how far from `position` force and tangent hold"
-    ]
+    valid_radius: Annotated[float, "float32", "mm", "how far from there force and tangent hold"]
     contact_point: Annotated[Array, "float32", "mm", "on the tissue", (3,)]
     normal: Annotated[Array, "float32", "", "outward, unit, at the contact", (3,)]
     depth: Annotated[float, "float32", "mm", "of the tip below the surface at rest"]
@@ -157,9 +150,7 @@ class Reply(NamedTuple):
     nodes: Annotated[int, "uint32", "", "nodes of the fields that follow, or 0"]
     iterations: Annotated[int, "uint16", "", "Newton steps taken"]
     steps: Annotated[int, "uint16", "", "positions solved on the way here"]
-    coordinates: Annotated[
-        Array | None, "uint16", "", "reduced coordinates per local model that follow, or 0"
-    ]
+    coordinates: Annotated[Array | None, "uint16", "", "how many per local model follow, or 0"]
     outputs: Annotated[int, "uint16", "", "what follows or is filled in, bits"]
     depth_limit: Annotated[float, "float32", "mm", "largest trained depth there"]
     reason: Annotated[int, "uint32", "", "why `position` is not the one asked for; 0 if it is"]
@@ -209,7 +200,7 @@ class Request(NamedTuple):
 
     seq: int
     client_time: float
-    position: tuple[float, float, float]
+    position: Sequence[float]  # (3,)
     outputs: int = 0
 
 
@@ -241,14 +232,14 @@ def _check_version(frame: bytes) -> None:
 
 
 class Extras(NamedTuple):
-    """What a reply holds on request; arrays are C-contiguous."""
+    """What a reply holds on request."""
 
     outputs: int = 0  # bits of `Output`: what is there
-    coordinates: Array | None = None  # (MODELS, r), float32
-    displacement: Array | None = None  # (n, 3), mm, float32 or float16
-    von_mises: Array | None = None  # (n,), kPa, float32 or float16
+    coordinates: int = 0  # per local model
+    nodes: int = 0  # of the fields
     max_von_mises: float = 0.0  # kPa
     p99_von_mises: float = 0.0  # kPa
+    fields: Sequence[Array] = ()  # C-contiguous, all that follows in the frame
 
 
 NO_EXTRAS = Extras()
@@ -276,7 +267,6 @@ def encode_reply(
     """Write a reply frame; `received` and `sent` (s) are on the server's clock."""
     touch = answer.touch
     absent = MODELS - len(touch.parts)
-    fields = [field for field in extras[2:4] if field is not None]
     largest = _LARGEST if answer.flags & _IN_RANGE else -1.0  # of an error that is known
     head = _REPLY.pack(
         VERSION,
@@ -304,19 +294,15 @@ def encode_reply(
         *([part[0] for part in touch.parts] + [-1] * absent),
         *([part[1] for part in touch.parts] + [0.0] * absent),
         superseded,
-        len(fields[0]) if fields else 0,
+        extras.nodes,
         touch.iterations,
         answer.steps,
-        0 if extras.coordinates is None else extras.coordinates.shape[1],
+        extras.coordinates,
         extras.outputs,
         touch.depth_limit,
         answer.reason,
     )
-    if extras is NO_EXTRAS:
-        return head
-    if extras.coordinates is not None:
-        fields.insert(0, extras.coordinates)
-    return b"".join((head, *(field.data for field in fields)))
+    return b"".join((head, *(field.data for field in extras.fields)))
 
 
 def decode_reply(frame: bytes) -> Reply:
@@ -342,11 +328,6 @@ def decode_reply(frame: bytes) -> Reply:
     return Reply(**head)
 
 
-def document() -> str:
-    """Describe the frames in a Markdown document."""
-    return f"# Frames of a session\n\n{__doc__}\n{tables()}".replace("``", "`")
-
-
 def layout() -> dict[str, Any]:
     """Describe the layout, for the greeting of a session; JSON-able."""
     return {
@@ -368,21 +349,22 @@ def _described(fields: Sequence[Field], dtype: np.dtype[Any]) -> dict[str, Any]:
     }
 
 
-def tables() -> str:
-    """Describe the layout in Markdown."""
-    lines = []
+def document() -> str:
+    """Describe the frames in Markdown."""
+    lines = ["# Frames of a session", "", str(__doc__).replace("``", "`")]
     for title in ("request", "reply"):
         frame = layout()[title]
         lines += [f"{title.capitalize()}, {frame['size']} bytes:", ""]
         lines += ["| offset | field | type | unit | meaning |", "|---|---|---|---|---|"]
         for f in frame["fields"]:
-            kind = f["type"] + "".join(f"[{n}]" for n in f["shape"])
-            lines.append(f"| {f['offset']} | {f['name']} | {kind} | {f['unit']} | {f['meaning']} |")
+            type_ = f["type"] + "".join(f"[{n}]" for n in f["shape"])
+            columns = f["offset"], f["name"], type_, f["unit"], f["meaning"]
+            lines.append(f"| {' | '.join(map(str, columns))} |")
         lines.append("")
     for title, meanings in (
         ("bit of `outputs`", [(bit, bit.meaning) for bit in Output]),
         ("bit of `flags`", [(bit, bit.meaning) for bit in Flag]),
-        ("`reason`", REASONS_MEAN.items()),
+        ("`reason`", zip(Reason, REASONS_MEAN, strict=True)),
     ):
         lines += [f"| {title} | name | meaning |", "|---|---|---|"]
         lines += [f"| {v.value} | {v.name} | {meaning} |" for v, meaning in meanings]

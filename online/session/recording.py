@@ -4,7 +4,7 @@ A recording is an HDF5 file with one dataset for each field of a reply (`session
 row for each reply in order of arrival, and beside them what was asked for and when. Every dataset
 has ``units`` and a ``description``. Since an answer depends on those before it, and on how many
 positions were solved for each (``steps``), the recording of a whole session is enough to answer it
-again, bit for bit (`session.replay`).
+again, bit for bit (`session.tracker.replay`).
 """
 
 import json
@@ -35,14 +35,8 @@ ASKED = (
     Field("received", "float64", "s", "when the reply came, on the client's clock"),
 )
 
-COMMANDS = Field(
-    "commands",
-    "uint32",
-    "",
-    "a row per snapshot taken or restored: number of replies before it; "
-    "0 if it was taken, 1 if it was restored; number of the snapshot",
-    (3,),
-)
+_COMMAND = "a row per snapshot: number of replies before it; 0 if taken, 1 if restored; its number"
+COMMANDS = Field("commands", "uint32", "", _COMMAND, (3,))
 
 
 class Recorder:
@@ -53,12 +47,8 @@ class Recorder:
         self._asked: list[tuple[Any, ...]] = []
         self._replies: list[bytes] = []
         self._file = h5py.File(path, "w")
-        self._file.attrs.update(
-            format=FORMAT,
-            format_version=FORMAT_VERSION,
-            scene=greeting["scene"],
-            greeting=json.dumps(greeting),
-        )
+        about = {"format": FORMAT, "format_version": FORMAT_VERSION, "scene": greeting["scene"]}
+        self._file.attrs.update(about, greeting=json.dumps(greeting))
         for name, kind, unit, meaning, shape in (*ASKED, *REPLY_FIELDS, COMMANDS):
             size = {"shape": (0, *shape), "maxshape": (None, *shape), "chunks": (CHUNK, *shape)}
             dataset = self._file.create_dataset(name, dtype=kind, **size)
@@ -132,9 +122,8 @@ def read_recording(path: Path) -> Recording:
             replies = np.zeros(len(file["seq"]), REPLY)
             for name in REPLY.names or ():
                 replies[name] = file[name][:]
-            columns = replies["seq"], replies["client_time"], file["asked_position"][:]
-            asked = (column.tolist() for column in (*columns, file["asked_outputs"][:]))
-            requests = [Request(*values) for values in zip(*asked, strict=True)]
+            asked = (file[n] for n in ("seq", "client_time", "asked_position", "asked_outputs"))
+            requests = list(map(Request, *(column[:].tolist() for column in asked)))
             commands = [tuple(row) for row in file[COMMANDS.name][:].tolist()]
             scene = str(file.attrs["scene"])
             return Recording(scene, requests, replies, file["received"][:], commands)

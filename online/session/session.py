@@ -19,10 +19,10 @@ from starlette.types import Message, Receive, Scope, Send
 
 from palpate.online.serve.errors import Refusal, as_refusal, check_json_size
 from palpate.online.serve.schemas import Position, Strict, parse
-from palpate.online.serve.store import ServedModel, Service
+from palpate.online.serve.service import ServedModel, Service
 from palpate.online.session import frames
-from palpate.online.session.frames import Flag, Output, Reason, Request
-from palpate.online.session.tracker import LONGEST, Snapshot, ToolTracker, recover
+from palpate.online.session.frames import Flag, Output, Request
+from palpate.online.session.tracker import LONGEST, ToolTracker, recover
 from palpate.online.session.websocket import CONNECTION, LINGER, MOST_FRAMES, STOPPING
 
 logger = logging.getLogger(__name__)
@@ -64,7 +64,7 @@ class Sessions:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Refuse a session or run it until it ends."""
-        served = self._service.store.model(scope["path_params"]["name"])
+        served = self._service.model(scope["path_params"]["name"])
         if not served.model.has_tip:
             raise Refusal(
                 "no_tip", "name", "This scene was trained without a tip; it only answers loads"
@@ -75,28 +75,27 @@ class Sessions:
                 "too_many_sessions", "", f"{self._open} sessions are open", {"max_sessions": most}
             )
         self._open += 1
-        self._service.metrics.count_session(opened=True)
+        count = self._service.metrics.count
+        count("sessions")
+        count("sessions_opened_total")
         spare = self._spare.setdefault(served.model.name, [])
         tracker = spare.pop() if spare else ToolTracker(served.model)
         try:
             await Session(self._service, served, tracker, scope, receive, send).run()
         finally:
             self._open -= 1
-            self._service.metrics.count_session(opened=False)
+            count("sessions", by=-1.0)
             tracker.restart()
             spare.append(tracker)
 
     def prepare(self, served: ServedModel, path: Sequence[Sequence[float]]) -> None:
         """Call everything once and make spare trackers; the tip follows `path` (mm)."""
-        x, y, z = served.tip
-        request = Request(0, 0.0, (x, y, z), sum(Output))
+        request = Request(0, 0.0, served.tip, sum(Output))
         spare = self._spare[served.model.name] = []
         for _ in range(SPARE):
             tracker = ToolTracker(served.model)
-            for number, position in enumerate(path):
-                tracker.follow(position, BUDGET, 0.01 * number)
-            tracker.restart()
-            answer = tracker.follow(request.position, BUDGET)
+            for number, position in enumerate([*path, request.position]):
+                answer = tracker.follow(position, BUDGET, 0.01 * number)
             extras = recover(served.model, answer.touch, request.outputs)
             write_reply(frames.encode_reply(request, answer, extras))
             tracker.restart()
@@ -119,7 +118,6 @@ class Session:
         self._served, self._model = served, served.model
         self._receive, self._send = receive, send
         self._connection = scope["extensions"][CONNECTION]
-        self._snapshots: dict[int, Snapshot] = {}
         self._received = self._full_at = 0.0
         self._superseded = 0
         self._sending, self._since = True, perf_counter()
@@ -214,7 +212,7 @@ class Session:
             refusal = as_refusal(error)
             if refusal.code == "internal":
                 logger.error("a session failed", exc_info=error)
-            self._service.metrics.count_refused_frame()
+            self._service.metrics.count("frames_total", "refused")
             reply["text"] = refusal.body().decode()
             if refusal.code in ENDING:
                 ending = ENDING[refusal.code], refusal.message
@@ -223,10 +221,12 @@ class Session:
     def _answer_text(self, text: str, start: float) -> str:
         """Obey a command or answer a position."""
         if is_command(text):
-            return self._obey(*read_command(text))
-        request = read_request(text)
-        outputs, nodes = names(Output(request.outputs)), len(self._model.surface_nodes)
-        check_json_size(outputs, nodes, self._service.settings.max_json_numbers, "outputs")
+            return self._obey(parse(TextCommand, text).model_dump(exclude_none=True))
+        asked = parse(TextRequest, text)
+        nodes, most = len(self._model.surface_nodes), self._service.settings.max_json_numbers
+        check_json_size(asked.outputs, nodes, most, "outputs")
+        outputs = sum({Output[name.upper()] for name in asked.outputs})
+        request = Request(asked.seq, asked.client_time, asked.position, outputs)
         return write_reply(self._answer(request, start))
 
     def _answer(self, request: Request, start: float) -> bytes:
@@ -242,16 +242,20 @@ class Session:
         self._service.metrics.count_frame(start - received, borders, answer.flags, dropped)
         return frame
 
-    def _obey(self, command: str, number: int) -> str:
+    def _obey(self, given: dict[str, int]) -> str:
         """Keep the state of the tissue or go back to one that was kept; echo the command."""
+        if len(given) != 1:
+            message, allowed = "One of snapshot and restore is wanted", [*TextCommand.model_fields]
+            raise Refusal("invalid_value", "snapshot", message, allowed)
+        ((command, number),) = given.items()
         if command == "snapshot":
-            self._snapshots[number] = self._tracker.snapshot()
-        elif number in self._snapshots:
-            self._tracker.restore(self._snapshots[number])
+            self._tracker.snapshot(number)
+        elif number in self._tracker.snapshots:
+            self._tracker.restore(number)
         else:
-            kept = sorted(self._snapshots)
+            kept = sorted(self._tracker.snapshots)
             raise Refusal("unknown_snapshot", "restore", "None was kept by this number", kept)
-        return orjson.dumps({command: number}).decode()
+        return orjson.dumps(given).decode()
 
     def _greeting(self) -> str:
         """Say what is served and how to speak with it."""
@@ -289,37 +293,16 @@ class TextCommand(Strict):
     restore: int | None = pydantic.Field(None, ge=0, lt=MOST_SNAPSHOTS)
 
 
-def read_request(text: str) -> Request:
-    """Read a position; raise `Refusal` with the field that is wrong."""
-    read = parse(TextRequest, text)
-    x, y, z = read.position
-    outputs = sum(Output[name.upper()] for name in set(read.outputs))
-    return Request(read.seq, read.client_time, (x, y, z), outputs)
-
-
 def is_command(text: str | None) -> bool:
     """Whether a message is a `TextCommand` rather than a position."""
     return text is not None and ('"snapshot"' in text or '"restore"' in text)
-
-
-def read_command(text: str) -> tuple[str, int]:
-    """Read a command: ``snapshot`` or ``restore``, and the number; raise `Refusal` for nonsense."""
-    given = parse(TextCommand, text).model_dump(exclude_none=True)
-    if len(given) != 1:
-        message, allowed = "One of snapshot and restore is wanted", list(TextCommand.model_fields)
-        raise Refusal("invalid_value", "snapshot", message, allowed)
-    return next(iter(given.items()))
-
-
-def names(bits: Output | Flag) -> list[str]:
-    """List bits as messages in JSON have them."""
-    return [str(bit.name).lower() for bit in bits]
 
 
 def write_reply(frame: bytes) -> str:
     """Write a reply in JSON: bits as lists of names, the reason in words, null for infinity."""
     reply = frames.decode_reply(frame)
     document = {name: value for name, value in reply._asdict().items() if value is not None}
-    document["flags"], document["outputs"] = names(Flag(reply.flags)), names(Output(reply.outputs))
-    document["reason"] = frames.REASONS_MEAN[Reason(reply.reason)]
+    for name, kind in ("flags", Flag), ("outputs", Output):
+        document[name] = [str(bit.name).lower() for bit in kind(document[name])]
+    document["reason"] = frames.REASONS_MEAN[reply.reason]
     return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY).decode()

@@ -1,4 +1,4 @@
-"""Following a tool: from one position of its tip to the next, whatever the next one is.
+"""Following a tool, in a session or its recording: from one position to the next, whatever it is.
 
 A position is first tried as it is, from the warm start of the last. If no equilibrium is found
 there, the way to it from the last good position is walked in smaller and smaller strides, for as
@@ -15,15 +15,16 @@ passes between two answers, and `STALLED` says that it was cut.
 import math
 from collections.abc import Sequence
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.online.session import frames
-from palpate.online.session.frames import Extras, Flag, Output, Reason, ToolAnswer
+from palpate.online.session.frames import REPLY, Extras, Flag, Output, Reason, ToolAnswer
+from palpate.online.session.recording import Recording
 from palpate.shared.answer import Answer
-from palpate.shared.errors import QueryError
+from palpate.shared.errors import PalpateError, QueryError
 from palpate.shared.model import ReducedModel
 from palpate.shared.reduced.transfer import REST, Past
 
@@ -49,17 +50,13 @@ SHORTEST = 1.0 / 64.0
 LONGEST = 0.1
 """Largest time that passes between two answers, s."""
 
+VOLATILE = ("server_received", "server_sent", "solve_time", "superseded")
+"""Fields of a reply that depend on the clock and on the network."""
+
 # enumerations are slow to calculate with
 _CONTACT, _CONVERGED, _IN_RANGE, _CLAMPED, _FALLBACK, _STALLED = map(int, Flag)
 _COORDINATES, _DISPLACEMENT, _VON_MISES, _STRESS, _HALF = map(int, Output)
 _SOLVED, _NO_EQUILIBRIUM, _BELOW_SURFACE = map(int, Reason)
-
-
-class Snapshot(NamedTuple):
-    """State of the tissue, to go back to; nothing in it ever changes."""
-
-    past: Past | None
-    good: Answer | None
 
 
 class ToolTracker:
@@ -73,17 +70,21 @@ class ToolTracker:
 
     def restart(self) -> None:
         """Forget where the tool has been: answers are then those of a new tracker."""
-        self.restore(Snapshot(self._rest, None))
+        self.snapshots: dict[int, tuple[Past | None, Answer | None]] = {}
+        self._past: Past | None = self._rest
+        self._good: Answer | None = None
+        self._lost = 0
+        self._warm.forget()
         self._clock: float | None = None
         self._span = self._reached = 0.0
 
-    def snapshot(self) -> Snapshot:
-        """Return the state of the tissue, for `restore`."""
-        return Snapshot(self._past, self._good)
+    def snapshot(self, number: int) -> None:
+        """Keep the state of the tissue by a number."""
+        self.snapshots[number] = self._past, self._good
 
-    def restore(self, snapshot: Snapshot) -> None:
+    def restore(self, number: int) -> None:
         """Go back to a snapshot and search from there; the client's time goes on."""
-        self._past, self._good = snapshot
+        self._past, self._good = self.snapshots[number]
         self._lost = 0
         self._warm.forget()
 
@@ -169,22 +170,62 @@ def recover(model: ReducedModel, touch: Answer, outputs: int) -> Extras:
     if not outputs & ~_HALF:
         return frames.NO_EXTRAS
     kind = np.float16 if outputs & _HALF else np.float32
-    extras: dict[str, Any] = {"outputs": outputs}
+    surface, fields = model.surface_nodes, []
+    coordinates, nodes = 0, len(surface) if outputs & (_DISPLACEMENT | _VON_MISES) else 0
+    largest = percentile = 0.0
     if outputs & _COORDINATES:
         states = [state for _, _, state in touch.parts]
-        rows = np.zeros((frames.MODELS, max(map(len, states), default=0)), np.float32)
+        coordinates = max(map(len, states), default=0)
+        rows = np.zeros((frames.MODELS, coordinates), np.float32)
         for row, state in zip(rows, states, strict=False):
             row[:] = state
-        extras["coordinates"] = rows
+        fields.append(rows)
     if outputs & (_DISPLACEMENT | _VON_MISES | _STRESS):
         everywhere = model.displacement(touch)
     if outputs & _DISPLACEMENT:
-        extras["displacement"] = everywhere[model.surface_nodes].astype(kind)
+        fields.append(everywhere[surface].astype(kind))
     if outputs & (_VON_MISES | _STRESS):
         stress = model.von_mises(touch, "all", everywhere)
     if outputs & _VON_MISES:
-        extras["von_mises"] = stress[model.surface_nodes].astype(kind)
+        fields.append(stress[surface].astype(kind))
     if outputs & _STRESS:
         largest, percentile = np.percentile(stress, (100.0, 99.0)).tolist()
-        extras |= {"max_von_mises": largest, "p99_von_mises": percentile}
-    return Extras(**extras)
+    return Extras(outputs, coordinates, nodes, largest, percentile, fields)
+
+
+def replay(recording: Recording, model: ReducedModel) -> dict[str, Any]:
+    """Answer a recorded session again and compare.
+
+    Returns the number of ``replies``, of those that are ``different``, that of the first of them
+    and the largest difference of a component of the force, mN.
+
+    The bits are those of compiled kernels from the cache: a process that has compiled some itself,
+    a server at its very first start, may differ from them in the last ones. Raises `PalpateError`
+    if the recording is of another scene.
+    """
+    if model.name != recording.scene:
+        raise PalpateError(
+            f"the recording is of scene {recording.scene!r}, the artifact of {model.name!r}"
+        )
+    tracker, commands = ToolTracker(model), list(recording.commands)
+    again = np.zeros_like(recording.replies)
+    for i, request in enumerate(recording.requests):
+        while commands and commands[0][0] <= i:
+            _, restores, number = commands.pop(0)
+            (tracker.restore if restores else tracker.snapshot)(number)
+        steps = int(recording.replies["steps"][i])
+        answer = tracker.follow(request.position, math.inf, request.client_time, steps)
+        extras = recover(model, answer.touch, request.outputs)
+        again[i] = np.frombuffer(frames.encode_reply(request, answer, extras), REPLY, 1)[0]
+    for name in VOLATILE:
+        again[name] = recording.replies[name]
+    # as opaque bytes, for which a NaN is equal to itself and -0 is not 0
+    one, other = (table.view(f"V{REPLY.itemsize}") for table in (again, recording.replies))
+    different = np.flatnonzero(one != other).tolist()
+    forces = np.abs(again["force"] - recording.replies["force"])
+    return {
+        "replies": len(again),
+        "different": len(different),
+        "first_different": different[0] if different else None,
+        "force_difference": float(forces.max(initial=0.0)),
+    }

@@ -10,7 +10,7 @@ from starlette.testclient import TestClient
 from palpate.online.client.session import ServiceError, Session
 from palpate.online.serve.app import create_app
 from palpate.online.serve.process import HttpProtocol
-from palpate.online.serve.store import Service, Store
+from palpate.online.serve.service import Service
 from palpate.online.session.websocket import OPTIONS
 from palpate.online.settings import Settings
 from palpate.shared.errors import PalpateError
@@ -20,13 +20,13 @@ from .fake_model import FakeModel
 
 
 @pytest.fixture
-def fake_store(tmp_path, monkeypatch):
-    """Return a function that makes a store of fake models, one per name.
+def fake_service(tmp_path, monkeypatch):
+    """Return a function that makes a service of fake models, one per name.
 
-    An exception in place of an model is raised when that file is loaded.
+    An exception in place of a model is raised when that file is loaded.
     """
 
-    def make(**models):
+    def make(settings=(), /, **models):
         for name in models:
             (tmp_path / f"{name}.h5").touch()
 
@@ -37,20 +37,20 @@ def fake_store(tmp_path, monkeypatch):
             return model
 
         monkeypatch.setattr(ReducedModel, "load", load)
-        return Store(tmp_path)
+        return Service(Settings(tmp_path, **dict(settings)))
 
     return make
 
 
 @pytest.fixture
-def make_app(fake_store, tmp_path):
-    """Return a function that makes a service of models, the toy unless told, and its store."""
+def make_app(fake_service):
+    """Return a function that makes a service of models (by default the toy) and its application."""
 
     def make(models, settings):
         models = models or [FakeModel()]
-        fake_store(**{getattr(model, "name", "broken"): model for model in models})
-        service = Service(Settings(tmp_path, **settings))
-        return create_app(service), service.store
+        named = {getattr(model, "name", "broken"): model for model in models}
+        service = fake_service(settings, **named)
+        return service, create_app(service)
 
     return make
 
@@ -61,9 +61,9 @@ def serve(make_app):
 
     @contextmanager
     def serving(*models, **settings):
-        app, store = make_app(models, settings)
+        service, app = make_app(models, settings)
         with TestClient(app, raise_server_exceptions=False) as client:
-            _wait_for(store)
+            _wait_for(service)
             yield client
 
     return serving
@@ -82,7 +82,7 @@ def serving(make_app):
 
     @contextmanager
     def serving(*models, **settings):
-        app, store = make_app(models, settings)
+        service, app = make_app(models, settings)
         config = uvicorn.Config(
             app, http=HttpProtocol, access_log=False, log_level="warning", **OPTIONS
         )
@@ -90,7 +90,7 @@ def serving(make_app):
         with socket.create_server(("127.0.0.1", 0)) as bound:
             thread = threading.Thread(target=server.run, args=([bound],))
             thread.start()
-            _wait_for(store)
+            _wait_for(service)
             try:
                 yield f"http://127.0.0.1:{bound.getsockname()[1]}"
             finally:
@@ -141,6 +141,6 @@ def error_of(response, status):
     return error
 
 
-def _wait_for(store):
-    while not store.ready:
+def _wait_for(service):
+    while not service.ready.is_set():
         time.sleep(0.005)

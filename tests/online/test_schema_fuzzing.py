@@ -7,7 +7,7 @@ from hypothesis import HealthCheck, settings
 from schemathesis.specs.openapi.checks import positive_data_acceptance
 
 from palpate.online.serve.app import create_app
-from palpate.online.serve.store import Service
+from palpate.online.serve.service import Service
 from palpate.online.settings import Settings
 
 

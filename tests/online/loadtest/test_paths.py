@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from palpate.online.client.http import Accessible
 from palpate.online.loadtest.paths import LIFTED, SPEED, tool_path
+from palpate.online.serve.schemas import Accessible
 
 from ..fake_model import FakeModel
 

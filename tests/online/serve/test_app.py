@@ -3,9 +3,9 @@ import threading
 import pytest
 from starlette.testclient import TestClient
 
+from palpate.online.serve import schemas
 from palpate.online.serve.app import create_app
-from palpate.online.serve.schemas import Accessible, Answer, Mesh, SceneList, SceneSummary
-from palpate.online.serve.store import Service
+from palpate.online.serve.service import Service
 from palpate.online.serve.wire import BINARY, JSON, MSGPACK
 from palpate.online.settings import Settings
 from palpate.shared.errors import PalpateError
@@ -46,7 +46,7 @@ def test_a_service_that_is_told_to_stop_does_not_wait_for_its_models(slow):
     service, loaded = slow
     with TestClient(create_app(service)) as client:
         assert client.get("/ready").status_code == 503
-    assert not service.store.ready
+    assert not service.ready.is_set()
     assert not loaded.is_set()
     loaded.set()
 
@@ -59,15 +59,15 @@ def test_a_service_without_any_model_is_not_ready(serve):
 
 def test_openapi_tells_units_ranges_and_examples(client):
     document = client.get("/openapi.json").json()
-    schemas = document["components"]["schemas"]
-    contact = schemas["Contact"]["properties"]
+    described = document["components"]["schemas"]
+    contact = described["Contact"]["properties"]
     assert "mm" in contact["position"]["description"]
     assert "kPa" in contact["pressure"]["description"]
     assert contact["pressure"]["minimum"] == 0
     assert contact["position"]["maxItems"] == 3
-    example = schemas["SolveRequest"]["examples"][0]
+    example = described["SolveRequest"]["examples"][0]
     assert client.post("/scenes/toy/check", json=example).json() == {"valid": True}
-    assert schemas["SolveRequest"]["properties"]["contacts"]["maxItems"] == 1
+    assert described["SolveRequest"]["properties"]["contacts"]["maxItems"] == 1
     solve = document["paths"]["/scenes/{name}/solve"]["post"]
     reference = solve["requestBody"]["content"]["application/json"]["schema"]["$ref"]
     assert reference == "#/components/schemas/SolveRequest"
@@ -79,11 +79,11 @@ def test_answers_are_as_documented(client):
     example = client.get("/scenes/toy").json()["example"]
     answer = client.post("/scenes/toy/solve", json={**example, "region": "surface"}).text
     documents = {
-        Answer: answer,
-        Accessible: client.get("/scenes/toy/accessible").text,
-        Mesh: client.get("/scenes/toy/mesh").text,
-        SceneList: client.get("/scenes").text,
-        SceneSummary: client.get("/scenes/toy").text,
+        schemas.Answer: answer,
+        schemas.AccessibleDocument: client.get("/scenes/toy/accessible").text,
+        schemas.MeshDocument: client.get("/scenes/toy/mesh").text,
+        schemas.SceneList: client.get("/scenes").text,
+        schemas.SceneSummary: client.get("/scenes/toy").text,
     }
     for model, text in documents.items():
         model.model_validate_json(text, strict=True, extra="forbid")

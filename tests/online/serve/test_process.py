@@ -96,9 +96,9 @@ def test_text_and_level_can_be_chosen(root, tmp_path, capsys):
 
 ENTER = """
 import os
-from palpate.online.serve.process import lock_memory, schedule_in_real_time
+from palpate.online.serve.process import run_in_real_time
 before = os.sched_getscheduler(0) if hasattr(os, "sched_getscheduler") else None
-print(schedule_in_real_time(), lock_memory())
+print(run_in_real_time())
 if before is not None:
     print(os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO)
 """
@@ -119,6 +119,6 @@ def test_a_refusal_is_told_with_what_it_takes(monkeypatch):
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    said = server.schedule_in_real_time()
+    said = server.run_in_real_time()
     assert "refused (Operation not permitted)" in said
     assert "CAP_SYS_NICE" in said

@@ -119,7 +119,7 @@ def test_other_versions_and_sizes_are_refused(decode):
 
 
 def test_a_reply_cut_short_is_refused(rng):
-    extras = Extras(outputs=Output.VON_MISES, von_mises=rng.random(5, np.float32))
+    extras = Extras(Output.VON_MISES, nodes=5, fields=[rng.random(5, np.float32)])
     frame = frames.encode_reply(REQUEST, step(), extras)
     with pytest.raises(FrameError, match="within von_mises"):
         frames.decode_reply(frame[:-1])

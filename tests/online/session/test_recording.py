@@ -16,8 +16,7 @@ from palpate.online.session.frames import (
     encode_request,
 )
 from palpate.online.session.recording import ASKED, Recorder, read_recording
-from palpate.online.session.replay import replay
-from palpate.online.session.tracker import LONGEST, ToolTracker
+from palpate.online.session.tracker import LONGEST, ToolTracker, replay
 from palpate.shared.errors import PalpateError
 from palpate.shared.model import ReducedModel
 

@@ -1,8 +1,8 @@
-"""The models a service answers from: every artifact of a directory that can be trusted."""
+"""What a service works with: settings, counts, and the models that can be trusted."""
 
+import asyncio
 import logging
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from palpate.online.serve.errors import Refusal
@@ -22,18 +22,18 @@ class ServedModel(NamedTuple):
     tip: list[float]  # mm, a position of the tip's centre at which it presses a little
 
 
-class Store:
-    """All models of the ``*.h5`` of a directory."""
+class Service:
+    """What endpoints and sessions work with; without `metrics` this is the only worker."""
 
-    def __init__(self, directory: Path) -> None:
-        self.directory = directory
+    def __init__(self, settings: Settings, metrics: Metrics | None = None) -> None:
+        self.settings, self.metrics = settings, metrics or Metrics()
         self.models: dict[str, ServedModel] = {}
         self.refused: list[dict[str, str]] = []  # `file` and `reason` of those that are not served
-        self.ready = False
+        self.ready = asyncio.Event()
 
     def open(self, warm: Callable[[ServedModel], Any]) -> None:
-        """Load and warm every model; a file that fails is refused and the others still served."""
-        for path in sorted(self.directory.glob("*.h5")):
+        """Load and warm the model of every ``*.h5``; refuse those that fail, serve the others."""
+        for path in sorted(self.settings.artifacts.glob("*.h5")):
             try:
                 served = _served(ReducedModel.load(path))
                 name = served.model.name
@@ -53,7 +53,7 @@ class Store:
 
     def require_ready(self) -> None:
         """Raise `Refusal` while models are being loaded."""
-        if not self.ready:
+        if not self.ready.is_set():
             raise Refusal("not_ready", "", "The models are being loaded; try again in a moment")
 
     def model(self, name: str) -> ServedModel:
@@ -62,14 +62,6 @@ class Store:
         if name not in self.models:
             raise Refusal("unknown_scene", "name", "No such scene is served", sorted(self.models))
         return self.models[name]
-
-
-class Service:
-    """What endpoints and sessions work with; without `metrics` this is the only worker."""
-
-    def __init__(self, settings: Settings, metrics: Metrics | None = None) -> None:
-        self.settings, self.store = settings, Store(settings.artifacts)
-        self.metrics = metrics or Metrics()
 
 
 def _served(model: ReducedModel) -> ServedModel:
