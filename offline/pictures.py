@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.fem.norms import Array
 from palpate.offline.solve import CELL_TYPES
 from palpate.shared.answer import Answer
+from palpate.shared.arrays import Array
 from palpate.shared.errors import PalpateError
 from palpate.shared.model import ReducedModel
 

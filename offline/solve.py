@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.offline.fem.model import NoEquilibrium
-from palpate.offline.fem.norms import Array, relative
+from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.shared.answer import describe
+from palpate.shared.arrays import Array
 from palpate.shared.artifact import read_artifact
 from palpate.shared.model import ReducedModel
 
@@ -123,7 +124,7 @@ def _peaks(displacement: Array, von_mises: Array) -> dict[str, float]:
 
 def write_vtu(
     path: Path,
-    nodes: NDArray[np.float64],
+    nodes: Array,
     elements: NDArray[np.integer[Any]],
     point_data: Mapping[str, NDArray[Any]],
 ) -> None:

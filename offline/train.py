@@ -31,7 +31,6 @@ from tqdm import tqdm
 from palpate.offline.choose.mesh import with_mesh
 from palpate.offline.choose.size import Trial, choose, first_place, ladder, try_patch
 from palpate.offline.fem.mesh import mesh_quality
-from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.info import duration
 from palpate.offline.reduce.footprint_models import compile_query, train_patch
@@ -54,6 +53,7 @@ from palpate.offline.validate.compare import (
 )
 from palpate.offline.validate.queries import KINDS, Kind
 from palpate.shared import artifact
+from palpate.shared.arrays import Array
 from palpate.shared.local_models import ESTIMATORS, Estimator, LocalModels
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.model import ReducedModel

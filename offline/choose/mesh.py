@@ -13,10 +13,10 @@ import numpy as np
 from tqdm import tqdm
 
 from palpate.offline.fem.mesh import build_mesh
-from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.sampling import spread_points
 from palpate.offline.run.streams import Stage, stream
+from palpate.shared.arrays import Array
 from palpate.shared.scene import Block, Divisions, Scene, SceneError, divisions_of, parse_scene
 
 SHARE = 3.0

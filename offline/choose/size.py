@@ -14,13 +14,14 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from palpate.offline.fem.norms import Array, relative, statistics
+from palpate.offline.fem.norms import relative, statistics
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.footprint_models import LocalTrainer, RandomLoads, train_patch
 from palpate.offline.reduce.join import nodal_modes
 from palpate.offline.reduce.layout import Patch
 from palpate.offline.reduce.ritz import region
 from palpate.offline.run.streams import Stage, stream
+from palpate.shared.arrays import Array
 from palpate.shared.mechanics.laws import AnyTissue
 from palpate.shared.mechanics.tissue import lame
 from palpate.shared.scene import Budget, Size, Tolerance

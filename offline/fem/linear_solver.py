@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_matrix, csr_matrix
 from scipy.sparse.linalg import SuperLU, splu
 
+from palpate.shared.arrays import Array, Numbers
 from palpate.shared.errors import PalpateError
 
 
@@ -58,7 +59,7 @@ class Pardiso:
             job(_PardisoJob.RELEASE)
         weakref.finalize(self, self._job, _PardisoJob.RELEASE)
 
-    def factorise(self, data: NDArray[np.float64]) -> None:
+    def factorise(self, data: Array) -> None:
         """Factorise the matrix of the given values.
 
         Parameters
@@ -77,7 +78,7 @@ class Pardiso:
             raise NotPositiveDefinite
         self._job(_PardisoJob.FACTORISE)
 
-    def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+    def solve(self, rhs: Array) -> Array:
         """Solve with the last factorisation, for right-hand sides (n,) or (n, k).
 
         All k together take half the time of one after the other.
@@ -96,9 +97,7 @@ class _PardisoJob:
     _SYMMETRIC_POSITIVE_DEFINITE = 2
     _NEGATIVE_PIVOT = -4
 
-    def __init__(
-        self, starts: NDArray[np.int32], columns: NDArray[np.int32], ordering: int
-    ) -> None:
+    def __init__(self, starts: Numbers, columns: Numbers, ordering: int) -> None:
         self.values = np.ones(columns.size)
         self._starts = starts
         self._columns = columns
@@ -117,8 +116,8 @@ class _PardisoJob:
     def __call__(
         self,
         phase: int,
-        rhs: NDArray[np.float64] | None = None,
-        x: NDArray[np.float64] | None = None,
+        rhs: Array | None = None,
+        x: Array | None = None,
     ) -> None:
         library = mkl()
         assert library is not None
@@ -170,7 +169,7 @@ class ScipyLU:
         )
         self._factors: SuperLU | None = None
 
-    def factorise(self, data: NDArray[np.float64]) -> None:
+    def factorise(self, data: Array) -> None:
         """See ``Pardiso``."""
         self._matrix.data[:] = data
         try:
@@ -186,7 +185,7 @@ class ScipyLU:
         if not on_diagonal or not (self._factors.U.diagonal() > 0).all():
             raise NotPositiveDefinite
 
-    def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+    def solve(self, rhs: Array) -> Array:
         """See ``Pardiso``."""
         assert self._factors is not None, "factorise first"
         return self._factors.solve(rhs)

@@ -4,12 +4,10 @@ Nodes, elements and faces are numbered by the lattice, first index slowest; degr
 3·node + axis. Element and face node order is VTK's.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.offline.fem.section import map_section, read_outline
+from palpate.shared.arrays import Array, Flags, Ints, Numbers
 from palpate.shared.geometry.elements import (
     HEX20_NODES,
     HEX_CORNERS,
@@ -22,9 +20,6 @@ from palpate.shared.geometry.elements import (
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.local_models import Mesh
 from palpate.shared.scene import Extrusion, Patch, Scene, SceneError, divisions_of
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int32]
 
 # Corners of an element's faces, outward by the right-hand rule: low and high end of each axis,
 # the order in which a geometry names its sides.
@@ -54,7 +49,7 @@ def build_mesh(scene: Scene) -> Mesh:
         nodes = parameters * np.array(geometry.size)
     centres = nodes[faces[:, :4]].mean(axis=1)
 
-    def patch(name: str, patch: Patch) -> NDArray[np.bool_]:
+    def patch(name: str, patch: Patch) -> Flags:
         inside = sides == geometry.sides.index(patch.side)
         for axis, bounds in enumerate((patch.x, patch.y, patch.z)):
             if bounds is not None:
@@ -73,7 +68,7 @@ def build_mesh(scene: Scene) -> Mesh:
     return Mesh(nodes, elements, faces, clamped, accessible)
 
 
-def _extruded(scene: Scene, geometry: Extrusion, parameters: Floats) -> Floats:
+def _extruded(scene: Scene, geometry: Extrusion, parameters: Array) -> Array:
     """Points (n, 3) mm of an extrusion for parameters in the unit cube."""
     if scene.folder is None:
         raise SceneError("geometry.section: the scene's folder is not known")
@@ -84,8 +79,8 @@ def _extruded(scene: Scene, geometry: Extrusion, parameters: Floats) -> Floats:
 
 
 def _lattice(
-    divisions: tuple[int, int, int], reference: Floats
-) -> tuple[Floats, Ints, Ints, NDArray[np.int64]]:
+    divisions: tuple[int, int, int], reference: Array
+) -> tuple[Array, Numbers, Numbers, Ints]:
     """Cut the unit cube into hexahedra whose nodes on [-1, 1]³ are ``reference`` (8 or 20, 3).
 
     Returns the nodes (n, 3) in the unit cube, elements and faces as in ``Mesh``, and on which side
@@ -147,16 +142,16 @@ def mesh_quality(mesh: Mesh) -> dict[str, float]:
     }
 
 
-def jacobians(mesh: Mesh, points: int) -> tuple[Floats, Floats]:
+def jacobians(mesh: Mesh, points: int) -> tuple[Array, Array]:
     """Jacobian determinants at Gauss points, shape (e, points³) mm³, and weights (points³,)."""
     at, weights = gauss(points, 3)
     _, slopes = shape(hexahedron(mesh.elements.shape[1]), at)
     gradient = np.einsum("eni,qnj->eqij", mesh.nodes[mesh.elements], slopes)
-    determinants: Floats = np.linalg.det(gradient)
+    determinants: Array = np.linalg.det(gradient)
     return determinants, weights
 
 
-def local_thickness(mesh: Mesh, points: Floats, normals: Floats) -> Floats:
+def local_thickness(mesh: Mesh, points: Array, normals: Array) -> Array:
     """How thick the body is (p,) mm under points (p, 3) of its boundary of given outward normals.
 
     This is the diameter of the largest ball that touches the surface at the point from inside and
@@ -184,7 +179,7 @@ def local_thickness(mesh: Mesh, points: Floats, normals: Floats) -> Floats:
     return thickness
 
 
-def _nodal_normals(mesh: Mesh, faces: NDArray[np.int32]) -> Floats:
+def _nodal_normals(mesh: Mesh, faces: Numbers) -> Array:
     """Outward unit normals (nodes, 3): area-weighted mean over the given faces, 0 elsewhere."""
     reference = quadrilateral(faces.shape[1])
     _, dN = shape(reference, reference)

@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from palpate.offline.fem import assembly
 from palpate.offline.fem.linear_solver import SparseSolver, sparse_solver
 from palpate.offline.fem.potential import Potential
 from palpate.offline.fem.terms import AppliedLoad, DeadLoad, Past, PastStress, Term, advanced
+from palpate.shared.arrays import Array, Ints, Numbers
 from palpate.shared.errors import PalpateError
 from palpate.shared.geometry.quadrature import volume_quadrature
 from palpate.shared.local_models import Mesh
@@ -23,8 +23,6 @@ from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.laws import AnyTissue, law_of
 from palpate.shared.mechanics.tensors import SYMMETRIC
 from palpate.shared.mechanics.viscosity import step_weights
-
-Array = NDArray[np.float64]
 
 TOLERANCE = 1e-9
 """Residual of an equilibrium relative to the load or to the force of the past, whichever is larger,
@@ -99,13 +97,13 @@ class FullModel:
             np.zeros((len(self.prony) + 1, *self.weights.shape, SYMMETRIC)),
         )
 
-    def _dofs(self, nodes: NDArray[np.int32]) -> NDArray[np.int64]:
+    def _dofs(self, nodes: Numbers) -> Ints:
         """Places (p, 3 k) among the free dofs of those of nodes (p, k); -1 is clamped."""
         number = np.full(3 * len(self.mesh.nodes), -1, dtype=np.int64)
         number[self.free] = np.arange(len(self.free))
         return number[(3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1)]
 
-    def _sparsity(self) -> tuple[NDArray[np.int32], csr_matrix]:
+    def _sparsity(self) -> tuple[Numbers, csr_matrix]:
         """CSR pattern of the free dofs and the slot in it of every element matrix entry."""
         dofs = self._dofs(self.mesh.elements)
         rows = np.repeat(dofs, dofs.shape[1], axis=1).ravel()
@@ -119,7 +117,7 @@ class FullModel:
         pattern = csr_matrix((np.zeros(len(keys)), (keys % n).astype(np.int32), indptr), (n, n))
         return slots.reshape(len(dofs), dofs.shape[1], -1), pattern
 
-    def face_slots(self, faces: NDArray[np.int32]) -> NDArray[np.int32]:
+    def face_slots(self, faces: Numbers) -> Numbers:
         """Slots (f, 3 k, 3 k) in the pattern of the dofs of faces (f, k); -1 is clamped."""
         dofs = self._dofs(faces)
         rows = np.broadcast_to(dofs[:, :, None], (*dofs.shape, dofs.shape[1]))

@@ -1,13 +1,10 @@
 """Relative errors and what is said of many."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from palpate.shared.arrays import Array
 
 
 def relative(approximation: Array, reference: Array) -> float:

@@ -9,17 +9,15 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.sparse import csr_matrix
 
 from palpate.offline.fem.linear_solver import NotPositiveDefinite
 from palpate.offline.fem.terms import Term
+from palpate.shared.arrays import Array
 
 if TYPE_CHECKING:
     from palpate.offline.fem.model import FullModel
-
-Array = NDArray[np.float64]
 
 
 class Potential:

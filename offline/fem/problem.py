@@ -8,11 +8,11 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.offline.fem.mesh import accessible_surface, build_mesh
 from palpate.offline.fem.model import Equilibrium, FullModel, NoEquilibrium
 from palpate.offline.fem.terms import DeadLoad, Past, TipContact, TipLoad
+from palpate.shared.arrays import Array, Field, Flags
 from palpate.shared.artifact import Artifact, values_of
 from palpate.shared.geometry.quadrature import stress_recovery
 from palpate.shared.geometry.surface import Surface
@@ -21,8 +21,6 @@ from palpate.shared.mechanics.footprint import footprint
 from palpate.shared.mechanics.sphere import tip_of, tip_surface
 from palpate.shared.mechanics.stress import StressRecovery, nodal_von_mises
 from palpate.shared.scene import Scene, parse_scene
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -50,8 +48,8 @@ Step = Load | TipPosition
 class Reference(NamedTuple):
     """Full solutions at the ends of time steps."""
 
-    u: NDArray[np.float32]  # (t, n, 3) mm
-    s: NDArray[np.float32]  # (t, n) kPa, von Mises stress
+    u: Field  # (t, n, 3) mm
+    s: Field  # (t, n) kPa, von Mises stress
     f: Array  # (t, 3) mN, on the tool
     tangent: Array  # (t, 3, 3) mN/mm, derivative of the force in the tool's position
 
@@ -78,7 +76,7 @@ class FullProblem:
         return Body(**vars(self.mesh), law=self.model.law, tip=tip)
 
     @cached_property
-    def beyond_clamped_layer(self) -> NDArray[np.bool_]:
+    def beyond_clamped_layer(self) -> Flags:
         """Nodes of no element that touches the support, (n,)."""
         layer = self.mesh.elements[self.mesh.clamped[self.mesh.elements].any(axis=1)]
         outside = np.ones(len(self.mesh.nodes), dtype=bool)

@@ -7,26 +7,23 @@ leave the boundary as squarely as the shape allows. Every mesh of a section, coa
 sampling of the same map.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline, RectBivariateSpline
 from scipy.optimize import minimize
 
+from palpate.shared.arrays import Array
 from palpate.shared.scene import SceneError
-
-Floats = NDArray[np.float64]
 
 # Grids on which the map is found. The last is fine enough that its cubic interpolation error
 # (microns) is far below the resolution of any medical image.
 LEVELS = ((18, 3), (36, 6), (72, 12))
 
 
-def read_outline(path: Path) -> Floats:
+def read_outline(path: Path) -> Array:
     """Read a closed outline (n, 2) mm, clockwise when x points right and z up.
 
     The CSV file has one header line and two columns, x and z; the last point is joined to the
@@ -54,13 +51,13 @@ def read_outline(path: Path) -> Floats:
     return points if polygon_area(points) < 0 else points[::-1]
 
 
-def polygon_area(points: Floats) -> float:
+def polygon_area(points: Array) -> float:
     """Signed area of a closed polygon, shape (n, 2); mm², positive if counter-clockwise."""
     after = np.roll(points, -1, axis=0)
     return float(0.5 * np.sum(_cross(points, after)))
 
 
-def _first_crossing(points: Floats) -> tuple[int, int] | None:
+def _first_crossing(points: Array) -> tuple[int, int] | None:
     """Find the first two edges of a closed polygon that cross, if any do."""
     a, b = points, np.roll(points, -1, axis=0)
     # Two edges cross where each separates the other's ends.
@@ -71,12 +68,12 @@ def _first_crossing(points: Floats) -> tuple[int, int] | None:
     return (int(found[0, 0]), int(found[0, 1])) if len(found) else None
 
 
-def _cross(a: Floats, b: Floats) -> Floats:
-    cross: Floats = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+def _cross(a: Array, b: Array) -> Array:
+    cross: Array = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
     return cross
 
 
-def map_section(points: Floats, corners: ArrayLike) -> Callable[[ArrayLike, ArrayLike], Floats]:
+def map_section(points: Array, corners: ArrayLike) -> Callable[[ArrayLike, ArrayLike], Array]:
     """Find a smooth map of the unit square onto the inside of an outline.
 
     Parameters
@@ -121,7 +118,7 @@ def map_section(points: Floats, corners: ArrayLike) -> Callable[[ArrayLike, Arra
         raise SceneError("geometry.corners: this split of the outline leaves a folded mesh")
     x, z = (RectBivariateSpline(u, v, grid[..., i]) for i in (0, 1))
 
-    def section(u: ArrayLike, v: ArrayLike) -> Floats:
+    def section(u: ArrayLike, v: ArrayLike) -> Array:
         return np.stack([x(u, v, grid=False), z(u, v, grid=False)], axis=-1)
 
     return section
@@ -130,7 +127,7 @@ def map_section(points: Floats, corners: ArrayLike) -> Callable[[ArrayLike, Arra
 class _Boundary:
     """A smooth outline cut into four sides, of arc lengths ``outer, tip, inner, lip`` (mm)."""
 
-    def __init__(self, points: Floats, corners: ArrayLike) -> None:
+    def __init__(self, points: Array, corners: ArrayLike) -> None:
         closed = np.vstack([points, points[:1]])
         arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
         self._curve = CubicSpline(arc, closed, bc_type="periodic")
@@ -144,12 +141,12 @@ class _Boundary:
             raise SceneError("geometry.corners: must lie apart and go clockwise round the section")
         self.outer, self.tip, self.inner, self.lip = sides
 
-    def scale(self, grid: Floats) -> Floats:
+    def scale(self, grid: Array) -> Array:
         """Inverse of a grid's mean cell size along u and v, shape (2,), 1/mm."""
         cells = np.array(grid.shape[:2]) - 1
         return 2 * cells / np.array([self.outer + self.inner, self.tip + self.lip])
 
-    def place(self, grid: Floats, slid: Floats) -> None:
+    def place(self, grid: Array, slid: Array) -> None:
         """Put the rim of a grid (nu + 1, nv + 1, 2) mm onto the outline.
 
         ``slid`` (nu - 1,) mm is where its inner nodes lie along the inner side, from the lip.
@@ -160,7 +157,7 @@ class _Boundary:
         grid[0] = self._at(3, self.lip * v)
         grid[1:-1, 0] = self._at(3, -slid)
 
-    def blend(self, u: Floats, v: Floats, slid: Floats) -> Floats:
+    def blend(self, u: Array, v: Array, slid: Array) -> Array:
         """Coons patch over the outline, shape (nu + 1, nv + 1, 2), mm."""
         grid = np.empty((len(u), len(v), 2))
         self.place(grid, slid)
@@ -169,37 +166,35 @@ class _Boundary:
         across = (1 - u) * grid[:1] + u * grid[-1:]
         lip = (1 - v) * grid[:1, :1] + v * grid[:1, -1:]
         tip = (1 - v) * grid[-1:, :1] + v * grid[-1:, -1:]
-        blend: Floats = along + across - (1 - u) * lip - u * tip
+        blend: Array = along + across - (1 - u) * lip - u * tip
         return blend
 
-    def slope(self, slid: Floats) -> Floats:
+    def slope(self, slid: Array) -> Array:
         """How the inner nodes move as they slide, shape (nu - 1, 2)."""
         return -self._at(3, -slid, derivative=1)
 
-    def _at(self, corner: int, distance: Floats, derivative: int = 0) -> Floats:
+    def _at(self, corner: int, distance: Array, derivative: int = 0) -> Array:
         arc = (self._starts[corner] + distance) % self._curve.x[-1]
-        at: Floats = self._curve(arc, derivative)
+        at: Array = self._curve(arc, derivative)
         return at
 
 
-def _uniform(cells: tuple[int, int]) -> tuple[Floats, Floats]:
+def _uniform(cells: tuple[int, int]) -> tuple[Array, Array]:
     """Grid lines u (cells[0] + 1,) and v (cells[1] + 1,) of the unit square."""
     return np.linspace(0.0, 1.0, cells[0] + 1), np.linspace(0.0, 1.0, cells[1] + 1)
 
 
-def _smooth(
-    boundary: _Boundary, grid: Floats, slid: Floats, epsilon: float
-) -> tuple[Floats, Floats]:
+def _smooth(boundary: _Boundary, grid: Array, slid: Array, epsilon: float) -> tuple[Array, Array]:
     """Move a grid's inside, and its inner side's nodes along that side, to the least energy."""
     grid, inside, scale = grid.copy(), grid[1:-1, 1:-1].shape, boundary.scale(grid)
 
-    def unpack(unknown: Floats) -> Floats:
+    def unpack(unknown: Array) -> Array:
         slid, free = np.split(unknown, [len(grid) - 2])
         boundary.place(grid, slid)
         grid[1:-1, 1:-1] = free.reshape(inside)
         return slid
 
-    def objective(unknown: Floats) -> tuple[float, Floats]:
+    def objective(unknown: Array) -> tuple[float, Array]:
         slope = boundary.slope(unpack(unknown))
         energy, gradient, _ = _mean_ratio(grid, scale, epsilon)
         sliding = np.sum(gradient[1:-1, 0] * slope, axis=1)
@@ -216,7 +211,7 @@ def _smooth(
     return grid, slid
 
 
-def _mean_ratio(grid: Floats, scale: Floats, epsilon: float) -> tuple[float, Floats, float]:
+def _mean_ratio(grid: Array, scale: Array, epsilon: float) -> tuple[float, Array, float]:
     """Mean ratio energy of a grid, its gradient, and the smallest scaled corner determinant.
 
     ``scale`` (2,) 1/mm is the inverse of the wanted cell size along the two grid directions,

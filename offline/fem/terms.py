@@ -11,17 +11,15 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.offline.fem import assembly
+from palpate.shared.arrays import Array, Numbers
 from palpate.shared.mechanics import sphere, viscosity
 from palpate.shared.mechanics.sphere import Tip, TipSurface, Touching, room_for
 
 if TYPE_CHECKING:
     from palpate.offline.fem.model import FullModel
     from palpate.offline.fem.potential import Potential
-
-Array = NDArray[np.float64]
 
 
 class Reaction(NamedTuple):
@@ -95,7 +93,7 @@ class TipContact:
 
     def touch(
         self, position: Array, displacement: Array, wanted: float
-    ) -> tuple[NDArray[np.int32], float, float]:
+    ) -> tuple[Numbers, float, float]:
         """Write to ``touching`` what ``sphere.touch`` finds; return faces (f, k), energy, depth."""
         count, energy, deepest = sphere.touch(
             self.tip, self.surface, self._all, position, displacement.reshape(-1, 3),

@@ -13,7 +13,6 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from palpate.offline.fem.model import FullModel
-from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods import hyper_reduction as hyper
 from palpate.offline.methods.full import Full, Remeshed
@@ -25,6 +24,7 @@ from palpate.offline.methods.spaces import Inner, krylov, mass, modal, pod, stat
 from palpate.offline.methods.tetrahedra import MassSpring, TensorMass
 from palpate.offline.reduce.ritz import TANGENTIAL
 from palpate.offline.reduce.sampling import spread_points, tangents
+from palpate.shared.arrays import Array
 from palpate.shared.model import ReducedModel
 
 FOOTPRINTS = 128

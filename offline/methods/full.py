@@ -4,10 +4,10 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from palpate.offline.fem.model import NoEquilibrium
-from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.terms import Past
 from palpate.offline.methods.method import Answer, Case, Method
+from palpate.shared.arrays import Array
 from palpate.shared.geometry.elements import hexahedron, shape
 from palpate.shared.scene import ElementName, Extrusion, Scene, divisions_of
 

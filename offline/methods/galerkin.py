@@ -5,18 +5,16 @@ other modes and points, under a dead load: equilibrium is sought with the invers
 secants make up, from rest on elastic tissue and from the last answer on tissue that remembers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.terms import Past
 from palpate.offline.methods.method import Answer, Case, Method
+from palpate.shared.arrays import Array, Field, Ints
 from palpate.shared.compiled import bind, bind_compiled, room
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.tensors import SYMMETRIC
@@ -35,9 +33,6 @@ from palpate.shared.reduced.press import ROUND_OFF, SMALLEST_TARGET
 from palpate.shared.reduced.problem import Problem, Work, newton_method
 from palpate.shared.reduced.terms import Dead
 
-Array = NDArray[np.float64]
-Field = NDArray[np.float32]
-
 TOLERANCE = 1e-4
 """Residual at equilibrium relative to load and past, in the energy norm: the solver's share of the
 error, small beside that of any basis here.  Single precision ends at about 1e-6."""
@@ -48,7 +43,7 @@ MAX_ITERATIONS = 400
 class Cubature(NamedTuple):
     """Quadrature points (c,), counted element by element, and their weights (c,) mm^3."""
 
-    points: NDArray[np.int64]
+    points: Ints
     weights: Array
 
 

@@ -23,8 +23,6 @@ POD: Everson & Sirovich 1995), the known cure for the noise that interpolation a
 a cubature of positive weights.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from contextlib import suppress
@@ -32,7 +30,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from palpate.offline.fem.model import FullModel
 from palpate.offline.fem.problem import FullProblem
@@ -40,7 +37,6 @@ from palpate.offline.methods.galerkin import (
     TOLERANCE,
     Content,
     Cubature,
-    Field,
     Galerkin,
     linearise_points,
     reduce_load,
@@ -48,10 +44,9 @@ from palpate.offline.methods.galerkin import (
 )
 from palpate.offline.methods.method import Answer, Case
 from palpate.offline.reduce.cubature import by_point, compress, nonnegative, training_forces
+from palpate.shared.arrays import Array, Field, Ints
 from palpate.shared.compiled import bind
 from palpate.shared.reduced.points import STATE, Points, project
-
-Array = NDArray[np.float64]
 
 LOOKS, RESPONSES = 16, 20
 """Random combinations of the modes' forces in one state, which are fitted instead of the forces,
@@ -61,9 +56,7 @@ EQUATIONS = 2  # equations kept for every cubature point, or element, allowed
 MAX_ITERATIONS = 60
 
 
-def contributions(
-    reduced: Galerkin, cases: Iterable[Case], rng: np.random.Generator
-) -> NDArray[np.float32]:
+def contributions(reduced: Galerkin, cases: Iterable[Case], rng: np.random.Generator) -> Field:
     """What every point adds to the sums (points, sums) that a cubature has to reproduce.
 
     They are forces in and off equilibria of cases, those that have one, weighted with the square
@@ -85,7 +78,7 @@ def contributions(
 
 def fit_cubature(
     model: FullModel,
-    forces: NDArray[np.float32],
+    forces: Field,
     most: int,
     rng: np.random.Generator,
     by_element: bool = False,
@@ -112,7 +105,7 @@ def force_modes(model: FullModel, displacements: Array, size: int) -> Array:
     return U[:, : min(size, int((amplitudes > 1e-12 * amplitudes[0]).sum()))]
 
 
-def sample(modes: Array, per_mode: int) -> NDArray[np.int64]:
+def sample(modes: Array, per_mode: int) -> Ints:
     """Greedy choice of dofs: for each force mode in turn, where those before it fit it worst.
 
     With one dof per mode (free dofs, k) that is the discrete empirical interpolation.
@@ -190,9 +183,7 @@ class PlainNewton(Galerkin):
 class Deim(PlainNewton):
     """Internal force interpolated by its modes (free dofs, k) at sampled dofs, see ``sample``."""
 
-    def __init__(
-        self, problem: FullProblem, basis: Array, modes: Array, sampled: NDArray[np.int64]
-    ) -> None:
+    def __init__(self, problem: FullProblem, basis: Array, modes: Array, sampled: Ints) -> None:
         model, dofs = problem.model, problem.model.free[sampled]
         touched = np.isin(model.connectivity, dofs // 3).any(axis=1)
         points = np.flatnonzero(np.repeat(touched, model.weights.shape[1]))

@@ -12,12 +12,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.fem.terms import Past
+from palpate.shared.arrays import Array, Ints
 
-Array = NDArray[np.float64]
 Foot = tuple[Array, Array]
 """Where a contact presses, mm, and the normal there."""
 
@@ -27,7 +26,7 @@ class Case:
     """Footprints that press at the same time, and the nodal forces they amount to."""
 
     contacts: tuple[Load, ...]
-    nodes: NDArray[np.int64]  # (k,) that are loaded
+    nodes: Ints  # (k,) that are loaded
     forces: Array  # (k, 3) mN, on those
     feet: tuple[Foot, ...] = ()
     radius: float | None = None  # mm, of the footprints; the scene's if absent

@@ -6,11 +6,11 @@ from collections.abc import Callable
 import numpy as np
 from scipy.interpolate import RBFInterpolator
 
-from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.methods.galerkin import reduce_load
 from palpate.offline.methods.method import Answer, Case, Method, Snapshots
 from palpate.offline.reduce.ritz import energy_pod
+from palpate.shared.arrays import Array
 
 Interpolant = Callable[[Array], Array]
 """Values (q, m) at features (q, 7) of loads."""

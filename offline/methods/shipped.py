@@ -8,10 +8,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods.method import Answer, Case, Method
 from palpate.shared.answer import Answer as Found
+from palpate.shared.arrays import Array
 from palpate.shared.errors import QueryError
 from palpate.shared.model import ReducedModel
 from palpate.shared.reduced.transfer import REST

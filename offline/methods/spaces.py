@@ -6,21 +6,18 @@ are the MOD, RITZ and POD of Radermacher & Reese.  In a quasi-static body the ma
 only: it makes a sequence of ever shorter waves out of one load.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from palpate.offline.fem.model import FullModel
 from palpate.offline.reduce.ritz import energy_pod, ritz_vectors
+from palpate.shared.arrays import Array
 from palpate.shared.geometry.elements import gauss, hexahedron, shape
 from palpate.shared.geometry.quadrature import volume_quadrature
 
-Array = NDArray[np.float64]
 Inner = Literal["energy", "euclidean"]
 
 EXHAUSTED = 1e-10

@@ -30,8 +30,6 @@ represent tissue of .45.  Only the overall stiffness can be corrected, as that o
 factor with which small loads get the full model's answer in the mean.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -47,12 +45,12 @@ from palpate.offline.fem.terms import DeadLoad
 from palpate.offline.methods.full import Remeshed, lattice
 from palpate.offline.methods.method import Answer, Case
 from palpate.offline.reduce.sampling import random_points
+from palpate.shared.arrays import Array, Flags
 from palpate.shared.errors import PalpateError
 from palpate.shared.local_models import Mesh
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.tissue import lame
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.integer]
 
 EVEN = ((0, 1, 2, 5), (0, 2, 3, 7), (0, 5, 7, 4), (2, 7, 5, 6), (0, 2, 7, 5))
@@ -73,7 +71,7 @@ MAX_ITERATIONS = 100
 LOADS = 24  # small loads by which a body's stiffness is fitted
 
 
-def cut(mesh: Mesh, mirrored: NDArray[np.bool_]) -> Ints:
+def cut(mesh: Mesh, mirrored: Flags) -> Ints:
     """Tetrahedra (5 c, 4) of a mesh of hex8 elements, those that are mirrored (c,) cut as ``ODD``.
 
     Raises

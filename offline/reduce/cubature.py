@@ -7,8 +7,6 @@ add the volume, which is not done here).  States off equilibrium belong to the t
 equilibrium the sum is the load, whatever the tissue does, and says little about the points.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,12 +15,12 @@ from numpy.typing import NDArray
 from scipy.linalg import qr_delete, qr_insert, solve, solve_triangular
 
 from palpate.offline.fem.problem import FullProblem, Step
+from palpate.shared.arrays import Array, Field, Ints
 from palpate.shared.mechanics.tissue import Law
 from palpate.shared.reduced.features import RESIDUAL_FEATURES, residual_features
 from palpate.shared.reduced.points import LANES, Points, add_past_stress, nonlinear_stress
 
-Array = NDArray[np.float64]
-Past = tuple[NDArray[np.float32], NDArray[np.float32]]
+Past = tuple[Field, Field]
 
 OFF_EQUILIBRIUM = 0.03
 """Size of the random departure from equilibrium, relative to each mode's part in the states."""
@@ -56,9 +54,7 @@ def compress(
     return A, A.sum(axis=1)
 
 
-def nonnegative(
-    A: NDArray[np.floating[Any]], b: Array, most: int
-) -> tuple[NDArray[np.int64], Array]:
+def nonnegative(A: NDArray[np.floating[Any]], b: Array, most: int) -> tuple[Ints, Array]:
     """Sparse non-negative solution of ``A x ~ b`` (Lawson & Hanson 1974, stopped early).
 
     A (r, q) is searched twice as fast in single precision.  Returns the columns with positive
@@ -103,7 +99,7 @@ def nonnegative(
     return np.array(chosen, dtype=np.int64)[order], x[order]
 
 
-def points_alone(points: Points) -> tuple[NDArray[np.float32], tuple[Array, Law]]:
+def points_alone(points: Points) -> tuple[Field, tuple[Array, Law]]:
     """Gradients (r, 9 c) of the modes at the points of the first local model, in tiles, 1/mm.
 
     Also their weights (c,) mm^3 and their law (c,).
@@ -112,19 +108,19 @@ def points_alone(points: Points) -> tuple[NDArray[np.float32], tuple[Array, Law]
     return rows, (points.weights[0], points.law.at(0))
 
 
-def by_point(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+def by_point(rows: Field) -> Field:
     """Gradients (c, 9, r) of modes, from those in tiles (r, 9 c)."""
     tiles = rows.reshape(len(rows), -1, 9, LANES)
     return np.ascontiguousarray(tiles.transpose(1, 3, 2, 0).reshape(-1, 9, len(rows)))
 
 
 def point_forces(
-    gradients: NDArray[np.float32],
+    gradients: Field,
     weights: Array,
     law: Law,
     state: Array,
     past: Past | None = None,
-) -> NDArray[np.float32] | None:
+) -> Field | None:
     """Nonlinear force of every point (c, r) at a state (r,) of a local model; None if inverted.
 
     Gradients (c, 9, r) 1/mm of the modes at points, a multiple of ``LANES``, of weights (c,) mm^3.
@@ -142,9 +138,7 @@ def point_forces(
     return (points @ gradients)[:, 0]
 
 
-def linear_forces(
-    gradients: NDArray[np.float32], weights: Array, law: Law, states: Array
-) -> NDArray[np.float32]:
+def linear_forces(gradients: Field, weights: Array, law: Law, states: Array) -> Field:
     """Linear elasticity's force of every point (c, r k) at states (k, r); see ``point_forces``."""
     H = (gradients @ states.T.astype(np.float32)).reshape(len(gradients), 3, 3, -1)
     P = law.mu[:, None, None, None] * (H + H.swapaxes(1, 2))
@@ -154,13 +148,13 @@ def linear_forces(
 
 
 def training_forces(
-    gradients: NDArray[np.float32],
+    gradients: Field,
     law: tuple[Array, Law],
     states: Sequence[tuple[Array, Array, Past | None]],
     count: int,
     responses: int,
     rng: np.random.Generator,
-) -> NDArray[np.float32]:
+) -> Field:
     """What each point (row) contributes to internal forces in and off equilibrium (columns).
 
     A local model adds to linear elasticity what the points have beyond it.  Points of great weight
@@ -193,15 +187,13 @@ def training_forces(
     return np.hstack([forces, _combined(linear, 2 * responses, rng)])
 
 
-def _combined(
-    columns: NDArray[np.float32], count: int, rng: np.random.Generator
-) -> NDArray[np.float32]:
+def _combined(columns: Field, count: int, rng: np.random.Generator) -> Field:
     """Random combinations (q, count) of columns (q, k), whose squares add up to about the same."""
     noise = rng.standard_normal((columns.shape[1], count), dtype=np.float32)
     return columns @ (noise / np.float32(np.sqrt(count)))
 
 
-def nonlinear_forces(rows: NDArray[np.float32], weights: Array, law: Law, states: Array) -> Array:
+def nonlinear_forces(rows: Field, weights: Array, law: Law, states: Array) -> Array:
     """Nonlinear force of all points together (k, r) at states (k, r); NaN where inverted.
 
     ``rows`` (r, 9 c) 1/mm are gradients of the modes in tiles.
@@ -233,7 +225,7 @@ def fit_residual(
     problem: FullProblem,
     frame: Array,
     centre: Array,
-    nodal: NDArray[np.float32],
+    nodal: Field,
     known: Sequence[tuple[Step, Array, float, Array]],
 ) -> Array:
     """Fit the log of the relative residual (RESIDUAL_FEATURES,) left in the full model by answers.

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.reduce import cubature
 from palpate.offline.reduce.join import deviatoric_of, half, nodal_modes, with_points
@@ -15,6 +14,7 @@ from palpate.offline.reduce.layout import Patch
 from palpate.offline.reduce.ritz import RITZ_VECTORS, Footprint, Region, local_modes, whole_numbers
 from palpate.offline.reduce.sampling import cone, fewer, tangents
 from palpate.offline.reduce.tip_models import compile_tip_query, endless, train_tip
+from palpate.shared.arrays import Array, Field
 from palpate.shared.local_models import LocalModels, ViscousModels
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import pressure_limit
@@ -213,7 +213,7 @@ def _untrained(
     at: Footprint,
     extent: float,
     whole: NDArray[np.int16],
-    mix: NDArray[np.float32],
+    mix: Field,
 ) -> LocalModels:
     """One local model that knows its modes alone, with every quadrature point."""
     modes, weights = len(mix), problem.model.weights.ravel()
@@ -255,7 +255,7 @@ def _expected(scene: Scene, region: Region, patch: Patch, rng: np.random.Generat
     return np.hstack(parts)
 
 
-def _training_forces(trainer: LocalTrainer, loads: RandomLoads) -> NDArray[np.float32]:
+def _training_forces(trainer: LocalTrainer, loads: RandomLoads) -> Field:
     """``cubature.training_forces`` whose errors are those of displacement in the energy norm."""
     samples = trainer.answers(loads.training, fewer(LOADS, loads.scene.tolerance))
     states = [(s.q, np.linalg.cholesky(s.compliance) / np.linalg.norm(s.q), None) for s in samples]

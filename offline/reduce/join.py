@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from palpate.offline.fem.model import FullModel
-from palpate.offline.fem.norms import Array
 from palpate.offline.reduce.ritz import Region
+from palpate.shared.arrays import Array, Field, Numbers
 from palpate.shared.local_models import LocalModels, LocalTips, ViscousModels
 
-Field = NDArray[np.float32]
 Tables = TypeVar("Tables", LocalModels, LocalTips)
 
 NEXT, FOLLOWED = 1.6, 2.0
@@ -35,7 +34,7 @@ def half(values: Array) -> Field:
 
 
 def join(
-    model: FullModel, bases: Sequence[Region], region: NDArray[np.int32], parts: list[LocalModels]
+    model: FullModel, bases: Sequence[Region], region: Numbers, parts: list[LocalModels]
 ) -> LocalModels:
     """Tables of all local models, which lie in given regions, from those of each."""
     models = _joined(
@@ -71,15 +70,13 @@ def _joined(parts: Sequence[Tables], **own: Any) -> Tables:
     return type(parts[0])(**own)
 
 
-def neighbours(models: LocalModels, reach: float) -> NDArray[np.int32]:
+def neighbours(models: LocalModels, reach: float) -> Numbers:
     """Pairs (n, 2) of patches whose centres are at most ``reach`` mm apart, the smaller first."""
     pairs = sorted(cKDTree(models.centres).query_pairs(reach))
     return np.array(pairs, np.int32).reshape(-1, 2)
 
 
-def overlaps(
-    model: FullModel, models: LocalModels, modes: Field, pairs: NDArray[np.int32]
-) -> Field:
+def overlaps(model: FullModel, models: LocalModels, modes: Field, pairs: Numbers) -> Field:
     """Products (n, r, r) of the modes (p, M, r) of both patches of each pair, in energy at rest.
 
     In half precision: products of orthonormal modes are at most one.

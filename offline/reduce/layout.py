@@ -3,13 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from palpate.offline.fem.norms import Array
 from palpate.offline.reduce.ritz import Footprint
 from palpate.offline.reduce.sampling import random_points, spacing_count, spread_points
 from palpate.offline.run.streams import Stage, stream
+from palpate.shared.arrays import Array, Ints
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.scene import Scene, Size
 
@@ -81,7 +80,7 @@ class Layout:
             seed=self._scene.seed + k,
         )
 
-    def footprints_of(self, region: int) -> NDArray[np.int64]:
+    def footprints_of(self, region: int) -> Ints:
         """Indices of the footprints that the local models of a region learn from, ascending."""
         own = np.flatnonzero(self.region == region)
         return np.unique(np.concatenate([self.learns_from[k] for k in own]))
@@ -100,7 +99,7 @@ def _centred_points(surface: Surface, count: int, rng: np.random.Generator) -> A
     return points
 
 
-def _within(radius: float, at: Array, points: Array) -> list[NDArray[np.int64]]:
+def _within(radius: float, at: Array, points: Array) -> list[Ints]:
     """Indices of ``points`` within ``radius`` of each row of ``at``, ascending."""
     found = cKDTree(points).query_ball_point(at, radius, return_sorted=True)
     return [np.array(rows, dtype=np.int64) for rows in found]

@@ -29,7 +29,6 @@ from scipy.spatial import cKDTree
 
 from palpate.offline.fem.mesh import local_thickness
 from palpate.offline.fem.model import FullModel, NoEquilibrium
-from palpate.offline.fem.norms import Array
 from palpate.offline.fem.potential import Projected
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.terms import DeadLoad
@@ -38,6 +37,7 @@ from palpate.offline.reduce.sampling import cone, random_points_and_rim, tangent
 from palpate.offline.run.streams import Stage
 from palpate.offline.validate.queries import Place
 from palpate.shared.answer import Answer
+from palpate.shared.arrays import Array
 from palpate.shared.errors import QueryError
 from palpate.shared.local_models import Estimators, LocalModels
 from palpate.shared.mechanics import newton

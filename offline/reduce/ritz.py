@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from palpate.offline.fem.model import FullModel
-from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.sampling import tangents
+from palpate.shared.arrays import Array, Field
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.scene import SceneError
 
@@ -152,9 +152,7 @@ def energy_pod(model: FullModel, vectors: Array, size: int) -> tuple[Array, Arra
     return np.linalg.solve(L, modes.T).T, energies
 
 
-def whole_numbers(
-    modes: Array, orthonormal: NDArray[np.float32]
-) -> tuple[NDArray[np.int16], NDArray[np.float32]]:
+def whole_numbers(modes: Array, orthonormal: Field) -> tuple[NDArray[np.int16], Field]:
     """Modes (M, r) in the basis of a region as whole numbers, and the mix (r, r) they want.
 
     The columns of ``whole @ mix`` are orthonormal, as reduced models take for granted: a mode that
@@ -195,9 +193,9 @@ class Region:
     """Basis of a region, and what local models learn from."""
 
     basis: NDArray[np.int16]  # (M, 3 n) in steps
-    steps: NDArray[np.float32]  # (M,) mm
-    orthonormal: NDArray[np.float32]  # (M, M) columns, in the basis: orthonormal in energy at rest
-    ritz: NDArray[np.float32]  # (k, M, 19 or more) in those, of the relaxed tissue last
+    steps: Field  # (M,) mm
+    orthonormal: Field  # (M, M) columns, in the basis: orthonormal in energy at rest
+    ritz: Field  # (k, M, 19 or more) in those, of the relaxed tissue last
 
     def truncate(self, modes: int) -> Self:
         """The leading modes; ``orthonormal`` is triangular, so its leading block stays right."""

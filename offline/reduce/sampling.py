@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from palpate.offline.fem.norms import Array
+from palpate.shared.arrays import Array
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.scene import Tolerance
 

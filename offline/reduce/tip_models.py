@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.offline.fem.model import NoEquilibrium
-from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem, TipPosition
 from palpate.offline.reduce import cubature
 from palpate.offline.reduce.join import deviatoric_of, half, nodal_modes, with_points
 from palpate.offline.reduce.layout import Patch
 from palpate.offline.reduce.sampling import farthest
+from palpate.shared.arrays import Array, Field
 from palpate.shared.geometry.surface import Surface, SurfaceIndex
 from palpate.shared.local_models import Body, LocalModels, LocalTips
 from palpate.shared.mechanics import newton
@@ -195,7 +195,7 @@ def train_tip(
     problem: FullProblem,
     patch: Patch,
     models: LocalModels,
-    orthonormal: NDArray[np.float32],
+    orthonormal: Field,
     rng: np.random.Generator,
 ) -> LocalTips:
     """Train one local model of the tip.
@@ -269,9 +269,7 @@ def _untrained(modes: NDArray[np.floating[Any]], weights: Array) -> LocalTips:
     )
 
 
-def _generous(
-    body: Body, models: LocalModels, orthonormal: NDArray[np.float32], nodal: int
-) -> Array:
+def _generous(body: Body, models: LocalModels, orthonormal: Field, nodal: int) -> Array:
     """Modes of a patch (M, r + nodal) with its responses to forces at nodes of its surface.
 
     In the energy of the rest state, the response to a force at a node has the components of the

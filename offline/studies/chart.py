@@ -26,10 +26,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
-from palpate.offline.fem.norms import Array, relative
+from palpate.offline.fem.norms import relative
 from palpate.offline.methods.catalogue import Training, build
 from palpate.offline.methods.full import Full, Remeshed
 from palpate.offline.methods.method import Method, Steps
@@ -40,6 +39,7 @@ from palpate.offline.studies import chart_drawing as drawing
 from palpate.offline.studies import references as full
 from palpate.offline.studies.chart_drawing import SHIPPED, TWIN, Row
 from palpate.offline.studies.references import Fields
+from palpate.shared.arrays import Array, Flags
 from palpate.shared.errors import PalpateError
 from palpate.shared.scene import Scene
 
@@ -187,7 +187,7 @@ def play(method: Method, steps: Steps) -> tuple[list[Any], Array, int]:
     return states[1:], np.array(seconds), missed
 
 
-def _pressing(steps: Steps) -> NDArray[np.bool_]:
+def _pressing(steps: Steps) -> Flags:
     return np.array([case.forces.any() for case, _ in steps])
 
 

@@ -9,10 +9,11 @@ from tqdm import tqdm
 
 from palpate.offline.bench import STEP, walk
 from palpate.offline.fem.model import NoEquilibrium
-from palpate.offline.fem.norms import Array, relative
+from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.validate.compare import OTHER_EQUILIBRIUM, opened
 from palpate.offline.validate.queries import Place, held_out_loads
+from palpate.shared.arrays import Array
 from palpate.shared.model import ReducedModel
 
 STATISTICS = {"median": 50, "p95": 95, "max": 100}

@@ -17,13 +17,14 @@ import numpy as np
 from palpate.offline.bench import walk
 from palpate.offline.fem.mesh import accessible_surface
 from palpate.offline.fem.model import NoEquilibrium
-from palpate.offline.fem.norms import Array, relative
+from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.methods.method import Case, Steps
 from palpate.offline.reduce.sampling import cone, random_points
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.studies.references import Fields, followed, of_tissue
 from palpate.offline.validate.queries import Place, random_loads
+from palpate.shared.arrays import Array
 from palpate.shared.model import ReducedModel
 
 Rng = np.random.Generator

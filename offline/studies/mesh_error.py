@@ -14,11 +14,11 @@ import numpy as np
 from tqdm import tqdm
 
 from palpate.offline.fem.mesh import local_thickness
-from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.sampling import spread_points
 from palpate.offline.run.tables import write_csv
 from palpate.offline.scenes import find_scene
+from palpate.shared.arrays import Array
 from palpate.shared.scene import ElementName
 
 POINTS = 12

@@ -36,11 +36,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import spearmanr
 from tqdm import tqdm
 
-from palpate.offline.fem.norms import Array, relative
+from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods.full import Full
 from palpate.offline.methods.galerkin import Galerkin
@@ -54,6 +53,7 @@ from palpate.offline.studies import paper_pictures
 from palpate.offline.studies.chart import play
 from palpate.offline.studies.references import Fields
 from palpate.offline.studies.relaxation import Phases, load_steps
+from palpate.shared.arrays import Array, Flags
 from palpate.shared.geometry.quadrature import surface_quadrature
 from palpate.shared.scene import Block
 
@@ -308,7 +308,7 @@ def claims_of_figure_1(rows: list[dict[str, Any]]) -> Claims:
     }
 
 
-def claims_of_figure_2(nodes: Nodes, near_support: NDArray[np.bool_]) -> Claims:
+def claims_of_figure_2(nodes: Nodes, near_support: Flags) -> Claims:
     """Where the errors are largest, in numbers.
 
     ``error_largest_where_value_smallest``, for displacement and stress: median relative errors of

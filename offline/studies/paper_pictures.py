@@ -7,9 +7,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
-from palpate.offline.fem.norms import Array
 from palpate.offline.methods.galerkin import TOLERANCE
 from palpate.offline.pictures import INK, body, new_plotter, ring, save
+from palpate.shared.arrays import Array
 from palpate.shared.local_models import Mesh
 
 STYLES = {"MOD": ("#0072B2", "o"), "RITZ": ("#E69F00", "s"), "POD": ("#009E73", "D")}

@@ -10,13 +10,14 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.fem.norms import Array, relative
+from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import FullProblem, Load, TipPosition
 from palpate.offline.methods.full import Remeshed
 from palpate.offline.methods.method import Case, Method, Snapshots, Steps
 from palpate.offline.run.workers import Checkpoint, content_key, open_artifact, worker_pool
 from palpate.offline.validate import compare
 from palpate.offline.validate.queries import HISTORIES, LOADS
+from palpate.shared.arrays import Array
 from palpate.shared.errors import PalpateError
 from palpate.shared.model import ReducedModel
 from palpate.shared.scene import Scene, parse_scene

@@ -8,10 +8,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
-from palpate.offline.fem.norms import Array
 from palpate.offline.run.tables import write_csv
 from palpate.offline.validate.compare import opened, play
 from palpate.offline.validate.queries import HISTORIES, Place
+from palpate.shared.arrays import Array
 
 PRESSED = 0.8  # pressure over its limit
 

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from palpate.offline.fem.norms import relative
@@ -31,6 +30,7 @@ from palpate.offline.studies.hard_cases import HardCase, Question
 from palpate.offline.studies.outcomes import Result
 from palpate.offline.studies.references import Fields
 from palpate.offline.studies.trajectories import histories
+from palpate.shared.arrays import Ints
 from palpate.shared.model import ReducedModel
 from palpate.shared.scene import Scene
 
@@ -209,9 +209,7 @@ def _answer(method: Method, problem: FullProblem, question: Question, every: int
         return Result(outcomes.DIVERGED, crashed=True)
 
 
-def _play(
-    method: Method, steps: Steps, ends: NDArray[np.int64], count: int
-) -> tuple[list[Any], bool, bool]:
+def _play(method: Method, steps: Steps, ends: Ints, count: int) -> tuple[list[Any], bool, bool]:
     """States at the last ``count`` of the ends, none if one is missing; trusted; refused."""
     state, states, trusted, begun = method.at_rest(), [], True, 0
     for number, end in enumerate(ends.tolist()):

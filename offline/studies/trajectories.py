@@ -11,7 +11,6 @@ from functools import cache, partial
 
 import numpy as np
 
-from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.methods.method import Case
 from palpate.offline.reduce.sampling import random_points_and_rim, tangents
@@ -19,6 +18,7 @@ from palpate.offline.run.streams import Stage, stream
 from palpate.offline.studies.hard_cases import HardCase
 from palpate.offline.studies.relaxation import load_steps
 from palpate.offline.validate.queries import Place
+from palpate.shared.arrays import Array
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.model import ReducedModel
 

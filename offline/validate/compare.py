@@ -12,12 +12,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from palpate.offline.fem.norms import Array, relative, statistics
+from palpate.offline.fem.norms import relative, statistics
 from palpate.offline.fem.problem import FullProblem, Load, Reference, Step
 from palpate.offline.run.tables import write_csv
 from palpate.offline.run.workers import open_artifact, run, worker_pool
 from palpate.offline.validate.queries import LOADS, Kind, held_out
 from palpate.shared.answer import Answer
+from palpate.shared.arrays import Array
 from palpate.shared.artifact import read_artifact
 from palpate.shared.errors import PalpateError, QueryError
 from palpate.shared.local_models import Estimator

@@ -5,7 +5,6 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from palpate.offline.fem.norms import Array
 from palpate.offline.fem.problem import Load, Step, TipPosition
 from palpate.offline.reduce.sampling import (
     cone,
@@ -14,6 +13,7 @@ from palpate.offline.reduce.sampling import (
     random_tangent,
 )
 from palpate.offline.run.streams import Stage, stream
+from palpate.shared.arrays import Array
 from palpate.shared.local_models import LocalModels
 from palpate.shared.mechanics.footprint import TIP_DEPTH, pressure_limit
 from palpate.shared.model import ReducedModel

@@ -13,11 +13,9 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.online.session.frames import Flag, Reply
-
-Array = NDArray[np.float64]
+from palpate.shared.arrays import Array, Field
 
 BLEND = 5e-3
 """Seconds over which a new reply takes over."""
@@ -38,7 +36,7 @@ def linear_force(reply: Reply, position: Array) -> Array:
     return without_pull(reply.force + reply.tangent @ step, reply.normal)
 
 
-def without_pull(force: Array, normal: NDArray[np.float32]) -> Array:
+def without_pull(force: Array, normal: Field) -> Array:
     """Drop the part of a force (3,) that points against the outward normal (3,)."""
     outward = normal.astype(np.float64)
     push = float(force @ outward)

@@ -14,6 +14,7 @@ from palpate.online.client.session import ServiceError, Session, scene_path, spl
 from palpate.online.serve import wire
 from palpate.online.serve.schemas import Accessible, Mesh
 from palpate.online.serve.wire import BINARY, JSON
+from palpate.shared.arrays import Array, Field
 from palpate.shared.errors import PalpateError
 
 
@@ -23,10 +24,10 @@ class Answer(NamedTuple):
     contact: dict[str, Any]  # this, trust and timing are described by the service's /docs
     trust: dict[str, Any]
     timing: dict[str, float]
-    force: NDArray[np.float64]  # (3,), mN, on the tool
-    contact_displacement: NDArray[np.float64]  # (3,), mm
-    displacement: NDArray[np.float32] | None  # (k, 3), mm
-    von_mises: NDArray[np.float32] | None  # (k,), kPa
+    force: Array  # (3,), mN, on the tool
+    contact_displacement: Array  # (3,), mm
+    displacement: Field | None  # (k, 3), mm
+    von_mises: Field | None  # (k,), kPa
 
 
 class Client:

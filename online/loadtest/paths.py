@@ -1,15 +1,13 @@
 """Where a tool goes: over the whole accessible surface, in and out of contact, fast as a hand."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import gaussian_filter1d
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from palpate.online.serve.schemas import Accessible
-
-Array = NDArray[np.float64]
+from palpate.shared.arrays import Array
 
 SPEED = 50.0
 """Largest speed of the tip, mm/s: a hand in a hurry."""

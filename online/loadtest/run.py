@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.online.client.http import Client
 from palpate.online.client.session import Connection, connect, scene_path, split_address
@@ -35,9 +34,8 @@ from palpate.online.serve.wire import BINARY, JSON
 from palpate.online.session.frames import Flag, Output
 from palpate.online.session.websocket import ECHO
 from palpate.online.settings import Plan
+from palpate.shared.arrays import Array, Flags
 from palpate.shared.errors import PalpateError
-
-Array = NDArray[np.float64]
 
 Messages = np.recarray[Any, Any]
 """What became of n messages, `streams.MESSAGE`, in the order in which they were due."""
@@ -59,7 +57,7 @@ class Outcome(NamedTuple):
 
     summary: dict[str, Any]  # JSON-able
     machine: Machine
-    clean: NDArray[np.bool_]  # (w,), which windows of the machine were clean
+    clean: Flags  # (w,), which windows of the machine were clean
     messages: dict[str, Messages]  # by kind, those that were sent
 
 
@@ -181,7 +179,7 @@ def gather(streams: Sequence[Stream], machine: Machine) -> Messages:
     return messages[np.argsort(messages["due"], kind="stable")].view(np.recarray)
 
 
-def clean_windows(machine: Machine, messages: Messages) -> NDArray[np.bool_]:
+def clean_windows(machine: Machine, messages: Messages) -> Flags:
     """Tell in which windows (w,) the host took no time and every message was sent on time."""
     clean = machine.steal == 0
     clean[messages.window[~(messages.lateness <= ON_TIME)]] = False  # also of those never sent
@@ -197,9 +195,7 @@ def quantiles(microseconds: Array) -> dict[str, float | None]:
     return dict(zip(QUANTILES, values.tolist(), strict=True))
 
 
-def summarize(
-    messages: Messages, clean: NDArray[np.bool_], streams: Sequence[Stream]
-) -> dict[str, Any]:
+def summarize(messages: Messages, clean: Flags, streams: Sequence[Stream]) -> dict[str, Any]:
     """Say what became of frames or queries, those of `clean` windows (w,) apart."""
     outcomes = Counter(messages.outcome.tolist())
     flags = messages["flags"][messages.outcome == ANSWERED]

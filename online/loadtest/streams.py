@@ -26,13 +26,11 @@ from typing import NamedTuple
 
 import numpy as np
 from httptools import HttpResponseParser
-from numpy.typing import NDArray
 from websockets.frames import Frame, Opcode
 from websockets.protocol import Protocol, Side
 
 from palpate.online.session.frames import REPLY, Request, encode_request
-
-Array = NDArray[np.float64]
+from palpate.shared.arrays import Array
 
 WINDOW = 0.25
 """Seconds over which it is judged whether machine and generator were on time."""

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.online.session.frames import REPLY, REPLY_FIELDS, Field, Request
+from palpate.shared.arrays import Array
 from palpate.shared.errors import PalpateError
 
 FORMAT = "palpate-session"
@@ -105,7 +106,7 @@ class Recording(NamedTuple):
     scene: str
     requests: list[Request]  # those that were answered
     replies: NDArray[Any]  # (n,), of `session.frames.REPLY`
-    received: NDArray[np.float64]  # (n,), s on the client's clock
+    received: Array  # (n,), s on the client's clock
     commands: list[tuple[int, int, int]]  # as `COMMANDS`
 
 

@@ -18,17 +18,15 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.online.session import frames
 from palpate.online.session.frames import REPLY, Extras, Flag, Output, Reason, ToolAnswer
 from palpate.online.session.recording import Recording
 from palpate.shared.answer import Answer
+from palpate.shared.arrays import Array
 from palpate.shared.errors import PalpateError, QueryError
 from palpate.shared.model import ReducedModel
 from palpate.shared.reduced.transfer import REST, Past
-
-Array = NDArray[np.float64]
 
 VALID = 0.2
 """Share of the depth over which force and tangent of an answer hold.
