@@ -14,7 +14,7 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -54,7 +54,7 @@ from palpate.offline.validate.compare import (
 from palpate.offline.validate.queries import KINDS, Kind
 from palpate.shared import artifact
 from palpate.shared.arrays import Array
-from palpate.shared.local_models import ESTIMATORS, Estimator, LocalModels
+from palpate.shared.local_models import Estimators, LocalModels
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.model import ReducedModel
 from palpate.shared.scene import Scene, Size, divisions_of
@@ -172,7 +172,7 @@ class Pipeline:
         limits = self._lowered(models, limits)
         model = untested(self.problem, models, limits)
         tables: dict[Kind, list[Row]] = {}
-        estimators: dict[str, Estimator] = {}
+        estimators: dict[str, Array] = {}
         documents: dict[str, Any] = {"provenance": self.provenance, "training": training}
         for kind in KINDS:
             if not kind.lacks(models):
@@ -180,7 +180,11 @@ class Pipeline:
                 documents[kind.document] = summarise(kind, tables[kind])
         training |= {"seconds": self.seconds, "layout": self._describe(layout, models)}
         self.provenance["wall_seconds"] = round(time.perf_counter() - self.started, 1)
-        artifact.write_artifact(path, self.scene.text, documents, _datasets(model, estimators))
+        where = "at vertices: limit along the normal, compliance, depth of the tip"
+        datasets = {"load_range": artifact.Dataset(model.limits, "kPa, mm/kPa, mm", where)}
+        for part in (model.body, model.models, model.surface, Estimators(**estimators)):
+            datasets |= artifact.datasets_of(part)
+        artifact.write_artifact(path, self.scene.text, documents, datasets)
         for kind, rows in tables.items():
             write_rows(path.parent / path.stem / "report" / f"{kind.document}.csv", kind, rows)
 
@@ -251,7 +255,7 @@ class Pipeline:
         self.asked += len(at)
         return np.concatenate(self._stage(title, tasks))
 
-    def _validate(self, kind: Kind, model: ReducedModel) -> tuple[Estimator, list[Row]]:
+    def _validate(self, kind: Kind, model: ReducedModel) -> tuple[Array, list[Row]]:
         """Calibrate the error estimate of a kind on random queries, each half for the other."""
         samples = self.scene.training.samples
         count = TIP_SAMPLES if kind.tip else fewer(samples, self.scene.tolerance)
@@ -314,23 +318,4 @@ def _provenance(scene: Scene, key: str) -> dict[str, Any]:
         "git_commit": commit,
         "seed": scene.seed,
         "content_key": key,
-    }
-
-
-def _datasets(model: ReducedModel, estimators: Mapping[str, Estimator]) -> dict[str, Any]:
-    """Arrays of a model and of its error estimates, which are named as in ``ESTIMATORS``."""
-    surface, dataset = model.surface, artifact.Dataset
-    limits = "at vertices: limit along the normal, compliance, depth of the tip"
-    errors = "log error = c . features; rows: displacement, von Mises, under the tip force"
-    return {
-        **artifact.datasets_of(model.body),
-        **artifact.datasets_of(model.models),
-        "surface_vertices": dataset(surface.vertices, "mm", "accessible surface"),
-        "surface_triangles": dataset(surface.triangles, "1", "triangles of it, outward"),
-        "surface_normals": dataset(surface.normals, "1", "outward unit normals at vertices"),
-        "load_range": dataset(model.limits, "kPa, mm/kPa, mm", limits),
-        **{
-            ESTIMATORS[kind]: dataset(estimator.coefficients, "1", errors)
-            for kind, estimator in estimators.items()
-        },
     }

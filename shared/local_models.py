@@ -167,51 +167,23 @@ class LocalModels:
         return self.whole.astype(np.float32) @ self.mix
 
 
-@dataclass(frozen=True)
-class Estimator:
-    """Calibrated error estimate: ``log error = c . features``, one row per quantity.
-
-    For the features see ``reduced.press``.
-    """
-
-    coefficients: Array  # (2, features): displacement, von Mises; under the tip also force
-
-    def __call__(self, features: Array) -> list[float]:
-        """Estimated relative errors, one for each row."""
-        errors: list[float] = np.exp(self.coefficients @ features).tolist()
-        return errors
+_FITTED = "log error = c . features; rows: displacement, von Mises, under the tip force"
 
 
 @dataclass(frozen=True)
 class Estimators:
-    """Error estimates of loads and of the tip, at once and over histories; 1 if not calibrated."""
+    """Calibrated error estimates of loads and of the tip, at once and over histories."""
 
-    loads: Estimator = Estimator(np.zeros((2, PRESS_FEATURES)))
-    touches: Estimator = Estimator(np.zeros((3, TOUCH_FEATURES)))
-    histories: Estimator = Estimator(np.zeros((2, HISTORY_FEATURES)))
-    courses: Estimator = Estimator(np.zeros((3, HISTORY_FEATURES)))
-
-    @classmethod
-    def of(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
-        """Read from an artifact, which holds those of its scene."""
-        return cls(
-            **{
-                name: Estimator(arrays[dataset])
-                for name, dataset in ESTIMATORS.items()
-                if dataset in arrays
-            }
-        )
+    loads: Annotated[Array | None, "error_coefficients", "1", _FITTED] = None
+    touches: Annotated[Array | None, "tip_error_coefficients", "1", _FITTED] = None
+    histories: Annotated[Array | None, "history_error_coefficients", "1", _FITTED] = None
+    courses: Annotated[Array | None, "tip_history_error_coefficients", "1", _FITTED] = None
 
     def coefficients(self, tip: bool, in_time: bool) -> Array:
-        """Of answers to loads or under the tip, at once or in time."""
+        """Of answers to loads or under the tip, at once or in time; 0 if not calibrated."""
         loads, touches = (self.histories, self.courses) if in_time else (self.loads, self.touches)
-        return (touches if tip else loads).coefficients
-
-
-ESTIMATORS = {
-    "loads": "error_coefficients",
-    "touches": "tip_error_coefficients",
-    "histories": "history_error_coefficients",
-    "courses": "tip_history_error_coefficients",
-}
-"""Where an artifact keeps each."""
+        found = touches if tip else loads
+        if found is not None:
+            return found
+        at_once = TOUCH_FEATURES if tip else PRESS_FEATURES
+        return np.zeros((3 if tip else 2, HISTORY_FEATURES if in_time else at_once))

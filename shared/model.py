@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from palpate.shared.answer import Answer
 from palpate.shared.arrays import Array, Field, Flags
-from palpate.shared.artifact import Artifact, ArtifactError, read_artifact
+from palpate.shared.artifact import Artifact, ArtifactError, read_artifact, values_of
 from palpate.shared.errors import QueryError
 from palpate.shared.fields import FieldRecovery
 from palpate.shared.geometry.surface import Surface, SurfaceIndex, boundary_triangles
@@ -108,12 +108,10 @@ class ReducedModel:
             scene=scene,
             info=artifact.documents,
             body=Body.of(arrays, scene),
-            surface=Surface(
-                arrays["surface_vertices"], arrays["surface_triangles"], arrays["surface_normals"]
-            ),
+            surface=Surface(**values_of(Surface, arrays)),
             limits=arrays["load_range"],
             models=LocalModels.of(arrays, scene),
-            estimators=Estimators.of(arrays),
+            estimators=Estimators(**values_of(Estimators, arrays)),
         )
 
     @property

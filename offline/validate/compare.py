@@ -21,7 +21,6 @@ from palpate.shared.answer import Answer
 from palpate.shared.arrays import Array
 from palpate.shared.artifact import read_artifact
 from palpate.shared.errors import PalpateError, QueryError
-from palpate.shared.local_models import Estimator
 from palpate.shared.model import ReducedModel
 from palpate.shared.reduced.transfer import REST
 
@@ -294,8 +293,8 @@ def reference_task(model: ReducedModel, query: Sequence[Step]) -> tuple[Any, ...
     return FullProblem.reference, query, model.displacement(answer)
 
 
-def calibrate(known: Sequence[KnownAnswer], share: float, damping: float) -> Estimator:
-    """Fit the error estimate: it covers a share of the known errors in all quantities.
+def calibrate(known: Sequence[KnownAnswer], share: float, damping: float) -> Array:
+    """Fit the error estimate (quantities, features): it covers a share of the known errors in all.
 
     A least-squares fit of their logs is raised by a constant for each quantity.  The answers that
     need not be covered are those that would raise one most.  What counts is how far an answer lies
@@ -318,12 +317,12 @@ def calibrate(known: Sequence[KnownAnswer], share: float, damping: float) -> Est
     rest = (rest - coefficients[0]) / (1 - leverage)[:, None]
     covered = np.argsort(rest.max(axis=1))[: int(np.ceil(share * (len(known) + 1)))]
     coefficients[0] += rest[covered].max(axis=0)
-    return Estimator(np.ascontiguousarray(coefficients.T))
+    return np.ascontiguousarray(coefficients.T)
 
 
 def calibrate_by_halves(
-    queries: Sequence[Sequence[KnownAnswer]], fit: Callable[[Sequence[KnownAnswer]], Estimator]
-) -> Estimator:
+    queries: Sequence[Sequence[KnownAnswer]], fit: Callable[[Sequence[KnownAnswer]], Array]
+) -> Array:
     """Fit an estimate to the answers to all queries.
 
     What an answer itself is estimated to err by comes from a fit to the other half of the queries.
@@ -332,7 +331,7 @@ def calibrate_by_halves(
         estimator = fit([answer for answers in queries[1 - half :: 2] for answer in answers])
         for answers in queries[half::2]:
             for answer in answers:
-                answer.estimated = np.array(estimator(answer.features))
+                answer.estimated = np.exp(estimator @ answer.features)
     return fit([answer for answers in queries for answer in answers])
 
 

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -135,9 +135,9 @@ class Surface:
         Outward unit normals, interpolated over the triangles.
     """
 
-    vertices: Array
-    triangles: Numbers
-    normals: Array
+    vertices: Annotated[Array, "surface_vertices", "mm", "accessible surface"]
+    triangles: Annotated[Numbers, "surface_triangles", "1", "triangles of it, outward"]
+    normals: Annotated[Array, "surface_normals", "1", "outward unit normals at vertices"]
 
     @cached_property
     def _index(self) -> SurfaceIndex:

@@ -186,7 +186,7 @@ def test_contact_begins_where_the_surface_is_cut_short(atlas):
     # triangles cut the curves of a surface: contact can begin a little above them
     ground = atlas.surface.ground(atlas.limits)
     lower = ground._replace(vertices=ground.vertices - [0.0, 0.0, 0.01])
-    coefficients = atlas.estimators.touches.coefficients
+    coefficients = atlas.estimators.touches
     radius, low = atlas.scene.endoscope.radius, atlas.nodes[:, 2].max() - 0.01
     for depth in (0.0085, 0.005, 0.002):
         own = Workspace(atlas.touch_models, lower, coefficients, Elastic())
