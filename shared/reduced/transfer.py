@@ -175,7 +175,9 @@ class Transfer:
         for slot, k, _ in answering:
             known = past.locals.get(k)
             if known is not None:
-                records[slot], moves[k] = known
+                if known is not workspace.held[slot]:
+                    records[slot] = known.record
+                moves[k] = known.moves
             else:
                 records[slot] = 0.0
                 memory = self.opened(records[slot])
