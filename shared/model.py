@@ -432,9 +432,7 @@ def _in_time(
         way = math.dist(position.tolist(), past.position.tolist())
     estimate_history(own.solver, past.features, way, share, response)
     found, records = own.result(), own.past.records
-    for slot, k, _ in answering:
-        own.held[slot] = Local(records[slot].copy(), moves[k])
-    active = tuple([(k, w, own.held[slot]) for slot, k, w in answering])
+    active = tuple([(k, w, Local(records[slot].copy(), moves[k])) for slot, k, w in answering])
     main = max(answering, key=itemgetter(2))[1] if answering else -1
     after = Past(
         past.time + dt, {k: local for k, _, local in active}, main, position,

@@ -17,9 +17,6 @@ BESIDE = 0.1
 ABSURD = 10.0
 """Multiple of the largest trained pressure beyond which a load is not answered."""
 
-SHORTEST = 1e-150
-"""Length of a direction whose square is no more than zero to a computer."""
-
 INWARD = np.zeros(3)
 """Direction that stands for the inward normal."""
 
@@ -56,7 +53,7 @@ def checked_load(
     if direction is None:
         return at, INWARD, radius
     towards = vector("direction", direction)
-    if not math.hypot(*towards.tolist()) > SHORTEST:
+    if not towards @ towards > 0.0:  # nor so short that its square is zero
         raise QueryError("direction", "must not be the zero vector")
     return at, towards, radius
 

@@ -175,9 +175,7 @@ class Transfer:
         for slot, k, _ in answering:
             known = past.locals.get(k)
             if known is not None:
-                if known is not workspace.held[slot]:
-                    records[slot] = known.record
-                moves[k] = known.moves
+                records[slot], moves[k] = known
             else:
                 records[slot] = 0.0
                 memory = self.opened(records[slot])

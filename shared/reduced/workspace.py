@@ -50,8 +50,6 @@ class Workspace:
         Its members.
     features : int
         Of the error estimate.
-    held : list of Local
-        What its past holds in each slot, after a step.
     """
 
     def __init__(
@@ -83,7 +81,6 @@ class Workspace:
             units = self.scratch.tangent.units.reshape(9, -1, 9, LANES)
             units[np.arange(9), :, np.arange(9)] = 1.0
         self.past, self._dt = past, math.nan
-        self.held: list[Any] = [None] * MAX_ACTIVE
         self.active = room(Active, **sizes)
         self._record, self.outcome = new_outcome()
         self.features = coefficients.shape[1]
