@@ -1,4 +1,5 @@
 import json
+import threading
 
 import h5py
 import numpy as np
@@ -34,13 +35,18 @@ def recorded(opening, stiff, tmp_path, rng, monkeypatch):
     """Return the recording of a wild session, written piece by piece, and its replies."""
     monkeypatch.setattr("palpate.online.session.recording.CHUNK", 10)
     path = tmp_path / "session.h5"
+    touch, answering = stiff.touch, threading.Event()
+    monkeypatch.setattr(stiff, "touch", lambda *a, **k: answering.wait() and touch(*a, **k))
+    answering.set()
     with opening(stiff, record=path) as session:
         replies = [
             session.step(position, Output.STRESS if i % 3 == 0 else 0)
             for i, position in enumerate(rng.uniform([0, 0, 4.5], [10, 10, 8], (100, 3)))
         ]
-        for i in range(50):  # without waiting, so that some are superseded
+        answering.clear()  # until all are sent, so that some are superseded
+        for i in range(50):
             session.send((5.0, 5.0, 7.0 - 0.01 * i))
+        answering.set()
         while replies[-1].seq != 150:
             replies.append(session.receive())
     return path, replies
