@@ -243,7 +243,6 @@ class ReducedModel:
         after: Past | None = None
         active: Active = ()
         if past is None:
-            press.estimate(own.solver, pressure)
             found = own.result()
         else:
             share = pressure / own.outcome.limit.item()
@@ -338,8 +337,6 @@ class ReducedModel:
         after: Past | None = None
         active: Active = ()
         if past is None:
-            if touched:
-                touch.estimate(own.solver, at)
             found = own.result()
         else:
             found, after, active = _in_time(

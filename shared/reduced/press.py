@@ -168,6 +168,8 @@ def press(solver, pressure, radius):
             outcome.displacement[i] += share * moved / max(area, 1e-12)
     for i in range(3):
         outcome.force[i] = -pressure * outcome.area[0] * outcome.direction[i]
+    if not solver.past.in_time:  # or ``transfer.estimate_history`` does
+        _estimate(solver, pressure)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -312,7 +314,7 @@ def _first_tangent(directions, table, scratch, inverse):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def estimate(solver, pressure):
+def _estimate(solver, pressure):
     """Estimated errors of an answer at once.
 
     The features: 1, tilt over the largest, smallest det F, the normal (where on the body), and the

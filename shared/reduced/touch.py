@@ -172,6 +172,8 @@ def touch(solver, x, most):
                         )
     _remember(solver, x)
     _act(solver, x)
+    if outcome.touched[0] > 0.0 and not solver.past.in_time:  # or ``estimate_history`` does
+        _estimate(solver, x)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -333,7 +335,7 @@ def _act(solver, x):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def estimate(solver, x):
+def _estimate(solver, x):
     """Estimated errors of an answer at once.
 
     The features: 1, the depth over its limit and its log, smallest det F, the normal (where on the
