@@ -22,7 +22,6 @@ from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.query import check_place, checked_load, out_of_range, vector
 from palpate.shared.reduced import press, touch
-from palpate.shared.reduced.outcome import Outcome
 from palpate.shared.reduced.past import Elastic, Remembering
 from palpate.shared.reduced.transfer import LeftBehind, Local, Past, Transfer, estimate_history
 from palpate.shared.reduced.workspace import Warm, Workspace
@@ -240,44 +239,42 @@ class ReducedModel:
             own.begin_step(self.scene.tissue.prony, dt)
             moves = self.transfer(False).begin(own, answering, past)
         press.press(own.solver, pressure, radius)
+        found, foot = own.outcome, own.outcome.foot.copy()
         after: Past | None = None
         active: Active = ()
-        if past is None:
-            found = own.result()
-        else:
-            share = pressure / own.outcome.limit.item()
-            found, after, active = _in_time(
-                own, answering, past, dt, moves, own.outcome.foot.copy(), share,
-                own.outcome.displacement,
-            )  # fmt: skip
+        if past is not None:
+            share = pressure / found.limit.item()
+            after, active = _in_time(
+                own, answering, past, dt, moves, foot, share, found.displacement
+            )
         parts = tuple([(k, w, own.warm.q[slot].copy()) for slot, k, w in answering])
-        converged = found.status == newton.CONVERGED
+        converged = found.status.item() == newton.CONVERGED
         outside = out_of_range(self.scene.endoscope, at, found, pressure, radius)
         errors = _UNKNOWN if outside or not converged else found.errors
         return Answer(
-            contact_point=found.foot,
-            normal=found.upward,
-            distance=found.distance,
-            force=found.force,
+            contact_point=foot,
+            normal=found.upward.copy(),
+            distance=found.distance.item(),
+            force=found.force.copy(),
             converged=converged,
-            iterations=int(found.iterations),
+            iterations=int(found.iterations.item()),
             in_range=not outside,
             out_of_range=outside,
             error_displacement=errors.item(0),
             error_von_mises=errors.item(1),
             error_force=0.0,
-            min_jacobian=found.min_jacobian,
-            pressure_limit=found.limit,
+            min_jacobian=found.min_jacobian.item(),
+            pressure_limit=found.limit.item(),
             depth_limit=found.limits.item(TIP_DEPTH),
-            features=found.features[: own.features],
+            features=found.features[: own.features].copy(),
             parts=parts,
-            direction=found.direction,
-            tilt=found.tilt,
+            direction=found.direction.copy(),
+            tilt=found.tilt.item(),
             pressure=pressure,
             radius=radius,
-            departure=found.departure,
-            residual=found.residual,
-            contact_displacement=found.displacement,
+            departure=found.departure.item(),
+            residual=found.residual.item(),
+            contact_displacement=found.displacement.copy(),
             contact=pressure > 0.0,
             time=0.0 if past is None else past.time + dt,
             past=after if converged else past,
@@ -333,22 +330,21 @@ class ReducedModel:
             own.begin_step(self.scene.tissue.prony, dt)
             moves = self.transfer(True).begin(own, answering, past)
         touch.touch(own.solver, at, most)
-        touched = own.outcome.touched.item() > 0
+        found, touched = own.outcome, own.outcome.touched.item() > 0
+        limit = found.limit.item()
         after: Past | None = None
         active: Active = ()
-        if past is None:
-            found = own.result()
-        else:
-            found, after, active = _in_time(
-                own, answering, past, dt, moves, past.position if off else at,
-                depth / own.outcome.limit.item(), own.outcome.force,
-            )  # fmt: skip
+        if past is not None:
+            place = past.position if off else at
+            after, active = _in_time(
+                own, answering, past, dt, moves, place, depth / limit, found.force
+            )
         parts = tuple([(k, w, own.scratch.q[slot].copy()) for slot, k, w in answering])
-        converged = found.status == newton.CONVERGED
+        converged = found.status.item() == newton.CONVERGED
         outside: tuple[str, ...] = ()
-        if found.beside and (touched or depth > 0.0):
+        if found.beside.item() and (touched or depth > 0.0):
             outside += ("position",)
-        if depth > found.limit * (1 + 1e-9):
+        if depth > limit * (1 + 1e-9):
             outside += ("depth",)
         errors = found.errors
         if outside or not converged:
@@ -356,29 +352,29 @@ class ReducedModel:
         elif not touched and past is None:
             errors = _NONE
         return Answer(
-            contact_point=found.point,
-            normal=found.normal,
-            distance=found.distance,
-            force=found.force,
+            contact_point=found.point.copy(),
+            normal=found.normal.copy(),
+            distance=found.distance.item(),
+            force=found.force.copy(),
             converged=converged,
-            iterations=int(found.iterations),
+            iterations=int(found.iterations.item()),
             in_range=not outside,
             out_of_range=outside,
             error_displacement=errors.item(0),
             error_von_mises=errors.item(1),
             error_force=errors.item(2),
-            min_jacobian=found.min_jacobian,
+            min_jacobian=found.min_jacobian.item(),
             pressure_limit=found.limits.item(0),
-            depth_limit=found.limit,
-            features=found.features[: own.features],
+            depth_limit=limit,
+            features=found.features[: own.features].copy(),
             parts=parts,
             tip=True,
             position=at,
             contact=touched,
-            tangent=found.tangent.reshape(3, 3),
+            tangent=found.tangent.copy(),
             depth=depth,
-            penetration=found.penetration,
-            energy=found.energy,
+            penetration=found.penetration.item(),
+            energy=found.energy.item(),
             time=0.0 if past is None else past.time + dt,
             past=after if converged else past,
             active=active,
@@ -421,18 +417,15 @@ def _in_time(
     position: Array | None,
     share: float,
     response: Array,
-) -> tuple[Outcome, Past, Active]:
-    """Return the outcome of a step, the past to go on from, and local models and theirs."""
+) -> tuple[Past, Active]:
+    """Return the past to go on from after a step, and local models and theirs."""
     assert isinstance(own.past, Remembering)
     way = 0.0
     if position is not None and past.position is not None:
         way = math.dist(position.tolist(), past.position.tolist())
     estimate_history(own.solver, past.features, way, share, response)
-    found, records = own.result(), own.past.records
+    records, features = own.past.records, own.outcome.features[: own.features].copy()
     active = tuple([(k, w, Local(records[slot].copy(), moves[k])) for slot, k, w in answering])
     main = max(answering, key=itemgetter(2))[1] if answering else -1
-    after = Past(
-        past.time + dt, {k: local for k, _, local in active}, main, position,
-        found.features[: own.features],
-    )  # fmt: skip
-    return found, after, active
+    after = Past(past.time + dt, {k: local for k, _, local in active}, main, position, features)
+    return after, active

@@ -75,12 +75,13 @@ def out_of_range(
 ) -> tuple[str, ...]:
     """Fields of a load that are not of the kind the model was trained for."""
     fields: tuple[str, ...] = ()
-    beside = UPRIGHT * found.distance  # rather beyond the rim than above or below
-    if found.distance > BESIDE and abs(np.dot(at - found.foot, found.upward)) < beside:
+    distance = found.distance.item()
+    beside = UPRIGHT * distance  # rather beyond the rim than above or below
+    if distance > BESIDE and abs(np.dot(at - found.foot, found.upward)) < beside:
         fields += ("position",)
-    if pressure > found.limit * (1 + 1e-9):
+    if pressure > found.limit.item() * (1 + 1e-9):
         fields += ("pressure",)
-    if found.tilt > endoscope.max_tilt + 1e-6:
+    if found.tilt.item() > endoscope.max_tilt + 1e-6:
         fields += ("direction",)
     if radius != endoscope.radius:
         fields += ("radius",)

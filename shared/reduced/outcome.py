@@ -1,23 +1,20 @@
-"""What a compiled query reads and writes; its outcome is one array, kept by one copy."""
+"""What a compiled query reads and writes."""
 
-from itertools import pairwise
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import Annotated, Any, NamedTuple
 
 from palpate.shared.arrays import Array
 from palpate.shared.geometry.surface import SurfaceIndex
-from palpate.shared.mechanics.footprint import LIMIT_FIELDS
 from palpate.shared.reduced.blend import Active
 
-Number = Any
+Number = Annotated[Array, "1"]
+Vector = Annotated[Array, "3"]
 
 PRESS_FEATURES, TOUCH_FEATURES, HISTORY_FEATURES = 11, 10, 9
 """Features of the error estimates of loads, of the tip, and of histories of both."""
 
 
 class Outcome(NamedTuple):
-    """Views of the array, in which a number is an array of one; or a copy with plain numbers."""
+    """Outcome of the last query; a number is an array of one."""
 
     status: Number  # worst of the local models, see ``mechanics.newton``
     iterations: Number  # most of one local model
@@ -33,34 +30,17 @@ class Outcome(NamedTuple):
     residual: Number  # relative residual of such answers in the full model
     penetration: Number  # mm, of the tip in the deformed surface
     touched: Number  # number of faces
-    foot: Array  # (3,) mm, on the surface, nearest to the position
-    upward: Array  # (3,) outward normal there
-    direction: Array  # (3,) of a load
-    force: Array  # (3,) mN
-    displacement: Array  # (3,) mm, mean under a footprint
-    point: Array  # (3,) mm, where the tip's force acts
-    normal: Array  # (3,) from there outwards
-    errors: Array  # (3,) estimated: displacement, von Mises stress, force
-    tangent: Array  # (3, 3) mN/mm
-    features: Array  # (PRESS_FEATURES,) of the error estimate
-    limits: Array  # (LIMIT_FIELDS,) load range there, see ``mechanics.footprint``
-
-
-NUMBERS = Outcome._fields.index("foot")
-"""Of fields that are one number."""
-
-_SIZES = {"tangent": 9, "features": PRESS_FEATURES, "limits": LIMIT_FIELDS}
-_ENDS = np.cumsum([NUMBERS, *(_SIZES.get(name, 3) for name in Outcome._fields[NUMBERS:])]).tolist()
-ARRAYS = [slice(start, stop) for start, stop in pairwise(_ENDS)]
-"""Where the others lie in the array."""
-
-
-def new_outcome() -> tuple[Array, Outcome]:
-    """Return the array and its views."""
-    record = np.zeros(_ENDS[-1])
-    numbers = [record[i : i + 1] for i in range(NUMBERS)]
-    views = Outcome(*numbers, *(record[place] for place in ARRAYS))
-    return record, views._replace(tangent=views.tangent.reshape(3, 3))
+    foot: Vector  # mm, on the surface, nearest to the position
+    upward: Vector  # outward normal there
+    direction: Vector  # of a load
+    force: Vector  # mN
+    displacement: Vector  # mm, mean under a footprint
+    point: Vector  # mm, where the tip's force acts
+    normal: Vector  # from there outwards
+    errors: Vector  # estimated: displacement, von Mises stress, force
+    tangent: Annotated[Array, "3, 3"]  # mN/mm
+    features: Annotated[Array, "features"]  # of the error estimate
+    limits: Annotated[Array, "limits"]  # load range there, see ``mechanics.footprint``
 
 
 class Solver(NamedTuple):

@@ -13,6 +13,7 @@ import numpy as np
 from palpate.shared.arrays import Array
 from palpate.shared.compiled import bind, room
 from palpate.shared.geometry.surface import SurfaceIndex
+from palpate.shared.mechanics.footprint import LIMIT_FIELDS
 from palpate.shared.mechanics.sphere import BLOCK
 from palpate.shared.mechanics.viscosity import step_weights
 from palpate.shared.reduced.blend import MAX_ACTIVE, Active
@@ -24,7 +25,7 @@ from palpate.shared.reduced.features import (
     TANGENT_FEATURES,
     TIP_FEATURES,
 )
-from palpate.shared.reduced.outcome import ARRAYS, NUMBERS, Outcome, Solver, new_outcome
+from palpate.shared.reduced.outcome import PRESS_FEATURES, Outcome, Solver
 from palpate.shared.reduced.past import Elastic, Remembering
 from palpate.shared.reduced.points import LANES, STATE
 from palpate.shared.reduced.press import PressModels, PressScratch, PressWarm
@@ -82,7 +83,7 @@ class Workspace:
             units[np.arange(9), :, np.arange(9)] = 1.0
         self.past, self._dt = past, math.nan
         self.active = room(Active, **sizes)
-        self._record, self.outcome = new_outcome()
+        self.outcome = room(Outcome, features=PRESS_FEATURES, limits=LIMIT_FIELDS)
         self.features = coefficients.shape[1]
         self.solver = bind(
             Solver(
@@ -117,11 +118,6 @@ class Workspace:
         """Slot, number and weight of the local models that answer."""
         weights = self.active.weight.tolist()
         return [(s, k, weights[s]) for s, k in enumerate(self.active.number.tolist()) if k >= 0]
-
-    def result(self) -> Outcome:
-        """Copy of the outcome, with plain numbers."""
-        record = self._record.copy()
-        return Outcome._make([*record[:NUMBERS].tolist(), *[record[place] for place in ARRAYS]])
 
 
 class Warm:

@@ -194,7 +194,7 @@ def test_contact_begins_where_the_surface_is_cut_short(atlas):
         x[2] = low + radius - (depth - 0.01)
         touch.place(own.solver, x, x)
         touch.touch(own.solver, x, touch.MAX_ITERATIONS)
-        answer = own.result()
+        answer = own.outcome
         assert -touch.SKIN * radius < answer.depth <= 0.0
         assert answer.touched > 0
         assert answer.status == newton.CONVERGED
