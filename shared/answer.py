@@ -39,7 +39,7 @@ class Answer(NamedTuple):
     pressure: float = 0.0  # kPa, of a load, at the footprint's centre
     radius: float = 0.0  # mm, of the footprint
     departure: float = 0.0  # from the linear response, relative to that, in the energy norm
-    residual: float = 0.0  # of such answers in the full model, relative, in the energy norm at rest
+    residual: float = 0.0  # at once: of such answers in the full model, relative, in energy norm
     contact_displacement: Array = np.zeros(3)  # mm, mean under the footprint's pressure
     tip: bool = False  # whether the tip was asked for, not a load
     position: Array = np.zeros(3)  # mm, centre of the tip

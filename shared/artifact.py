@@ -106,7 +106,7 @@ def digest(values: NDArray[Any]) -> str:
     values = np.ascontiguousarray(values)
     header = f"{values.dtype.str}{values.shape}".encode()
     sha = hashlib.sha256(header)
-    sha.update(values.data if values.ndim else values.tobytes())
+    sha.update(values.data)
     return sha.hexdigest()
 
 

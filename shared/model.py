@@ -37,6 +37,10 @@ Moves = dict[int, tuple[Mapping[int, LeftBehind], ...]]
 _NONE, _UNKNOWN = np.zeros(3), np.full(3, np.inf)
 """Estimated errors."""
 
+_BEYOND = 2.0
+"""Share of its limit that stands for a load that is out of range in other ways: no error is known
+of a history from there on."""
+
 
 class ReducedModel:
     """A trained scene that answers queries: an atlas of local models over its surface.
@@ -224,13 +228,14 @@ class ReducedModel:
             If a field is not finite, out of reach or makes no sense; see its message.
         """
         started = time.perf_counter()
+        last = None if past is None else past.position
+        lifted = position is None
         if position is None:
-            last = None if past is None else past.position
             position, pressure = self.surface.vertices[0] if last is None else last, 0.0
         at, towards, radius = checked_load(
             self.scene.endoscope, self.pressure_max, position, pressure, direction, radius
         )
-        own = self._warm(warm, past, dt).workspace(tip=False, in_time=past is not None)
+        own = self._memory(False, warm, past, dt)
         press.place(own.solver, at, towards)
         check_place(self.scene.endoscope, own.outcome.distance.item(), own.outcome.tilt.item())
         answering = own.answering()
@@ -238,21 +243,22 @@ class ReducedModel:
         if past is not None:
             own.begin_step(self.scene.tissue.prony, dt)
             moves = self.transfer(False).begin(own, answering, past)
-        press.press(own.solver, pressure, radius)
-        found, foot = own.outcome, own.outcome.foot.copy()
+        press.press(own.solver, float(pressure), radius)
+        found = own.outcome
+        outside = out_of_range(self.scene.endoscope, at, found, pressure, radius)
         after: Past | None = None
         active: Active = ()
         if past is not None:
-            share = pressure / found.limit.item()
+            place = last if lifted else found.foot.copy()
+            share = _BEYOND if outside else pressure / found.limit.item()
             after, active = _in_time(
-                own, answering, past, dt, moves, foot, share, found.displacement
+                own, answering, past, dt, moves, place, share, found.displacement
             )
         parts = tuple([(k, w, own.warm.q[slot].copy()) for slot, k, w in answering])
         converged = found.status.item() == newton.CONVERGED
-        outside = out_of_range(self.scene.endoscope, at, found, pressure, radius)
         errors = _UNKNOWN if outside or not converged else found.errors
         return Answer(
-            contact_point=foot,
+            contact_point=found.foot.copy(),
             normal=found.upward.copy(),
             distance=found.distance.item(),
             force=found.force.copy(),
@@ -310,7 +316,7 @@ class ReducedModel:
         """
         started = time.perf_counter()
         at = vector("position", position)
-        own = self._warm(warm, past, dt).workspace(tip=True, in_time=past is not None)
+        own = self._memory(True, warm, past, dt)
         last = at if past is None or past.position is None else past.position
         touch.place(own.solver, at, last)
         depth, radius = own.outcome.depth.item(), self.body.tip.radius
@@ -381,17 +387,18 @@ class ReducedModel:
             solve_seconds=time.perf_counter() - started,
         )
 
-    def _warm(self, warm: Warm | None, past: Past | None, dt: float) -> Warm:
+    def _memory(self, tip: bool, warm: Warm | None, past: Past | None, dt: float) -> Workspace:
         """Memory to answer with: the caller's, or the model's own, which knows no last answer."""
         if past is not None:
-            if not self.scene.tissue.prony:
-                raise QueryError("time", f"scene {self.name!r} is elastic and knows none")
             if not 0.0 <= dt < math.inf:
                 raise QueryError("time", f"steps must be >= 0 s and finite, not {dt}")
+            if past.main >= 0 and past.tip is not tip:
+                kinds = ("loads", "the tip")
+                raise QueryError("past", f"is of {kinds[past.tip]}, the query of {kinds[tip]}")
         if warm is None:
             warm = self._own
             warm.forget()
-        return warm
+        return warm.workspace(tip, past is not None)
 
     def displacement(self, answer: Answer, region: Region = "all") -> Field:
         """Nodal displacement (k, 3) mm, of all nodes or those of ``surface_nodes``."""
@@ -427,5 +434,5 @@ def _in_time(
     records, features = own.past.records, own.outcome.features[: own.features].copy()
     active = tuple([(k, w, Local(records[slot].copy(), moves[k])) for slot, k, w in answering])
     main = max(answering, key=itemgetter(2))[1] if answering else -1
-    after = Past(past.time + dt, {k: local for k, _, local in active}, main, position, features)
-    return after, active
+    known = {k: local for k, _, local in active}
+    return Past(past.time + dt, known, main, position, features, own.tip), active

@@ -29,7 +29,7 @@ def checked_load(
     direction: ArrayLike | None,
     radius: float | None,
 ) -> tuple[Array, Array, float]:
-    """Position, direction (zero for the inward normal) and radius of a well-formed load.
+    """Position, unit direction (zero for the inward normal) and radius of a well-formed load.
 
     Raises
     ------
@@ -51,11 +51,12 @@ def checked_load(
         allowed = f"[{endoscope.radius / 2}, {endoscope.radius}] mm"
         raise QueryError("radius", f"must be in {allowed}, not {radius}")
     if direction is None:
-        return at, INWARD, radius
+        return at, INWARD, float(radius)
     towards = vector("direction", direction)
-    if not towards @ towards > 0.0:  # nor so short that its square is zero
+    length = math.hypot(*towards.tolist())
+    if length == 0.0:
         raise QueryError("direction", "must not be the zero vector")
-    return at, towards, radius
+    return at, towards / length, float(radius)
 
 
 def check_place(endoscope: Endoscope, distance: float, tilt: float) -> None:

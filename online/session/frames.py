@@ -1,9 +1,10 @@
 """Frames of a session: the binary layout of what a tool sends and what it feels.
 
 Version 2, everything little-endian, every field at a fixed offset that is a multiple of its size:
-a C struct with the same members in the same order has this layout. One request frame asks for one
-reply frame. The tables in ``online/PROTOCOL.md``, in the OpenAPI document and in a session's
-greeting are made from `REQUEST_FIELDS` and `REPLY_FIELDS`.
+a C struct with the same members in the same order has this layout. A request frame is answered by
+one reply frame, unless a newer one came before its turn: `superseded` counts those. The tables in
+``online/PROTOCOL.md``, in the OpenAPI document and in a session's greeting are made from
+`REQUEST_FIELDS` and `REPLY_FIELDS`.
 
 Replies of version 1 had neither `depth_limit` nor `reason`; requests were the same. The fields of a
 reply are followed by what was asked for, without gaps, in this order:

@@ -14,7 +14,7 @@ PRESS_FEATURES, TOUCH_FEATURES, HISTORY_FEATURES = 11, 10, 9
 
 
 class Outcome(NamedTuple):
-    """Outcome of the last query; a number is an array of one."""
+    """Outcome of the last query, which writes what is of its kind; a number is an array of one."""
 
     status: Number  # worst of the local models, see ``mechanics.newton``
     iterations: Number  # most of one local model
@@ -27,7 +27,7 @@ class Outcome(NamedTuple):
     depth: Number  # mm, of the tip in the undeformed surface
     area: Number  # mm^2, force over pressure
     departure: Number  # from the linear response, relative to it
-    residual: Number  # relative residual of such answers in the full model
+    residual: Number  # of an answer at once: relative residual of such in the full model
     penetration: Number  # mm, of the tip in the deformed surface
     touched: Number  # number of faces
     foot: Vector  # mm, on the surface, nearest to the position
@@ -39,7 +39,7 @@ class Outcome(NamedTuple):
     normal: Vector  # from there outwards
     errors: Vector  # estimated: displacement, von Mises stress, force
     tangent: Annotated[Array, "3, 3"]  # mN/mm
-    features: Annotated[Array, "features"]  # of the error estimate
+    features: Annotated[Array, "features"]  # of the error estimate, with room for the most
     limits: Annotated[Array, "limits"]  # load range there, see ``mechanics.footprint``
 
 

@@ -134,7 +134,7 @@ class Step(NamedTuple):
     exerted: Annotated[Array, "r"]  # D h
     loss: Annotated[Array, "1"]  # l
     B: Annotated[Field, "6 c"]  # in tiles, what the past drives the points to
-    S: Annotated[Field, "6 c"]  # in tiles, kPa, the linear part of it
+    S: Annotated[Field, "6 c"]  # in tiles, kPa, minus the stress of the linear part
     softer: Annotated[Array, "r"]  # D q of the last evaluation
     state: Annotated[Field, "state"]  # see ``points.add_past_increments``
 

@@ -3,13 +3,13 @@
 Theory.  See ``reduced.problem`` for the potential.  Its minimum is sought with the inverse tangent
 that secants make up (BFGS): the rest stiffness is the identity, so few of them are needed.
 
-A search starts where it is likely to end.  A local model that answered last is *warm*: its answer
-differs from its first guess much as this one will; in time, where the force of the past is followed
-by the inverse tangent, the start misses the answer much as the last one did.  A *cold* model starts
-from the guess, with an inverse tangent that differs from the identity in few directions; both are
-polynomials in the load and its place.  Where neither leads to an equilibrium the search starts from
-the last answer that the tissue remembers, which is rest for elastic tissue: a guess can lie beyond
-a fold of the load path.
+A search starts where it is likely to end.  A local model that answered last in its slot is *warm*:
+its answer differs from its first guess much as this one will; in time, where the force of the past
+is followed by the inverse tangent, the start misses the answer much as the last one did.  A *cold*
+model starts from the guess, with an inverse tangent that differs from the identity in few
+directions; both are polynomials in the load and its place.  Where neither leads to an equilibrium
+the search starts from the last answer that the tissue remembers, which is rest for elastic tissue:
+a guess can lie beyond a fold of the load path.
 
 What the points miss of the internal force in equilibrium, the *defect* of the cubature, is a smooth
 function of the load.  It is fitted by polynomials on each local model and taken off ``f``: the
@@ -77,7 +77,7 @@ class PressModels(NamedTuple):
 
 
 class PressWarm(NamedTuple):
-    """Last answers of the local models in use, to start the next from."""
+    """Last answers in each slot, to start the next of the same local model from."""
 
     number: Annotated[Ints, "slots"]  # -1 for an empty slot
     q: Annotated[Array, "slots, r"]
@@ -137,6 +137,8 @@ def place(solver, position, direction):
 @njit(cache=True, error_model="numpy", nogil=True)
 def press(solver, pressure, radius):
     """Press where ``place`` has found, from the answers that the solver's memory holds.
+
+    Of an answer at once it estimates the errors, too.
 
     Parameters
     ----------

@@ -138,7 +138,7 @@ def place(solver, x, last):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def touch(solver, x, most):
-    """Answer a tip at ``x`` (3,) mm that ``place`` has placed.
+    """Answer a tip at ``x`` (3,) mm that ``place`` has placed; at once, estimate its errors.
 
     Parameters
     ----------
@@ -172,7 +172,8 @@ def touch(solver, x, most):
                         )
     _remember(solver, x)
     _act(solver, x)
-    if outcome.touched[0] > 0.0 and not solver.past.in_time:  # or ``estimate_history`` does
+    # or ``transfer.estimate_history`` estimates
+    if outcome.touched[0] > 0.0 and not solver.past.in_time:
         _estimate(solver, x)
 
 

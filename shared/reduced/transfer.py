@@ -74,6 +74,8 @@ class Past(NamedTuple):
         The last contact point; under the tip, where it was over the surface last.
     features : ndarray, shape (HISTORY_FEATURES,)
         Of the error estimate so far, see ``estimate_history``.
+    tip : bool
+        Whether it is of the rigid tip; loads do not go on from there.
     """
 
     time: float = 0.0
@@ -81,6 +83,7 @@ class Past(NamedTuple):
     main: int = -1
     position: Array | None = None
     features: Array = np.array([1.0, 0.0, _NOTHING, 1.0, 0.0, 0.0, 0.0, 0.0, _NOTHING])
+    tip: bool = False
 
 
 REST = Past()
@@ -91,9 +94,9 @@ def estimate_history(solver, before, way, share, response):
     """Estimated errors of a history; infinite where it has left the trained range.
 
     The features: 1; the largest share of the limit so far and its log; smallest det F so far; the
-    normal (where on the body); the way over the surface; the log of the largest response over the
-    largest share.  ``before`` are those before this step, which goes a ``way`` (mm) and is answered
-    by a ``response`` (3,), a displacement of the contact or a force.
+    normal (where on the body); the log of 1 + the way over the surface; the log of the largest
+    response over the largest share.  ``before`` are those before this step, which goes a ``way``
+    (mm) and is answered by a ``response`` (3,), a displacement of the contact or a force.
     """
     outcome, features = solver.outcome, solver.outcome.features[:HISTORY_FEATURES]
     most = max(before[1], share, 1e-6)

@@ -51,6 +51,8 @@ class Workspace:
         Its members.
     features : int
         Of the error estimate.
+    tip : bool
+        Whether it is for the tip.
     """
 
     def __init__(
@@ -65,6 +67,7 @@ class Workspace:
         sizes |= {"clusters": len(index.radii), "residual_features": RESIDUAL_FEATURES}
         self.warm: Any
         self.scratch: Any
+        self.tip = isinstance(models, TouchModels)
         if isinstance(models, PressModels):
             self.warm = room(PressWarm, **sizes)
             self.scratch = room(

@@ -8,6 +8,7 @@ import pytest
 from palpate.shared.answer import describe
 from palpate.shared.errors import QueryError
 from palpate.shared.query import ABSURD
+from palpate.shared.reduced import press
 from palpate.shared.reduced.transfer import REST
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -97,15 +98,25 @@ def test_no_pressure_moves_nothing_and_the_length_of_a_direction_means_nothing(a
     assert solution.converged
     assert np.abs(atlas.displacement(solution)).max() <= 1e-9
     assert np.abs(atlas.von_mises(solution)).max() <= 1e-6
-    short, long = (atlas.press(*contact, scale * np.array([0.2, 0.1, -1.0])) for scale in (1e-3, 7))
-    assert np.linalg.norm(long.direction) == pytest.approx(1)
-    np.testing.assert_allclose(short.force, long.force, rtol=1e-12)
+    usual, *others = (
+        atlas.press(*contact, scale * np.array([0.2, 0.1, -1.0])) for scale in (7, 2e-162, 1e200)
+    )
+    assert np.linalg.norm(usual.direction) == pytest.approx(1)
+    for other in others:
+        np.testing.assert_allclose(other.force, usual.force, rtol=1e-12)
+
+
+def test_whole_numbers_are_answered_by_the_kernel_that_is_there(atlas, contact):
+    atlas.press(contact[0], 1.0)
+    compiled = len(press.press.signatures)
+    atlas.press(contact[0], 1, radius=2)
+    assert len(press.press.signatures) == compiled
 
 
 NONSENSE = {
     "pressure": (math.nan, math.inf, -1e-9),
     "position": ([math.nan, 0, 0], [0, math.inf, 0], [1.0, 2.0], "here", [5.0, 5.0, 500.0]),
-    "direction": ([0, 0, 0], [0, 0, 1e-200], [0, math.nan, -1], [0, -1], [0, 0, 1], [1, 0, 0]),
+    "direction": ([0, 0, 0], [0, math.nan, -1], [0, -1], [0, 0, 1], [1, 0, 0]),
     "radius": (0.0, -1.0, 2.001, math.nan),
 }
 

@@ -286,6 +286,30 @@ def test_the_error_stays_unknown_once_a_history_has_left_the_range(tool):
             assert 0.0 < error < 0.3 if known else error == np.inf
 
 
+def test_a_load_out_of_range_in_other_ways_leaves_the_error_unknown_too(atlas):
+    load = Pressing(atlas)
+    small = 0.9 * atlas.scene.endoscope.radius
+    past = atlas.press(load.middle, 1.0, radius=small, past=REST, dt=0.1).past
+    answer = load(0.3, past=past, dt=0.1)
+    assert answer.in_range
+    assert answer.error_displacement == answer.error_von_mises == np.inf
+
+
+def test_a_tool_that_waits_first_has_gone_no_way(atlas):
+    load = Pressing(atlas)
+    waited = load(LIFTED, past=REST, dt=0.1)
+    assert waited.past.position is None
+    late, soon = (load(0.5, past=past, dt=0.1) for past in (waited.past, REST))
+    assert late.error_displacement == pytest.approx(soon.error_displacement, rel=1e-3)
+
+
+def test_the_past_of_one_tool_is_not_that_of_the_other(atlas, tip):
+    pressed = Pressing(atlas)(0.5, past=REST, dt=0.1).past
+    with pytest.raises(QueryError, match="is of loads, the query of the tip"):
+        tip(0.5, past=pressed, dt=0.1)
+    assert tip(0.5, past=REST, dt=0.1).converged
+
+
 def test_beyond_the_range_is_flagged_and_never_nan(atlas):
     load, past = Pressing(atlas), REST
     for factor in (2.0, 5.0, 9.0):
