@@ -65,6 +65,8 @@ def _divided(scene: Scene, divisions: Divisions) -> Scene:
     try:
         return parse_scene(scene.text[:start] + line + scene.text[start:], scene.folder)
     except SceneError as error:
+        if table:
+            raise
         raise SceneError("geometry.divisions: needed where geometry is an inline table") from error
 
 

@@ -29,8 +29,11 @@ def with_points(
 
 
 def half(values: Array) -> Field:
-    """A field of one local model, in half precision as it is stored."""
-    return values[None].astype(np.float16).astype(np.float32)
+    """A field of one local model, in half precision and in the order it is stored in.
+
+    Kernels would be compiled again for another order.
+    """
+    return values[None].astype(np.float16, order="C").astype(np.float32)
 
 
 def join(
