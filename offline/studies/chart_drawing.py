@@ -69,7 +69,7 @@ LOOKS = {
 """Methods by family, in groups of a colour."""
 
 NAMES = {
-    "linear 160": ("linear\nresponse", (-4, -26), "left"),
+    "linear 160": ("linear\nresponse", (4, -28), "right"),
     "regression 20": ("regression", (-4, 14), "left"),
     "pod-ecm 80": ("POD, hyper-reduced", (-8, -14), "right"),
     "pod 80": ("POD", (8, -4), "left"),
