@@ -373,7 +373,9 @@ def cube(scene: str, report: Path | None) -> Report:
 
 
 @study.command()
-@click.argument("scene", type=click.Choice(["turbinate", "turbinate-visco"]), default="turbinate")
+@click.argument(
+    "scene", type=click.Choice(["turbinate-paper", "turbinate-visco"]), default="turbinate-paper"
+)
 @report_option
 @reporting
 def turbinate(scene: str, report: Path | None) -> Report:
@@ -381,7 +383,8 @@ def turbinate(scene: str, report: Path | None) -> Report:
 
     The turbinate under one footprint in modal, Ritz and POD bases, and contours of the relative
     errors in five POD bases, for which PyVista is needed: pip install -e '.[pictures]'. SCENE
-    turbinate-visco is of visco-elastic tissue, pressed, held and let go; without contours.
+    turbinate-paper is of the size of the paper's mesh; turbinate-visco is of visco-elastic tissue,
+    pressed, held and let go, without contours.
     """
     from palpate.offline.studies.paper import figures
 

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from palpate.offline.fem.mesh import build_mesh
+from palpate.offline.fem.mesh import build_mesh, divided, in_order, ticks_of
 from palpate.offline.fem.problem import FullProblem
+from palpate.offline.fem.shapes import shape_of
 from palpate.offline.reduce.sampling import spread_points
 from palpate.offline.run.streams import Stage, stream
 from palpate.shared.arrays import Array
-from palpate.shared.scene import Block, Divisions, Scene, SceneError, divisions_of, parse_scene
+from palpate.shared.scene import Divisions, Scene, SceneError, parse_scene
 
 SHARE = 3.0
 """Multiple of the tolerance of displacement that the mesh's error may have."""
@@ -29,6 +30,9 @@ MOST_DOFS = 40_000
 """Of a mesh that is tried; its reference has more than six times as many."""
 
 PLACES = 12
+
+PROBE = 8
+"""Steps along each axis in which a body is measured."""
 
 
 def with_mesh(scene: Scene) -> tuple[Scene, dict[str, Any] | None]:
@@ -72,14 +76,10 @@ def _divided(scene: Scene, divisions: Divisions) -> Scene:
 
 def _candidates(scene: Scene) -> list[Divisions]:
     """Divisions whose elements are about as long as wide, from coarse to fine."""
-    probe = np.array([8, 8, 8])
-    mesh = build_mesh(_changed(scene, element="hex8", divisions=tuple(probe)))
-    corners = mesh.nodes[mesh.elements]
-    # the lattice's axes: of a block x, y, z; of an extrusion along the section, y, through it
-    edges = [np.linalg.norm(corners[:, i] - corners[:, 0], axis=1).mean() for i in (1, 3, 4)]
-    lengths = probe * np.array(edges)
-    if not isinstance(scene.geometry, Block):
-        lengths = lengths[[0, 2, 1]]
+    even = np.linspace(0, 1, PROBE + 1)
+    grid = shape_of(scene).grid(even, even, even)
+    steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).mean() for axis in range(3)]
+    lengths = PROBE * np.array(in_order(scene.geometry, steps))
     found: list[Divisions] = []
     for k in range(SIZES):
         edge = COARSEST * FINER**k * scene.endoscope.radius
@@ -91,8 +91,8 @@ def _candidates(scene: Scene) -> list[Divisions]:
 
 def _try(scene: Scene) -> tuple[int, float]:
     """Degrees of freedom of a mesh, and the 95th percentile of its errors beside a finer one."""
-    finer = tuple(2 * n for n in divisions_of(scene.geometry))
-    problem, reference = FullProblem(scene), FullProblem(_changed(scene, divisions=finer))
+    u, v, w = (divided(along, 2 * (len(along) - 1)) for along in ticks_of(scene.geometry))
+    problem, reference = FullProblem(scene), FullProblem(scene, build_mesh(scene, (u, v, w)))
     rng = stream(scene.seed, Stage.MESH_CHOICE)
     errors = []
     for point in spread_points(problem.surface, PLACES, rng):
@@ -108,8 +108,3 @@ def _moved(problem: FullProblem, x: Array, normal: Array) -> float:
     load = (nodal[:, None] * normal).reshape(-1)[problem.model.free]
     u = problem.model.solve_linear(load[:, None])[:, 0]
     return float(load @ u) / float(nodal.sum())
-
-
-def _changed(scene: Scene, **geometry: object) -> Scene:
-    """The same scene with other values in its geometry, but not in its text."""
-    return scene.model_copy(update={"geometry": scene.geometry.model_copy(update=geometry)})

@@ -4,9 +4,12 @@ Nodes, elements and faces are numbered by the lattice, first index slowest; degr
 3·node + axis. Element and face node order is VTK's.
 """
 
+from collections.abc import Sequence
+from typing import TypeVar
+
 import numpy as np
 
-from palpate.offline.fem.section import map_section, read_outline
+from palpate.offline.fem.shapes import shape_of
 from palpate.shared.arrays import Array, Flags, Ints, Numbers
 from palpate.shared.geometry.elements import (
     HEX20_NODES,
@@ -19,34 +22,42 @@ from palpate.shared.geometry.elements import (
 )
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.local_models import Mesh
-from palpate.shared.scene import Extrusion, Patch, Scene, SceneError, divisions_of
+from palpate.shared.scene import Block, Extrusion, Patch, Scene, SceneError, divisions_of
+
+T = TypeVar("T")
 
 # Corners of an element's faces, outward by the right-hand rule: low and high end of each axis,
 # the order in which a geometry names its sides.
 HEX_FACES = ((0, 4, 7, 3), (1, 2, 6, 5), (0, 1, 5, 4), (3, 7, 6, 2), (0, 3, 2, 1), (4, 5, 6, 7))
 
+Ticks = tuple[Array, Array, Array]
+"""Parameters, rising from 0 to 1, of the corners of elements along each axis of a shape."""
+
 SUBDIVISIONS = {4: 2, 8: 4}
 """Squares per face edge: a straight face needs few, a curved one enough to be smooth to 0.01 mm."""
 
 
-def build_mesh(scene: Scene) -> Mesh:
+def build_mesh(scene: Scene, ticks: Ticks | None = None) -> Mesh:
     """Mesh the body of a scene.
+
+    ``ticks`` are those of the scene's divisions if absent.
 
     Raises
     ------
     SceneError
-        If the section cannot be read or meshed, or if support or surface hold no face, or the same.
+        If the section cannot be read or mapped, if an element is inverted somewhere, or if support
+        or surface hold no face, or the same.
     """
-    geometry, divisions = scene.geometry, divisions_of(scene.geometry)
-    if isinstance(geometry, Extrusion):
-        # Along the section, along y, through the section: right-handed in this order.
-        divisions = divisions[0], divisions[2], divisions[1]
+    geometry = scene.geometry
+    if ticks is None:
+        ticks = ticks_of(geometry)
     reference = HEX20_NODES if geometry.element == "hex20" else HEX_CORNERS
-    parameters, elements, faces, sides = _lattice(divisions, reference)
-    if isinstance(geometry, Extrusion):
-        nodes = _extruded(scene, geometry, parameters)
-    else:
-        nodes = parameters * np.array(geometry.size)
+    a, b, c = (len(along) - 1 for along in ticks)
+    places, elements, faces, sides = _lattice((a, b, c), reference)
+    u, v, w = ticks
+    grid = shape_of(scene).grid(divided(u, 2 * a), divided(v, 2 * b), divided(w, 2 * c))
+    nodes = grid.reshape(-1, 3)[np.ravel_multi_index(places.T, grid.shape[:3])]
+    _refuse_inverted(nodes, elements)
     centres = nodes[faces[:, :4]].mean(axis=1)
 
     def patch(name: str, patch: Patch) -> Flags:
@@ -68,34 +79,61 @@ def build_mesh(scene: Scene) -> Mesh:
     return Mesh(nodes, elements, faces, clamped, accessible)
 
 
-def _extruded(scene: Scene, geometry: Extrusion, parameters: Array) -> Array:
-    """Points (n, 3) mm of an extrusion for parameters in the unit cube."""
-    if scene.folder is None:
-        raise SceneError("geometry.section: the scene's folder is not known")
-    section = map_section(read_outline(scene.folder / geometry.section), geometry.corners)
-    u, w, v = parameters.T
-    x, z = section(u, 1 - (1 - v) ** geometry.grading).T
-    return np.column_stack([x, geometry.length * w, z])
+def ticks_of(geometry: Extrusion | Block) -> Ticks:
+    """Ticks of a geometry's divisions: even, but for the layers of an extrusion."""
+    divisions = in_order(geometry, divisions_of(geometry))
+    first, second, third = (np.arange(n + 1) / n for n in divisions)
+    if isinstance(geometry, Extrusion):
+        third = 1 - (1 - third) ** geometry.grading
+    return first, second, third
+
+
+def in_order(geometry: Extrusion | Block, three: Sequence[T]) -> tuple[T, T, T]:
+    """Values of the axes of a shape in the order of a geometry's divisions, or the other way round.
+
+    Along the section, along y and through it, its axes are right-handed.
+    """
+    first, second, third = three
+    return (first, third, second) if isinstance(geometry, Extrusion) else (first, second, third)
+
+
+def divided(ticks: Array, cells: int) -> Array:
+    """As many ticks as make a number of cells, spread as the given ones are.
+
+    With twice their number, those between are half-way.
+    """
+    own = len(ticks) - 1
+    return np.interp(np.arange(cells + 1) / cells, np.arange(own + 1) / own, ticks)
+
+
+def _refuse_inverted(nodes: Array, elements: Numbers) -> None:
+    """Refuse elements that are inverted or flat somewhere."""
+    least = determinants(nodes, elements).min(axis=1)
+    if not (least > 0).all():
+        x, y, z = nodes[elements[np.argmin(least)]].mean(axis=0)
+        raise SceneError(
+            f"geometry: {np.sum(~(least > 0))} of {len(elements)} elements are inverted, the worst "
+            f"near ({x:.2f}, {y:.2f}, {z:.2f}) mm; change divisions, grading or corners"
+        )
 
 
 def _lattice(
     divisions: tuple[int, int, int], reference: Array
-) -> tuple[Array, Numbers, Numbers, Ints]:
-    """Cut the unit cube into hexahedra whose nodes on [-1, 1]³ are ``reference`` (8 or 20, 3).
+) -> tuple[Ints, Numbers, Numbers, Ints]:
+    """Hexahedra of a lattice whose nodes on [-1, 1]^3 are ``reference`` (8 or 20, 3).
 
-    Returns the nodes (n, 3) in the unit cube, elements and faces as in ``Mesh``, and on which side
-    each face lies (f,), as an index into the sides of a geometry.
+    Returns the places of the nodes (n, 3) in the grid of corners and half-way places, elements and
+    faces as in ``Mesh``, and on which side each face lies (f,), as an index into the sides of a
+    geometry.
     """
-    steps = 1 if len(reference) == 8 else 2
-    grid = steps * np.array(divisions) + 1
+    grid = 2 * np.array(divisions) + 1
     cells = np.moveaxis(np.indices(divisions), 0, -1).reshape(-1, 3)
-    offsets = ((reference + 1) * steps / 2).astype(int)
-    points = steps * cells[:, None] + offsets
+    points = 2 * cells[:, None] + (reference + 1).astype(int)
     used, numbers = np.unique(
         np.ravel_multi_index(np.moveaxis(points, -1, 0), grid), return_inverse=True
     )
     elements = numbers.reshape(len(cells), -1).astype(np.int32)
-    parameters = np.column_stack(np.unravel_index(used, grid)) / (grid - 1)
+    places = np.column_stack(np.unravel_index(used, grid))
 
     faces, sides = [], []
     for side, corners in enumerate(HEX_FACES):
@@ -103,7 +141,7 @@ def _lattice(
         boundary = cells[:, axis] == (divisions[axis] - 1 if high else 0)
         faces.append(elements[boundary][:, _face_nodes(corners, len(reference))])
         sides.append(np.full(boundary.sum(), side))
-    return parameters, elements, np.concatenate(faces), np.concatenate(sides)
+    return places, elements, np.concatenate(faces), np.concatenate(sides)
 
 
 def _face_nodes(corners: tuple[int, ...], nodes_per_element: int) -> list[int]:
@@ -123,8 +161,9 @@ def mesh_quality(mesh: Mesh) -> dict[str, float]:
     dict
         ``scaled_jacobian_min`` and ``scaled_jacobian_median``: per element the smallest det J over
         the product of edge lengths, at the corners of the straight-edged hexahedron (Verdict);
-        ``jacobian_ratio_min``: per element smallest over largest det J at 3³ Gauss points of the
-        true, curved element; ``aspect_ratio_max``: longest over shortest edge; ``volume_mm3``.
+        ``jacobian_ratio_min``: per element the smallest det J over the mean one, at the nodes and
+        5³ Gauss points of the true, curved element; ``aspect_ratio_max``: longest over shortest
+        edge; ``volume_mm3``.
     """
     corners = mesh.nodes[mesh.elements[:, :8]]
     _, slopes = shape(HEX_CORNERS, HEX_CORNERS)
@@ -132,11 +171,12 @@ def mesh_quality(mesh: Mesh) -> dict[str, float]:
     scaled = np.linalg.det(edges) / np.linalg.norm(edges, axis=2).prod(axis=2)
     ends = np.array(HEX_EDGES)
     lengths = np.linalg.norm(corners[:, ends[:, 0]] - corners[:, ends[:, 1]], axis=2)
+    everywhere = determinants(mesh.nodes, mesh.elements)
     jacobian, weights = jacobians(mesh, points=3)
     return {
         "scaled_jacobian_min": float(scaled.min()),
         "scaled_jacobian_median": float(np.median(scaled.min(axis=1))),
-        "jacobian_ratio_min": float((jacobian.min(axis=1) / jacobian.max(axis=1)).min()),
+        "jacobian_ratio_min": float((everywhere.min(axis=1) / everywhere.mean(axis=1)).min()),
         "aspect_ratio_max": float((lengths.max(axis=1) / lengths.min(axis=1)).max()),
         "volume_mm3": float(np.sum(jacobian @ weights)),
     }
@@ -145,10 +185,29 @@ def mesh_quality(mesh: Mesh) -> dict[str, float]:
 def jacobians(mesh: Mesh, points: int) -> tuple[Array, Array]:
     """Jacobian determinants at Gauss points, shape (e, points³) mm³, and weights (points³,)."""
     at, weights = gauss(points, 3)
-    _, slopes = shape(hexahedron(mesh.elements.shape[1]), at)
-    gradient = np.einsum("eni,qnj->eqij", mesh.nodes[mesh.elements], slopes)
-    determinants: Array = np.linalg.det(gradient)
-    return determinants, weights
+    return _determinants_at(mesh.nodes, mesh.elements, at), weights
+
+
+def determinants(nodes: Array, elements: Numbers) -> Array:
+    """Jacobian determinants (e, n + 125) mm³ at the n nodes of elements and at 5³ Gauss points.
+
+    Where these are positive, an element may be trusted to be nowhere inverted.
+    """
+    at, _ = gauss(5, 3)
+    return _determinants_at(nodes, elements, np.vstack([hexahedron(elements.shape[1]), at]))
+
+
+def _determinants_at(nodes: Array, elements: Numbers, at: Array) -> Array:
+    """Jacobian determinants (e, q) mm³ at reference coordinates (q, 3)."""
+    _, slopes = shape(hexahedron(elements.shape[1]), at)
+    determinants: Array = np.linalg.det(np.einsum("eni,qnj->eqij", nodes[elements], slopes))
+    return determinants
+
+
+def least_volume_ratio(mesh: Mesh, displacement: Array) -> float:
+    """Smallest det F of a displacement (n, 3) mm, where ``determinants`` are taken."""
+    deformed = determinants(mesh.nodes + displacement, mesh.elements)
+    return float((deformed / determinants(mesh.nodes, mesh.elements)).min())
 
 
 def local_thickness(mesh: Mesh, points: Array, normals: Array) -> Array:

@@ -3,13 +3,15 @@
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from palpate.offline.fem.mesh import Ticks, build_mesh, divided, in_order, ticks_of
 from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.terms import Past
 from palpate.offline.methods.method import Answer, Case, Method
 from palpate.shared.arrays import Array
 from palpate.shared.geometry.elements import hexahedron, shape
-from palpate.shared.scene import ElementName, Extrusion, Scene, divisions_of
+from palpate.shared.local_models import Mesh
+from palpate.shared.scene import ElementName, Scene, divisions_of
 
 SAME = 1e-9  # coordinates in the unit cube that differ by less are equal
 
@@ -48,7 +50,7 @@ class Remeshed(Method):
     It finds the nodes that a contact loads by itself; other methods are given them.  The state is
     the displacement (m, 3) mm of the other mesh's nodes, from which ``to_scene`` (n, m)
     interpolates.  The problem's scene comes with its files; the divisions of its mesh are
-    multiplied by the factor and rounded up.
+    multiplied by the factor and rounded up, and its ticks spread alike.
     """
 
     def __init__(
@@ -57,11 +59,13 @@ class Remeshed(Method):
         geometry = problem.scene.geometry
         divisions = tuple(int(np.ceil(factor * n - SAME)) for n in divisions_of(geometry))
         changed = {"divisions": divisions, "element": element or geometry.element}
-        geometry = geometry.model_copy(update=changed)
-        self.other = FullProblem(problem.scene.model_copy(update={"geometry": geometry}))
+        scene = problem.scene.model_copy(update={"geometry": geometry.model_copy(update=changed)})
+        own = ticks_of(geometry)
+        u, v, w = (divided(*pair) for pair in zip(own, lattice(scene), strict=True))
+        self.other = FullProblem(scene, build_mesh(scene, (u, v, w)))
         label = f"mesh of {' x '.join(map(str, divisions))}"
         super().__init__(problem, len(self.other.model.free), label)
-        self.to_scene = _interpolation(self.other, problem)
+        self.to_scene = _interpolation(self.other.mesh, (u, v, w), problem.mesh, own)
 
     def step(self, state: Array | None, case: Case, dt: float = 0.0) -> Answer:
         """See ``Method``."""
@@ -87,26 +91,26 @@ class Remeshed(Method):
 
 def lattice(scene: Scene) -> tuple[int, int, int]:
     """Hexahedra of a scene along the axes of its mesh's lattice (see ``fem.mesh``)."""
-    along, second, third = divisions_of(scene.geometry)
-    return (
-        (along, third, second) if isinstance(scene.geometry, Extrusion) else (along, second, third)
-    )
+    return in_order(scene.geometry, divisions_of(scene.geometry))
 
 
-def _interpolation(source: FullProblem, target: FullProblem) -> csr_matrix:
+def _interpolation(source: Mesh, its_ticks: Ticks, target: Mesh, own: Ticks) -> csr_matrix:
     """Matrix (n, m) that interpolates nodal values of one mesh of a body at another's nodes.
 
     Both meshes map a lattice of the unit cube onto the body, so that a node of one is found in the
-    other by its coordinates in the cube.
+    other by its parameters.
     """
-    mesh, elements = target.mesh, source.mesh.elements
-    own, divisions = lattice(target.scene), lattice(source.scene)
-    corner = np.moveaxis(np.indices(own), 0, -1).reshape(-1, 1, 3)
-    at = np.empty_like(mesh.nodes)
-    at[mesh.elements] = (corner + (hexahedron(mesh.elements.shape[1]) + 1) / 2) / own
-    cell = np.minimum((at * divisions + SAME).astype(int), np.array(divisions) - 1)
-    N, _ = shape(hexahedron(elements.shape[1]), 2.0 * (at * divisions - cell) - 1.0)
+    cells = np.moveaxis(np.indices([len(along) - 1 for along in own]), 0, -1).reshape(-1, 1, 3)
+    places = 2 * cells + (hexahedron(target.elements.shape[1]) + 1).astype(int)
+    cell, local = np.empty((len(target.nodes), 3), int), np.empty((len(target.nodes), 3))
+    for axis, (ticks, theirs) in enumerate(zip(own, its_ticks, strict=True)):
+        at = np.empty(len(local))
+        at[target.elements] = divided(ticks, 2 * (len(ticks) - 1))[places[..., axis]]
+        before = np.searchsorted(theirs[1:-1], at + SAME, side="right")
+        low, high = theirs[before], theirs[before + 1]
+        cell[:, axis], local[:, axis] = before, 2.0 * (at - low) / (high - low) - 1.0
+    N, _ = shape(hexahedron(source.elements.shape[1]), local)
     N[abs(N) < SAME] = 0.0
-    nodes = elements[np.ravel_multi_index(tuple(cell.T), divisions)]
-    rows = np.repeat(np.arange(len(at)), N.shape[1])
-    return csr_matrix((N.ravel(), (rows, nodes.ravel())), (len(at), len(source.mesh.nodes)))
+    nodes = source.elements[np.ravel_multi_index(tuple(cell.T), [len(t) - 1 for t in its_ticks])]
+    rows = np.repeat(np.arange(len(N)), N.shape[1])
+    return csr_matrix((N.ravel(), (rows, nodes.ravel())), (len(N), len(source.nodes)))

@@ -17,7 +17,8 @@ from the paper:
 - The cube: the paper does not give its size, mesh or load.  Here a dead pressure covers its whole
   top, which is free to move sideways, so that it would sway beyond ``pi^2 E / 48`` = 3.1 kPa (a
   clamped column); the load ends well before, at 13 % of its height.  P is the top's centre.
-- The turbinate: our own section and mesh; the pressure is a round footprint's.  P lies under it.
+- The turbinate: our own section, in a mesh of their size; the pressure is a round footprint's.  P
+  lies under it.
 - Elastic tissue follows a curve in one parameter, and a handful of POD bases hold it to within the
   reduced solver's tolerance; where fields are looked at, that is as small as can be.
 

@@ -28,7 +28,7 @@ def few_snapshots(monkeypatch):
 
 @pytest.fixture(scope="module")
 def pressed():
-    return paper.footprint(coarse("turbinate", 7, 1, 7))
+    return paper.footprint(coarse("turbinate-paper", 7, 2, 7))
 
 
 @pytest.mark.parametrize(("name", "rounds"), [("cube", 3), ("cube-visco", 1)])

@@ -1,0 +1,70 @@
+"""Shapes of bodies: the unit cube mapped onto them.
+
+A shape places a grid of the cube, three rising arrays of parameters, in the body.  Every mesh of a
+body, coarse or fine, uniform or graded, is such a grid: every other parameter is a corner of
+elements, those between are half-way.
+"""
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from palpate.offline.fem.section import Section, map_section, read_outline
+from palpate.shared.arrays import Array
+from palpate.shared.scene import Block, Extrusion, Scene, SceneError
+
+
+class Shape(Protocol):
+    """The unit cube mapped onto a body."""
+
+    def grid(self, u: Array, v: Array, w: Array) -> Array:
+        """Points (a, b, c, 3) mm of a grid of parameters."""
+
+
+class BlockShape:
+    """A box: parameters along x, y, z."""
+
+    def __init__(self, geometry: Block) -> None:
+        self._size = np.array(geometry.size)
+
+    def grid(self, u: Array, v: Array, w: Array) -> Array:
+        """See ``Shape``."""
+        return np.stack(np.meshgrid(u, v, w, indexing="ij"), axis=-1) * self._size
+
+
+class ExtrusionShape:
+    """A section along y: parameters along the section, along y, through it; right-handed so."""
+
+    def __init__(self, geometry: Extrusion, folder: Path) -> None:
+        self._section = _section(folder / geometry.section, geometry.corners)
+        self._length = geometry.length
+
+    def grid(self, u: Array, v: Array, w: Array) -> Array:
+        """See ``Shape``."""
+        plane = self._section(*np.meshgrid(u, w, indexing="ij"))
+        points = np.empty((len(plane), len(v), plane.shape[1], 3))
+        points[..., [0, 2]] = plane[:, None]
+        points[..., 1] = self._length * v[:, None]
+        return points
+
+
+@lru_cache(maxsize=8)
+def _section(path: Path, corners: tuple[tuple[float, float], ...]) -> Section:
+    return map_section(read_outline(path), corners)
+
+
+def shape_of(scene: Scene) -> Shape:
+    """Shape of the body of a scene.
+
+    Raises
+    ------
+    SceneError
+        If the section cannot be read or mapped.
+    """
+    if isinstance(scene.geometry, Block):
+        return BlockShape(scene.geometry)
+    if scene.folder is None:
+        raise SceneError("geometry.section: the scene's folder is not known")
+    return ExtrusionShape(scene.geometry, scene.folder)
