@@ -171,7 +171,9 @@ class Trust(BaseModel):
         "as fractions. Null outside the trained range. In a history: the largest error so far "
         "relative to the largest norm so far of the field."
     )
-    min_jacobian: float = Field(description="Smallest volume ratio met; 1 at rest, 0 is collapse.")
+    min_jacobian: float = Field(
+        description="Smallest volume ratio at the model's points; 1 at rest, 0 is collapse."
+    )
 
 
 class Fields(BaseModel):
