@@ -56,7 +56,7 @@ PLAN: Plan = {
     **dict.fromkeys(("pod-deim", "pod-gappy", "regression"), MODES),
     "linear": (*MODES, 160),
     **dict.fromkeys(("mass-spring", "tensor-mass"), (0.5, 1, 2)),
-    "full": (0.5, 0.75, 1, 1.5),
+    "full": (0.6, 0.75, 1, 1.5),
 }
 PLAN_IN_TIME: Plan = {
     **dict.fromkeys(("artifact", "artifact, warm", "full"), (1,)),
