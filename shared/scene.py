@@ -85,6 +85,13 @@ class Extrusion(Part):
         le=3,
         description="depth over thickness = (layer / layers)^grading: thin layers outside",
     )
+    lip_rows: int = Field(
+        0,
+        ge=0,
+        le=6,
+        description="more rows of ever shorter elements at the lip, its outermost layers thin: "
+        "for one that is clamped",
+    )
 
 
 class Block(Part):

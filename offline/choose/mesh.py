@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from palpate.offline.fem.mesh import build_mesh, divided, in_order, ticks_of
+from palpate.offline.fem.mesh import build_mesh, cells_of, divided, in_order, ticks_of
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.shapes import shape_of
 from palpate.offline.reduce.sampling import spread_points
@@ -91,8 +91,10 @@ def _candidates(scene: Scene) -> list[Divisions]:
 
 def _try(scene: Scene) -> tuple[int, float]:
     """Degrees of freedom of a mesh, and the 95th percentile of its errors beside a finer one."""
-    u, v, w = (divided(along, 2 * (len(along) - 1)) for along in ticks_of(scene.geometry))
-    problem, reference = FullProblem(scene), FullProblem(scene, build_mesh(scene, (u, v, w)))
+    ticks = ticks_of(scene.geometry)
+    a, b, c = cells_of(ticks)
+    finer = build_mesh(scene, divided(ticks, (2 * a, 2 * b, 2 * c)))
+    problem, reference = FullProblem(scene), FullProblem(scene, finer)
     rng = stream(scene.seed, Stage.MESH_CHOICE)
     errors = []
     for point in spread_points(problem.surface, PLACES, rng):

@@ -25,13 +25,19 @@ from palpate.shared.local_models import Mesh
 from palpate.shared.scene import Block, Extrusion, Patch, Scene, SceneError, divisions_of
 
 T = TypeVar("T")
+Cells = tuple[int, int, int]
 
 # Corners of an element's faces, outward by the right-hand rule: low and high end of each axis,
 # the order in which a geometry names its sides.
 HEX_FACES = ((0, 4, 7, 3), (1, 2, 6, 5), (0, 1, 5, 4), (3, 7, 6, 2), (0, 3, 2, 1), (4, 5, 6, 7))
 
 Ticks = tuple[Array, Array, Array]
-"""Parameters, rising from 0 to 1, of the corners of elements along each axis of a shape."""
+"""Parameters, rising from 0 to 1, of the corners of elements along each axis of a shape: (a + 1,),
+(b + 1,) and (c + 1,), the last (a + 1, c + 1) where layers differ along the first axis."""
+
+ROW, EDGE, FAN = 0.3, 0.1, 0.3
+"""Of a refined lip: length of a row of elements over that of the next one, thickness of the first
+and last layer over the whole, and how far along the section its layers go over into the others."""
 
 SUBDIVISIONS = {4: 2, 8: 4}
 """Squares per face edge: a straight face needs few, a curved one enough to be smooth to 0.01 mm."""
@@ -52,10 +58,9 @@ def build_mesh(scene: Scene, ticks: Ticks | None = None) -> Mesh:
     if ticks is None:
         ticks = ticks_of(geometry)
     reference = HEX20_NODES if geometry.element == "hex20" else HEX_CORNERS
-    a, b, c = (len(along) - 1 for along in ticks)
-    places, elements, faces, sides = _lattice((a, b, c), reference)
-    u, v, w = ticks
-    grid = shape_of(scene).grid(divided(u, 2 * a), divided(v, 2 * b), divided(w, 2 * c))
+    a, b, c = cells = cells_of(ticks)
+    places, elements, faces, sides = _lattice(cells, reference)
+    grid = shape_of(scene).grid(*divided(ticks, (2 * a, 2 * b, 2 * c)))
     nodes = grid.reshape(-1, 3)[np.ravel_multi_index(places.T, grid.shape[:3])]
     _refuse_inverted(nodes, elements)
     centres = nodes[faces[:, :4]].mean(axis=1)
@@ -80,12 +85,53 @@ def build_mesh(scene: Scene, ticks: Ticks | None = None) -> Mesh:
 
 
 def ticks_of(geometry: Extrusion | Block) -> Ticks:
-    """Ticks of a geometry's divisions: even, but for the layers of an extrusion."""
-    divisions = in_order(geometry, divisions_of(geometry))
-    first, second, third = (np.arange(n + 1) / n for n in divisions)
+    """Ticks of a geometry's divisions: even, but for the layers of an extrusion and its lip."""
+    first, second, third = _even(in_order(geometry, divisions_of(geometry)))
     if isinstance(geometry, Extrusion):
         third = 1 - (1 - third) ** geometry.grading
+        if geometry.lip_rows:
+            return _refined(first, second, third, geometry.lip_rows)
     return first, second, third
+
+
+def _even(cells: Cells) -> Ticks:
+    a, b, c = (np.arange(n + 1) / n for n in cells)
+    return a, b, c
+
+
+def _refined(first: Array, second: Array, third: Array, rows: int) -> Ticks:
+    """Ticks with more rows at the lip, where the first and last layer are thin.
+
+    At both edges of a clamped side the displacement goes about as the root of the distance, and all
+    that hangs from it moves with what happens there: elements of any order are off in proportion to
+    their size at these edges, however fine they are elsewhere.
+    """
+    near = first[1] * ROW ** np.arange(rows, 0, -1)
+    first = np.concatenate([[0.0], near, first[1:]])
+    at_lip = third
+    if len(third) > 3:
+        at_lip = np.concatenate([[0.0], np.linspace(EDGE, 1 - EDGE, len(third) - 2), [1.0]])
+    share = np.maximum(1 - first / FAN, 0.0)[:, None] ** 2
+    return first, second, share * at_lip + (1 - share) * third
+
+
+def cells_of(ticks: Ticks) -> Cells:
+    """Numbers of elements between ticks."""
+    a, b, c = (along.shape[-1] - 1 for along in ticks)
+    return a, b, c
+
+
+def divided(ticks: Ticks, cells: Cells) -> Ticks:
+    """Ticks of another number of elements, spread as the given ones are.
+
+    With twice their number, those between are half-way.
+    """
+    at, own = _even(cells), _even(cells_of(ticks))
+    first, second = (np.interp(at[axis], own[axis], ticks[axis]) for axis in range(2))
+    third = np.array([np.interp(at[2], own[2], row) for row in np.atleast_2d(ticks[2])])
+    if len(third) == 1:
+        return first, second, third[0]
+    return first, second, np.array([np.interp(at[0], own[0], row) for row in third.T]).T
 
 
 def in_order(geometry: Extrusion | Block, three: Sequence[T]) -> tuple[T, T, T]:
@@ -95,15 +141,6 @@ def in_order(geometry: Extrusion | Block, three: Sequence[T]) -> tuple[T, T, T]:
     """
     first, second, third = three
     return (first, third, second) if isinstance(geometry, Extrusion) else (first, second, third)
-
-
-def divided(ticks: Array, cells: int) -> Array:
-    """As many ticks as make a number of cells, spread as the given ones are.
-
-    With twice their number, those between are half-way.
-    """
-    own = len(ticks) - 1
-    return np.interp(np.arange(cells + 1) / cells, np.arange(own + 1) / own, ticks)
 
 
 def _refuse_inverted(nodes: Array, elements: Numbers) -> None:
@@ -117,9 +154,7 @@ def _refuse_inverted(nodes: Array, elements: Numbers) -> None:
         )
 
 
-def _lattice(
-    divisions: tuple[int, int, int], reference: Array
-) -> tuple[Ints, Numbers, Numbers, Ints]:
+def _lattice(divisions: Cells, reference: Array) -> tuple[Ints, Numbers, Numbers, Ints]:
     """Hexahedra of a lattice whose nodes on [-1, 1]^3 are ``reference`` (8 or 20, 3).
 
     Returns the places of the nodes (n, 3) in the grid of corners and half-way places, elements and

@@ -1,8 +1,8 @@
 """Shapes of bodies: the unit cube mapped onto them.
 
-A shape places a grid of the cube, three rising arrays of parameters, in the body.  Every mesh of a
-body, coarse or fine, uniform or graded, is such a grid: every other parameter is a corner of
-elements, those between are half-way.
+A shape places a grid of the cube, three rising arrays of parameters, in the body; those through a
+section may be others at each place along it.  Every mesh of a body, coarse or fine, uniform or
+graded, is such a grid: every other parameter is a corner of elements, those between are half-way.
 """
 
 from functools import lru_cache
@@ -20,7 +20,7 @@ class Shape(Protocol):
     """The unit cube mapped onto a body."""
 
     def grid(self, u: Array, v: Array, w: Array) -> Array:
-        """Points (a, b, c, 3) mm of a grid of parameters."""
+        """Points (a, b, c, 3) mm of a grid of parameters (a,), (b,) and (c,) or (a, c)."""
 
 
 class BlockShape:
@@ -31,7 +31,9 @@ class BlockShape:
 
     def grid(self, u: Array, v: Array, w: Array) -> Array:
         """See ``Shape``."""
-        return np.stack(np.meshgrid(u, v, w, indexing="ij"), axis=-1) * self._size
+        third = np.atleast_2d(w)[:, None]
+        grid = np.broadcast_arrays(u[:, None, None], v[:, None], third)
+        return np.stack(grid, axis=-1) * self._size
 
 
 class ExtrusionShape:
@@ -43,7 +45,7 @@ class ExtrusionShape:
 
     def grid(self, u: Array, v: Array, w: Array) -> Array:
         """See ``Shape``."""
-        plane = self._section(*np.meshgrid(u, w, indexing="ij"))
+        plane = self._section(*np.broadcast_arrays(u[:, None], w))
         points = np.empty((len(plane), len(v), plane.shape[1], 3))
         points[..., [0, 2]] = plane[:, None]
         points[..., 1] = self._length * v[:, None]

@@ -3,15 +3,15 @@
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from palpate.offline.fem.mesh import Ticks, build_mesh, divided, in_order, ticks_of
+from palpate.offline.fem.mesh import Ticks, build_mesh, cells_of, divided, in_order, ticks_of
 from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.terms import Past
 from palpate.offline.methods.method import Answer, Case, Method
-from palpate.shared.arrays import Array
+from palpate.shared.arrays import Array, Ints
 from palpate.shared.geometry.elements import hexahedron, shape
 from palpate.shared.local_models import Mesh
-from palpate.shared.scene import ElementName, Scene, divisions_of
+from palpate.shared.scene import ElementName
 
 SAME = 1e-9  # coordinates in the unit cube that differ by less are equal
 
@@ -56,16 +56,19 @@ class Remeshed(Method):
     def __init__(
         self, problem: FullProblem, factor: float, element: ElementName | None = None
     ) -> None:
+        own = ticks_of(problem.scene.geometry)
+        a, b, c = (int(np.ceil(factor * n - SAME)) for n in cells_of(own))
+        ticks = divided(own, (a, b, c))
         geometry = problem.scene.geometry
-        divisions = tuple(int(np.ceil(factor * n - SAME)) for n in divisions_of(geometry))
-        changed = {"divisions": divisions, "element": element or geometry.element}
-        scene = problem.scene.model_copy(update={"geometry": geometry.model_copy(update=changed)})
-        own = ticks_of(geometry)
-        u, v, w = (divided(*pair) for pair in zip(own, lattice(scene), strict=True))
-        self.other = FullProblem(scene, build_mesh(scene, (u, v, w)))
+        divisions = in_order(geometry, (a, b, c))
+        geometry = geometry.model_copy(update={"element": element or geometry.element})
+        scene = problem.scene.model_copy(update={"geometry": geometry})
+        self.cells = a, b, c
+        """Of the other mesh along the axes of its lattice."""
+        self.other = FullProblem(scene, build_mesh(scene, ticks))
         label = f"mesh of {' x '.join(map(str, divisions))}"
         super().__init__(problem, len(self.other.model.free), label)
-        self.to_scene = _interpolation(self.other.mesh, (u, v, w), problem.mesh, own)
+        self.to_scene = _interpolation(self.other.mesh, ticks, problem.mesh, own)
 
     def step(self, state: Array | None, case: Case, dt: float = 0.0) -> Answer:
         """See ``Method``."""
@@ -89,28 +92,39 @@ class Remeshed(Method):
         return np.asarray(self.to_scene @ state)
 
 
-def lattice(scene: Scene) -> tuple[int, int, int]:
-    """Hexahedra of a scene along the axes of its mesh's lattice (see ``fem.mesh``)."""
-    return in_order(scene.geometry, divisions_of(scene.geometry))
-
-
 def _interpolation(source: Mesh, its_ticks: Ticks, target: Mesh, own: Ticks) -> csr_matrix:
     """Matrix (n, m) that interpolates nodal values of one mesh of a body at another's nodes.
 
     Both meshes map a lattice of the unit cube onto the body, so that a node of one is found in the
     other by its parameters.
     """
-    cells = np.moveaxis(np.indices([len(along) - 1 for along in own]), 0, -1).reshape(-1, 1, 3)
-    places = 2 * cells + (hexahedron(target.elements.shape[1]) + 1).astype(int)
-    cell, local = np.empty((len(target.nodes), 3), int), np.empty((len(target.nodes), 3))
-    for axis, (ticks, theirs) in enumerate(zip(own, its_ticks, strict=True)):
-        at = np.empty(len(local))
-        at[target.elements] = divided(ticks, 2 * (len(ticks) - 1))[places[..., axis]]
-        before = np.searchsorted(theirs[1:-1], at + SAME, side="right")
-        low, high = theirs[before], theirs[before + 1]
-        cell[:, axis], local[:, axis] = before, 2.0 * (at - low) / (high - low) - 1.0
+    a, b, c = cells_of(own)
+    u, v, w = divided(own, (2 * a, 2 * b, 2 * c))
+    corners = np.moveaxis(np.indices((a, b, c)), 0, -1).reshape(-1, 1, 3)
+    places = np.empty((len(target.nodes), 3), int)
+    places[target.elements] = 2 * corners + (hexahedron(target.elements.shape[1]) + 1).astype(int)
+    i, j, k = places.T
+    first, second, third = its_ticks
+    row, along = _within(u[i], first)
+    third = np.broadcast_to(third, (len(first), third.shape[-1]))
+    share = (1.0 + along[:, None]) / 2.0
+    layers = (1.0 - share) * third[row] + share * third[row + 1]
+    column, across = _within(v[j], second)
+    layer, through = _within(np.broadcast_to(w, (len(u), w.shape[-1]))[i, k], layers)
+    local = np.column_stack([along, across, through])
     N, _ = shape(hexahedron(source.elements.shape[1]), local)
     N[abs(N) < SAME] = 0.0
-    nodes = source.elements[np.ravel_multi_index(tuple(cell.T), [len(t) - 1 for t in its_ticks])]
+    nodes = source.elements[np.ravel_multi_index((row, column, layer), cells_of(its_ticks))]
     rows = np.repeat(np.arange(len(N)), N.shape[1])
     return csr_matrix((N.ravel(), (rows, nodes.ravel())), (len(N), len(source.nodes)))
+
+
+def _within(at: Array, ticks: Array) -> tuple[Ints, Array]:
+    """Cells (n,) that hold parameters (n,), and where in them these lie, from -1 to 1.
+
+    The ticks are (m,), or (n, m) for each parameter its own.
+    """
+    ticks = np.broadcast_to(ticks, (len(at), ticks.shape[-1]))
+    cell = np.sum(ticks[:, 1:-1] <= at[:, None] + SAME, axis=1)
+    low, high = (ticks[np.arange(len(at)), cell + end] for end in (0, 1))
+    return cell, 2.0 * (at - low) / (high - low) - 1.0

@@ -42,7 +42,7 @@ from palpate.offline.fem.model import KEEP_TANGENT, FullModel
 from palpate.offline.fem.potential import Potential
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.fem.terms import DeadLoad
-from palpate.offline.methods.full import Remeshed, lattice
+from palpate.offline.methods.full import Remeshed
 from palpate.offline.methods.method import Answer, Case
 from palpate.offline.reduce.sampling import random_points
 from palpate.shared.arrays import Array, Flags
@@ -153,7 +153,7 @@ class TensorMass(Fitted):
     def __init__(self, problem: FullProblem, factor: float) -> None:
         super().__init__(problem, factor)
         mesh, free = self.other.mesh, self.other.model.free
-        elements = cut(mesh, np.indices(lattice(self.other.scene)).sum(axis=0).ravel() % 2 == 1)
+        elements = cut(mesh, np.indices(self.cells).sum(axis=0).ravel() % 2 == 1)
         self.label = f"linear, {len(elements)} tetrahedra"
         K = stiffness(mesh.nodes, elements, problem.scene.tissue.young, POISSON)[free][:, free]
         self._solver = sparse_solver(K)

@@ -10,7 +10,7 @@ from scipy.sparse.linalg import cg, spsolve
 from palpate.offline.fem.mesh import jacobians
 from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import FullProblem, Load
-from palpate.offline.methods.full import Remeshed, lattice
+from palpate.offline.methods.full import Remeshed
 from palpate.offline.methods.method import Case
 from palpate.offline.methods.tetrahedra import POISSON, TensorMass, cut, gradients, stiffness
 from palpate.offline.scenes import find_scene
@@ -32,18 +32,18 @@ def method(problem):
     return TensorMass(problem, 1)
 
 
-def tetrahedra(other):
+def tetrahedra(remeshed):
     """Return both ways to cut a mesh so that its tetrahedra fit together."""
-    odd = np.indices(lattice(other.scene)).sum(axis=0).ravel() % 2 == 1
-    return cut(other.mesh, odd), cut(other.mesh, ~odd)
+    odd = np.indices(remeshed.cells).sum(axis=0).ravel() % 2 == 1
+    return cut(remeshed.other.mesh, odd), cut(remeshed.other.mesh, ~odd)
 
 
 def test_every_size_fills_the_body(body):
     jacobian, weights = jacobians(body.mesh, 3)
     whole, error = np.sum(jacobian @ weights), []
     for factor in (1, 2):
-        other = Remeshed(body, factor, "hex8").other
-        volumes = [gradients(other.mesh.nodes, own)[1] for own in tetrahedra(other)]
+        fine = Remeshed(body, factor, "hex8")
+        volumes = [gradients(fine.other.mesh.nodes, own)[1] for own in tetrahedra(fine)]
         assert min(own.min() for own in volumes) > 0
         error.append(abs(volumes[0].sum() / whole - 1))
     assert error[0] < 0.07
@@ -59,11 +59,11 @@ def test_a_doubled_lattice_has_the_nodes_of_the_scene(body):
 
 
 def test_neighbours_share_whole_faces(body):
-    other = Remeshed(body, 1, "hex8").other
+    same = Remeshed(body, 1, "hex8")
     corners = [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]
-    faces = np.sort(tetrahedra(other)[0][:, corners].reshape(-1, 3), axis=1)
+    faces = np.sort(tetrahedra(same)[0][:, corners].reshape(-1, 3), axis=1)
     _, times = np.unique(faces, axis=0, return_counts=True)
-    along, second, third = lattice(body.scene)
+    along, second, third = same.cells
     outside = 4 * (along * second + second * third + third * along)
     assert sorted(set(times)) == [1, 2]
     assert np.sum(times == 1) == outside
@@ -82,7 +82,7 @@ def test_a_load_on_another_mesh_is_as_large_and_turns_as_much(problem, factor):
 
 def test_gradients_of_a_linear_field(method, rng):
     mesh, slope = method.other.mesh, rng.standard_normal(3)
-    elements = tetrahedra(method.other)[0]
+    elements = tetrahedra(method)[0]
     g, _ = gradients(mesh.nodes, elements)
     found = np.einsum("ta,tai->ti", (mesh.nodes @ slope)[elements], g)
     np.testing.assert_allclose(found, np.tile(slope, (len(found), 1)), atol=1e-12)
@@ -119,7 +119,7 @@ def voigt_stiffness(nodes, elements, young, poisson):
 def test_the_answer_is_that_of_another_assembly(problem, method):
     mesh, free = method.other.mesh, method.other.model.free
     case = Case.of(problem, Load(POINT, TILTED, 2.0))
-    K = voigt_stiffness(mesh.nodes, tetrahedra(method.other)[0], 1.0, POISSON)[free][:, free]
+    K = voigt_stiffness(mesh.nodes, tetrahedra(method)[0], 1.0, POISSON)[free][:, free]
     load = method.load(case).ravel()[free] / problem.scene.tissue.young
     exact = method.other.model.filled(spsolve(K.tocsc(), load)).reshape(-1, 3)
     found = method.solve(case).state
@@ -129,7 +129,7 @@ def test_the_answer_is_that_of_another_assembly(problem, method):
 def test_patch_of_uniform_strain(problem, method, rng):
     """Forces of a uniform gradient: none inside, and those of the law's uniform stress outside."""
     mesh, young = method.other.mesh, problem.scene.tissue.young
-    elements = tetrahedra(method.other)[0]
+    elements = tetrahedra(method)[0]
     H = 1e-4 * rng.standard_normal((3, 3))
     force = stiffness(mesh.nodes, elements, young, 0.3) @ (mesh.nodes @ H.T).ravel()
     mu, lam = lame(young, 0.3)
@@ -151,7 +151,7 @@ def test_the_full_model_is_approached(problem):
     case, expected = Case.of(problem, load), problem.solve(load).displacement
     for factor in (1, 2, 4):
         method = Remeshed(problem, factor, "hex8")
-        model, (elements, _) = method.other.model, tetrahedra(method.other)
+        model, (elements, _) = method.other.model, tetrahedra(method)
         K = stiffness(method.other.mesh.nodes, elements, tissue.young, tissue.poisson)
         u, status = cg(
             K[model.free][:, model.free], method.load(case).ravel()[model.free], rtol=1e-4
