@@ -78,7 +78,7 @@ def bench(artifact: Path) -> dict[str, Any]:
         take("surface_us", partial(with_fields, "surface"), loads)
         take("fields_us", partial(with_fields, "all"), loads)
         take("full_us", full, loads[:1])
-        if atlas.models.tips is not None:
+        if atlas.has_tip:
             touches = [Place.at(atlas, load.position).touch(0.5).position for load in path]
             touch(touches[0])
             take("tip_us", touch, touches[1:])

@@ -175,7 +175,7 @@ class Pipeline:
         estimators: dict[str, Array] = {}
         documents: dict[str, Any] = {"provenance": self.provenance, "training": training}
         for kind in KINDS:
-            if not kind.lacks(models):
+            if not kind.lacks(self.scene):
                 estimators[kind.name], tables[kind] = self._validate(kind, model)
                 documents[kind.document] = summarise(kind, tables[kind])
         training |= {"seconds": self.seconds, "layout": self._describe(layout, models)}

@@ -46,7 +46,7 @@ class Answer(NamedTuple):
     contact: bool = False  # whether something presses
     tangent: Array = np.zeros((3, 3))  # mN/mm, derivative of the tip's force in its position
     depth: float = 0.0  # mm, of the tip in the undeformed surface; negative away from it
-    penetration: float = 0.0  # mm, of the tip in the deformed surface, at most
+    penetration: float = 0.0  # mm, of the tip in the deformed surface as a footprint sees it
     energy: float = 0.0  # mN mm, in tissue and contact; with a past, the potential of the step
     time: float = 0.0  # s, since rest, of tissue with a past
     past: Past | None = None  # to go on from; the one before if this answer did not converge

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from palpate.shared.errors import PalpateError
 
 FORMAT = "palpate-artifact"
-FORMAT_VERSION = 7
+FORMAT_VERSION = 8
 
 SEAL_BYTES = 512
 """The smallest user block that HDF5 offers."""

@@ -21,12 +21,10 @@ class FieldRecovery:
     body : Body
     models : LocalModels
     transfer : callable
-        What knows the past under the tip (True) or under loads.
+        Gives what knows the past.
     """
 
-    def __init__(
-        self, body: Body, models: LocalModels, transfer: Callable[[bool], Transfer]
-    ) -> None:
+    def __init__(self, body: Body, models: LocalModels, transfer: Callable[[], Transfer]) -> None:
         self._body = body
         self._models = models
         self._transfer = transfer
@@ -36,19 +34,12 @@ class FieldRecovery:
     def coefficients(self, answer: Answer) -> dict[int, Field]:
         """Displacement as coefficients (M,) in the basis of each region that takes part."""
         if answer.past is None:
-            return self._by_region(answer, answer.parts)
-        return self._by_region(
-            answer, self._transfer(answer.tip).displacements(answer.time, answer.active)
-        )
+            return self._by_region(answer.parts)
+        return self._by_region(self._transfer().displacements(answer.time, answer.active))
 
-    def _by_region(
-        self, answer: Answer, parts: Sequence[tuple[int, float, Array]]
-    ) -> dict[int, Field]:
-        """Coefficients of states in the modes that an answer is given in."""
+    def _by_region(self, parts: Sequence[tuple[int, float, Array]]) -> dict[int, Field]:
+        """Coefficients of states of local models."""
         modes = self._models.modes
-        if answer.tip:
-            assert self._models.tips is not None, "or there would be no such answer"
-            modes = self._models.tips.modes
         total: dict[int, Field] = {}
         for k, weight, q in parts:
             region = int(self._models.region[k])
@@ -76,12 +67,12 @@ class FieldRecovery:
 
     def _remembered(self, answer: Answer) -> Array:
         """``B`` of ``mechanics.viscosity`` (e, 6, 8) at the points of all elements."""
-        transfer = self._transfer(answer.tip)
+        transfer = self._transfer()
         B = np.zeros((len(self._body.elements), 6, 8))
         for k, share, knot in transfer.knots(answer.active):
-            u = self._field(self._by_region(answer, [(k, 1.0, knot)]))
+            u = self._field(self._by_region([(k, 1.0, knot)]))
             remember(self._recovery, u, share, B)
         lasting = transfer.lasting(answer.time, answer.active)
         if lasting:
-            remember(self._recovery, self._field(self._by_region(answer, lasting)), None, B)
+            remember(self._recovery, self._field(self._by_region(lasting)), None, B)
         return B

@@ -1,7 +1,7 @@
 """What training finds out about a scene: body, local models, error estimates.
 
 A ``Stored`` field is a dataset of the artifact, with its unit and a description that gives its
-shape: n nodes, p local models of r modes (m under the tip) in a basis of M modes of their region.
+shape: n nodes, p local models of r modes in a basis of M modes of their region.
 """
 
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ from palpate.shared.artifact import values_of
 from palpate.shared.geometry.quadrature import surface_quadrature, volume_quadrature
 from palpate.shared.mechanics.footprint import SurfaceQuadrature
 from palpate.shared.mechanics.laws import law_of
-from palpate.shared.mechanics.sphere import Tip, TipSurface, tip_of, tip_surface
+from palpate.shared.mechanics.tip import Tip, tip_of
 from palpate.shared.mechanics.tissue import Law
 from palpate.shared.reduced.outcome import HISTORY_FEATURES, PRESS_FEATURES, TOUCH_FEATURES
 from palpate.shared.scene import Scene
@@ -45,16 +45,9 @@ class Body(Mesh):
     def of(cls, arrays: Mapping[str, NDArray[Any]], scene: Scene) -> Self:
         """Body of an artifact of this scene."""
         law = law_of(scene.tissue, len(arrays["elements"]))
-        tip = tip_of(scene.endoscope.radius, scene.tissue.young)
-        return cls(**values_of(cls, arrays), law=law, tip=tip)
-
-    @cached_property
-    def touchable(self) -> tuple[TipSurface, Numbers]:
-        """Faces that the tip can touch, their nodes counted anew, and these nodes (s,)."""
-        surface = tip_surface(self.nodes, self.faces, self.accessible, self.tip.radius)
-        nodes, faces = np.unique(surface.faces, return_inverse=True)
-        own = faces.reshape(surface.faces.shape).astype(np.int32)
-        return surface._replace(nodes=self.nodes[nodes], faces=own), nodes
+        return cls(
+            **values_of(cls, arrays), law=law, tip=tip_of(scene.endoscope.radius, scene.tissue)
+        )
 
     @cached_property
     def gradients(self) -> Array:
@@ -83,31 +76,8 @@ class ViscousModels:
 
 
 @dataclass(frozen=True)
-class LocalTips:
-    """The same local models under the rigid tip."""
-
-    modes: Annotated[
-        Field, "tip_modes", "1", "orthonormal modes in the basis of the region (p, M, m)"
-    ]
-    point_from: Annotated[Ints, "tip_from", "1", "first cubature point of each (p + 1,)"]
-    points: Annotated[Numbers, "tip_points", "1", "quadrature point by element (c,)"]
-    weights: Annotated[Array, "tip_weights", "mm^3", "weight of each point (c,)"]
-    guess: Annotated[Field, "tip_guess", "1", "answer, polynomials (p, TIP_FEATURES, m)", "half"]
-    pairs: Annotated[Numbers, "tip_pairs", "1", "local models side by side (n, 2), ascending"]
-    overlaps: Annotated[
-        Field, "tip_overlaps", "1", "their modes' products at rest (n, m, m)", "half"
-    ]
-    residuals: Annotated[
-        Array, "tip_residuals", "1", "log of the residual in the full model (p, k)"
-    ]
-    deviatoric: Annotated[
-        Field | None, "tip_viscous_deviatoric", "1", "deviatoric rest stiffness (p, m, m)"
-    ] = None
-
-
-@dataclass(frozen=True)
 class LocalModels:
-    """Local models under footprints, and the modes of the regions that they are made of."""
+    """Local models, and the modes of the regions that they are made of."""
 
     basis: Annotated[
         NDArray[np.int16], "basis", "basis_steps", "orthonormal modes (regions, M, 3 n)", "compress"
@@ -139,7 +109,6 @@ class LocalModels:
     ]
     extent: Annotated[float, "patch_extent", "mm", "largest distance of a contact"]
     blend: Annotated[float, "patch_blend", "mm", "width of blending"]
-    tips: LocalTips | None = None
     viscous: ViscousModels | None = None
 
     @classmethod
@@ -147,19 +116,10 @@ class LocalModels:
         """Local models of an artifact of this scene."""
         return cls(
             **values_of(cls, arrays),
-            tips=LocalTips(**values_of(LocalTips, arrays)) if scene.endoscope.tip else None,
             viscous=(
                 ViscousModels(**values_of(ViscousModels, arrays)) if scene.tissue.prony else None
             ),
         )
-
-    @property
-    def viscous_tips(self) -> ViscousModels | None:
-        """What steps in time need under the tip."""
-        tips = self.tips
-        if tips is None or tips.deviatoric is None:
-            return None
-        return ViscousModels(tips.deviatoric, tips.pairs, tips.overlaps)
 
     @cached_property
     def modes(self) -> Field:

@@ -20,19 +20,23 @@ from palpate.shared.geometry.surface import Surface, SurfaceIndex, boundary_tria
 from palpate.shared.local_models import Body, Estimators, LocalModels
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import TIP_DEPTH
+from palpate.shared.mechanics.tip import CURVED_WITHIN, dented, held
 from palpate.shared.query import check_place, checked_load, out_of_range, vector
 from palpate.shared.reduced import press, touch
 from palpate.shared.reduced.past import Elastic, Remembering
 from palpate.shared.reduced.transfer import LeftBehind, Local, Past, Transfer, estimate_history
 from palpate.shared.reduced.workspace import Warm, Workspace
 from palpate.shared.scene import Scene, SceneError, parse_scene
-from palpate.shared.tables import press_models, touch_models
+from palpate.shared.tables import press_models
 
 Region = Literal["surface", "all"]
 
 Active = tuple[tuple[int, float, Local], ...]
 Answering = list[tuple[int, int, float]]
 Moves = dict[int, tuple[Mapping[int, LeftBehind], ...]]
+
+MOST_BEGINNINGS = 6
+"""Times that a step under the tip is begun, each with the local models that the last ended at."""
 
 _NONE, _UNKNOWN = np.zeros(3), np.full(3, np.inf)
 """Estimated errors."""
@@ -82,10 +86,10 @@ class ReducedModel:
             self.limits[:, TIP_DEPTH] = 0.0
         self.estimators = estimators
         self.surface_nodes, self.surface_triangles = boundary_triangles(body.faces)
-        self.fields = FieldRecovery(body, models, self.transfer)
+        self.fields = FieldRecovery(body, models, lambda: self.transfer)
         self._own = self.new_warm()
-        self._index: SurfaceIndex = surface.ground(self.limits)
-        self._transfers: dict[bool, Transfer] = {}
+        bent = surface.curvature(CURVED_WITHIN * body.tip.radius)
+        self._index: SurfaceIndex = surface.ground(np.hstack([self.limits, bent]))
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -130,7 +134,7 @@ class ReducedModel:
     @property
     def has_tip(self) -> bool:
         """Whether the scene was trained for the rigid tip."""
-        return self.models.tips is not None
+        return self.scene.endoscope.tip
 
     @cached_property
     def pressure_max(self) -> float:
@@ -149,41 +153,29 @@ class ReducedModel:
         QueryError
             If the scene has no tip, or its tissue no past.
         """
-        if tip and self.models.tips is None:
+        if tip and not self.has_tip:
             raise QueryError(
                 "position",
                 f"scene {self.name!r} was trained without a tip: endoscope.tip = true adds it",
             )
         if in_time and not self.scene.tissue.prony:
             raise QueryError("time", f"scene {self.name!r} is elastic and knows none")
-        past = self.transfer(tip).new_past() if in_time else Elastic()
+        past = self.transfer.new_past() if in_time else Elastic()
         coefficients = self.estimators.coefficients(tip, in_time)
-        return Workspace(self._tables(tip), self._index, coefficients, past)
+        return Workspace(self.press_models, self.body.tip, self._index, coefficients, past)
 
-    def transfer(self, tip: bool) -> Transfer:
-        """Takes the past under loads or under the tip from one local model to the next."""
-        if tip not in self._transfers:
-            models = self.models.viscous_tips if tip else self.models.viscous
-            assert models is not None, "or there would be no past"
-            points = self._tables(tip).points.weights.shape[1]
-            self._transfers[tip] = Transfer(
-                models.deviatoric, models.pairs, models.overlap, self.scene.tissue.prony, points
-            )
-        return self._transfers[tip]
-
-    def _tables(self, tip: bool) -> press.PressModels | touch.TouchModels:
-        return self.touch_models if tip else self.press_models
+    @cached_property
+    def transfer(self) -> Transfer:
+        """Takes the past from one local model to the next."""
+        models, points = self.models.viscous, self.press_models.points.weights.shape[1]
+        assert models is not None, "or there would be no past"
+        prony = self.scene.tissue.prony
+        return Transfer(models.deviatoric, models.pairs, models.overlap, prony, points)
 
     @cached_property
     def press_models(self) -> press.PressModels:
-        """Local models of loads."""
+        """Tables of the local models."""
         return press_models(self.body, self.models, self.scene)
-
-    @cached_property
-    def touch_models(self) -> touch.TouchModels:
-        """Local models of the rigid tip."""
-        assert self.models.tips is not None
-        return touch_models(self.body, self.models, self.models.tips)
 
     def press(
         self,
@@ -242,7 +234,7 @@ class ReducedModel:
         moves: Moves = {}
         if past is not None:
             own.begin_step(self.scene.tissue.prony, dt)
-            moves = self.transfer(False).begin(own, answering, past)
+            moves = self.transfer.begin(own, answering, past)
         press.press(own.solver, float(pressure), radius)
         found = own.outcome
         outside = out_of_range(self.scene.endoscope, at, found, pressure, radius)
@@ -295,7 +287,6 @@ class ReducedModel:
         past: Past | None = None,
         dt: float = 0.0,
         warm: Warm | None = None,
-        most: int = touch.MAX_ITERATIONS,
     ) -> Answer:
         """Answer a position of the rigid tip.
 
@@ -305,9 +296,6 @@ class ReducedModel:
             Centre of the tip, outside the body.
         past, dt, warm
             As in ``press``; the tip moved evenly since the end of the past.
-        most : int
-            Iterations in one local model. With fewer than the default, a position that is hard to
-            get to is given up early: for callers that come nearer step by step.
 
         Raises
         ------
@@ -317,35 +305,42 @@ class ReducedModel:
         started = time.perf_counter()
         at = vector("position", position)
         own = self._memory(True, warm, past, dt)
-        last = at if past is None or past.position is None else past.position
-        touch.place(own.solver, at, last)
-        depth, radius = own.outcome.depth.item(), self.body.tip.radius
+        touch.place(own.solver, at)
+        found, radius = own.outcome, self.body.tip.radius
+        depth, limit = found.depth.item(), found.limit.item()
         if depth > radius:
-            own.active.number[:] = -1  # no search has begun that could be resumed
             raise QueryError(
                 "position",
                 f"the tip's centre lies {depth - radius:.2f} mm below the accessible surface",
             )
-        off = depth < -touch.SKIN * radius
+        off = depth <= 0.0
+        last = found.foot.copy() if past is None or past.position is None else past.position
+        touch.begin(own.solver, at, last)
         if off and (past is None or past.main < 0):
             own.active.number[:] = -1
             own.active.weight[:] = 0.0
-        answering = own.answering()
         moves: Moves = {}
-        if past is not None:
-            own.begin_step(self.scene.tissue.prony, dt)
-            moves = self.transfer(True).begin(own, answering, past)
-        touch.touch(own.solver, at, most)
-        found, touched = own.outcome, own.outcome.touched.item() > 0
-        limit = found.limit.item()
+        law = own.scratch.tip.contact.law
+        for _ in range(MOST_BEGINNINGS):
+            if past is not None and isinstance(own.past, Remembering):
+                own.begin_step(self.scene.tissue.prony, dt)
+                moves = self.transfer.begin(own, own.answering(), past)
+                law[2:4] = held(self.body.tip, past.dent, own.past.time)
+            touch.touch(own.solver, at)
+            if found.status.item() != touch.ELSEWHERE:
+                break
+        answering = own.answering()
+        touched = found.touched.item() > 0
         after: Past | None = None
         active: Active = ()
-        if past is not None:
-            place = past.position if off else at
+        if past is not None and isinstance(own.past, Remembering):
+            place = past.position if off else found.foot.copy()
+            force = math.sqrt(np.dot(found.force, found.force))
+            dent = dented(past.dent, own.past.time, law[:4], force)
             after, active = _in_time(
-                own, answering, past, dt, moves, place, depth / limit, found.force
+                own, answering, past, dt, moves, place, depth / limit, found.force, dent
             )
-        parts = tuple([(k, w, own.scratch.q[slot].copy()) for slot, k, w in answering])
+        parts = tuple([(k, w, own.warm.q[slot].copy()) for slot, k, w in answering])
         converged = found.status.item() == newton.CONVERGED
         outside: tuple[str, ...] = ()
         if found.beside.item() and (touched or depth > 0.0):
@@ -424,15 +419,22 @@ def _in_time(
     position: Array | None,
     share: float,
     response: Array,
+    dent: Array | None = None,
 ) -> tuple[Past, Active]:
-    """Return the past to go on from after a step, and local models and theirs."""
+    """Return the past to go on from after a step, and local models and theirs.
+
+    What the tip's law remembers, the ``dent``, is that of the tip alone.
+    """
     assert isinstance(own.past, Remembering)
     way = 0.0
     if position is not None and past.position is not None:
         way = math.dist(position.tolist(), past.position.tolist())
     estimate_history(own.solver, past.features, way, share, response)
     records, features = own.past.records, own.outcome.features[: own.features].copy()
-    active = tuple([(k, w, Local(records[slot].copy(), moves[k])) for slot, k, w in answering])
+    active = tuple(
+        [(k, w, Local(records[slot].copy(), moves.get(k, ()))) for slot, k, w in answering]
+    )
     main = max(answering, key=itemgetter(2))[1] if answering else -1
     known = {k: local for k, _, local in active}
-    return Past(past.time + dt, known, main, position, features, own.tip), active
+    tip, kept = dent is not None, past.dent if dent is None else dent
+    return Past(past.time + dt, known, main, position, features, tip, kept), active

@@ -143,7 +143,7 @@ class Endoscope(Part):
     )
     reach: Positive = _in_radii(1.5, "largest distance of a queried position from the body, mm")
     tip: bool = Field(
-        False, description="whether to train for a rigid spherical tip too, for sessions"
+        False, description="whether a rigid spherical tip may press too, for sessions"
     )
 
 

@@ -6,27 +6,19 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.shared.arrays import Field, Ints, Numbers
-from palpate.shared.local_models import Body, LocalModels, LocalTips
+from palpate.shared.local_models import Body, LocalModels
 from palpate.shared.mechanics.footprint import SurfaceQuadrature
 from palpate.shared.reduced.points import LANES, Points
 from palpate.shared.reduced.press import PressModels
-from palpate.shared.reduced.touch import TouchModels
 from palpate.shared.scene import Scene
-
-REACH = 0.8
-"""Radius of a contact at most, in radii of the tip: nearer faces count."""
-
-MIDDLE = 0.6
-"""Height over a local model of a tip half as deep as may be, in radii of the tip."""
 
 
 def press_models(body: Body, models: LocalModels, scene: Scene) -> PressModels:
     """Everything the compiled query needs for footprints of up to the scene's radius."""
     surface, reach = body.boundary, models.extent + scene.endoscope.radius
-    points = _no_points(body, models, np.int16)
+    points = _no_points(body, models)
     found = {}
     for k, rows in _modes_at(body, models, models.modes):
         G = _place_points(body, models, k, rows, points)
@@ -57,61 +49,6 @@ def press_models(body: Body, models: LocalModels, scene: Scene) -> PressModels:
     )
 
 
-def touch_models(
-    body: Body, models: LocalModels, tips: LocalTips, tangent: LocalTips | None = None
-) -> TouchModels:
-    """Everything the compiled query of the tip needs.
-
-    The cubature of ``tangent``, which has the same modes, serves the tangent if given.
-    """
-    surface, surface_nodes = body.touchable
-    reach = models.extent + REACH * body.tip.radius
-    points = _no_points(body, tips, np.float32)
-    tangent_points = points if tangent is None else _no_points(body, tangent, np.float32)
-    found = {}
-    for k, rows in _modes_at(body, models, tips.modes):
-        points.gradients[k] = _place_points(body, tips, k, rows, points)
-        if tangent is not None:
-            own = _place_points(body, tangent, k, rows, tangent_points)
-            tangent_points.gradients[k] = own
-        away = np.linalg.norm(surface.nodes[surface.faces] - models.centres[k], axis=2)
-        near = np.flatnonzero((away < reach).any(axis=1))
-        nodes, corners = _compact(surface.faces[near])
-        found[k] = near, nodes, rows(surface_nodes[nodes]), corners
-    near, nodes, modes, corners = _by_model(found)
-    normals = models.frames[:, 0]
-    return TouchModels(
-        centres=np.ascontiguousarray((models.centres + MIDDLE * body.tip.radius * normals).T),
-        frames=models.frames,
-        blend=models.blend,
-        points=points,
-        tangent_points=tangent_points,
-        guess=tips.guess,
-        tip=body.tip,
-        surface=surface,
-        node_from=_offsets(nodes),
-        nodes=np.concatenate(nodes).astype(np.int32),
-        modes=np.concatenate(modes),
-        face_from=_offsets(near),
-        faces=np.concatenate(near).astype(np.int32),
-        corners=np.concatenate(corners),
-        **_neighbours(len(models.centres), tips),
-        residuals=tips.residuals,
-    )
-
-
-def _neighbours(count: int, tips: LocalTips) -> dict[str, NDArray[Any]]:
-    """From pairs of models to the neighbours of each."""
-    own, other = np.vstack([tips.pairs, tips.pairs[:, ::-1]]).T
-    overlaps = np.concatenate([tips.overlaps, tips.overlaps.swapaxes(1, 2)])
-    order = np.argsort(own, kind="stable")
-    return {
-        "neighbour_from": np.searchsorted(own[order], np.arange(count + 1)).astype(np.int64),
-        "neighbours": other[order].astype(np.int32),
-        "transfer": np.ascontiguousarray(overlaps[order]),
-    }
-
-
 def _modes_at(
     body: Body, models: LocalModels, modes: Field
 ) -> Iterator[tuple[int, Callable[[Any], Field]]]:
@@ -135,14 +72,14 @@ def _compact(numbers: Numbers) -> tuple[Numbers, Numbers]:
     return nodes, own.reshape(numbers.shape).astype(np.int32)
 
 
-def _no_points(body: Body, models: LocalModels | LocalTips, dtype: type) -> Points:
+def _no_points(body: Body, models: LocalModels) -> Points:
     """Room for the points of all models: of their tissue, but without gradients and weights."""
     counts, modes = np.diff(models.point_from), models.modes.shape[2]
     elements = np.zeros((len(counts), -(-int(counts.max()) // LANES) * LANES), int)
     filled = np.arange(elements.shape[1]) < counts[:, None]
     elements[filled] = models.points // body.gradients.shape[1]
     return Points(
-        np.zeros((len(counts), modes, 9 * elements.shape[1]), dtype),
+        np.zeros((len(counts), modes, 9 * elements.shape[1]), np.int16),
         np.ones((len(counts), modes), np.float32),
         np.zeros(elements.shape),
         body.law.at(elements),
@@ -151,7 +88,7 @@ def _no_points(body: Body, models: LocalModels | LocalTips, dtype: type) -> Poin
 
 def _place_points(
     body: Body,
-    models: LocalModels | LocalTips,
+    models: LocalModels,
     k: int,
     rows: Callable[[Any], Field],
     points: Points,

@@ -67,7 +67,7 @@ class TrialResult(NamedTuple):
 def try_patch(problem: FullProblem, patch: Patch) -> TrialResult:
     """Train a local model by itself and judge it on loads it has not seen."""
     basis = region(problem, patch.footprints, patch.size.region_modes)
-    trained = train_patch(problem, basis, patch, tip=False)
+    trained = train_patch(problem, basis, patch)
     models = replace(trained, basis=basis.basis[None], steps=basis.steps[None])
     trainer, nodal = LocalTrainer(problem, models), nodal_modes(models, models.modes[0])
     loads = RandomLoads(problem.scene, patch, stream(patch.seed, Stage.TRIAL_LOADS))

@@ -14,7 +14,15 @@ from scipy.sparse import csr_matrix
 from palpate.offline.fem import assembly
 from palpate.offline.fem.linear_solver import SparseSolver, sparse_solver
 from palpate.offline.fem.potential import Potential
-from palpate.offline.fem.terms import AppliedLoad, DeadLoad, Past, PastStress, Term, advanced
+from palpate.offline.fem.terms import (
+    AppliedLoad,
+    DeadLoad,
+    Past,
+    PastStress,
+    Place,
+    Term,
+    advanced,
+)
 from palpate.shared.arrays import Array, Ints, Numbers
 from palpate.shared.errors import PalpateError
 from palpate.shared.geometry.quadrature import volume_quadrature
@@ -59,6 +67,7 @@ class Equilibrium:
     force: Array  # (3,) mN, on the tool; see ``Reaction`` for these
     tangent: Array
     penetration: float
+    place: Place | None
 
 
 @dataclass

@@ -13,7 +13,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.sparse import csr_matrix
 
 from palpate.offline.fem.linear_solver import NotPositiveDefinite
-from palpate.offline.fem.terms import Term
+from palpate.offline.fem.terms import Term, TipLoad
 from palpate.shared.arrays import Array
 
 if TYPE_CHECKING:
@@ -33,6 +33,7 @@ class Potential:
         self._displacement = np.zeros(3 * len(model.mesh.nodes))
         self._force = np.zeros_like(self._displacement)
         self._data = np.empty(model.pattern.nnz)
+        self._springs: list[tuple[Array, Array]] = []  # see ``solve``
 
     def stiffness(self, u: Array, convex: bool = False) -> csr_matrix:
         """Tangent (mN/mm) at ``u`` (free dofs,) mm, which the next call overwrites.
@@ -47,8 +48,19 @@ class Potential:
         return self._model.matrix(self._data)
 
     def solve(self, loads: Array) -> Array:
-        """Linear responses (free dofs, k) mm to loads (free dofs, k) mN, by the factorisation."""
-        return self._model.solver.solve(loads)
+        """Linear responses (free dofs, k) mm to loads (free dofs, k) mN, by the factorisation.
+
+        A tip's spring beside the factorised matrix comes by Sherman and Morrison's formula.
+        """
+        found = self._model.solver.solve(loads)
+        for direction, response in self._springs:
+            found -= np.multiply.outer(response, direction @ found)
+        return found
+
+    def compliance(self, u: Array, seen: Array) -> Array:
+        """``seen^T K^-1 seen`` (k, k) of the tissue's tangent at u alone; seen (free dofs, k)."""
+        self.factorise(u, 0.0)
+        return np.asarray(seen.T @ self._model.solver.solve(seen))
 
     def potential(self, u: Array, residual: Array) -> tuple[float, float]:
         """Energy (mN mm), its gradient (mN) and the smallest det F."""
@@ -69,6 +81,14 @@ class Potential:
             self._model.solver.factorise(matrix.data)
         except NotPositiveDefinite:
             return False
+        self._springs = []
+        for term in self.terms:
+            if isinstance(term, TipLoad):
+                direction, stiffness = term.spring(self._displacement)
+                direction = direction[self.free]
+                response = self._model.solver.solve(direction)
+                response *= stiffness / (1.0 + stiffness * (direction @ response))
+                self._springs.append((direction, response))
         return True
 
     def correct(self, residual: Array, step: Array) -> None:

@@ -3,24 +3,48 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
+from palpate.offline.fem.contact import SphereContact, SphereLoad
 from palpate.offline.fem.mesh import accessible_surface, build_mesh
 from palpate.offline.fem.model import Equilibrium, FullModel, NoEquilibrium
-from palpate.offline.fem.terms import DeadLoad, Past, TipContact, TipLoad
+from palpate.offline.fem.sphere import sphere_of, sphere_surface
+from palpate.offline.fem.terms import Past, TipLoad
 from palpate.shared.arrays import Array, Field, Flags
 from palpate.shared.artifact import Artifact, values_of
 from palpate.shared.geometry.quadrature import stress_recovery
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.local_models import Body, Mesh
-from palpate.shared.mechanics.footprint import footprint
-from palpate.shared.mechanics.sphere import tip_of, tip_surface
+from palpate.shared.mechanics.footprint import MEANS, footprint, means
 from palpate.shared.mechanics.stress import StressRecovery, nodal_von_mises
+from palpate.shared.mechanics.tip import (
+    CURVED_WITHIN,
+    LONGEST,
+    bend,
+    dented,
+    held,
+    meet_wall,
+    tangents_of,
+    tip_of,
+)
+from palpate.shared.mechanics.viscosity import step_weights
 from palpate.shared.scene import Scene, parse_scene
+
+MOST_PLACES = 24
+"""Rounds in which the tip finds the place it touches; from the eighth on its steps are halved."""
+
+RAMP = 8
+"""Steps of the way in where the tip finds no place in one."""
+
+SLIGHT = 1e-4
+"""Force, over that which dents the tissue by about the radius, whose place does not matter."""
+
+NEAREST = 1e-4
+"""Step to the next place, in radii of the tip, and turn of the normal that are taken for none."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +96,7 @@ class FullProblem:
     @cached_property
     def body(self) -> Body:
         """Mesh and tissue as the reduced model sees them."""
-        tip = tip_of(self.scene.endoscope.radius, self.scene.tissue.young)
+        tip = tip_of(self.scene.endoscope.radius, self.scene.tissue)
         return Body(**vars(self.mesh), law=self.model.law, tip=tip)
 
     @cached_property
@@ -104,25 +128,36 @@ class FullProblem:
         nodal, _ = self.unit_load(load.position)
         return load.pressure * nodal[:, None] * load.direction
 
-    def load(self, step: Step) -> DeadLoad | TipLoad:
-        """What the endoscope does, as a term of the potential."""
-        if isinstance(step, Load):
-            return DeadLoad(self.load_vector(step).reshape(-1))
-        return self.tip_load(step.position)
+    @cached_property
+    def _curvature(self) -> Array:
+        return self.surface.curvature(CURVED_WITHIN * self.body.tip.radius)
+
+    def tip_at(
+        self, place: Array, centre: Array, normal: Array, *time: float
+    ) -> tuple[TipLoad, Array]:
+        """The tip with its centre (3,) mm that touches at a place, and the surface point there.
+
+        It pushes along ``normal`` (3,); ``time`` is ``loss`` and ``held``, see ``tip.held``.
+        """
+        x, out, _, curvature = self.surface.locate(place, self._curvature)
+        tip, tangents, bent = self.body.tip, np.empty((2, 3)), np.empty((2, 2))
+        tangents_of(out, tangents)
+        law = *tip.local_law(bend(curvature, tangents, tip.radius, bent)), *(time or (0.0, 0.0))
+        nodal = np.empty((MEANS, len(self.mesh.nodes)))
+        means(self.body.boundary, x, out, tangents, bent, tip.radius, nodal)
+        return TipLoad(tip, nodal, tangents, bent, centre - x, normal, law), x
 
     @cached_property
-    def contact(self) -> TipContact:
-        """The rigid tip against the full model."""
-        mesh, tip = self.mesh, self.body.tip
-        surface = tip_surface(mesh.nodes, mesh.faces, mesh.accessible, tip.radius)
-        return TipContact(self.model, surface, tip)
+    def contact(self) -> SphereContact:
+        """The rigid sphere against the full model, integrated over its faces."""
+        mesh, radius = self.mesh, self.scene.endoscope.radius
+        surface = sphere_surface(mesh.nodes, mesh.faces, mesh.accessible, radius)
+        return SphereContact(self.model, surface, sphere_of(radius, self.scene.tissue.young))
 
-    def tip_load(self, position: Array) -> TipLoad:
-        """The tip at a place (3,) mm, on the shortest way from where it does not touch."""
-        foot, normal, _ = self.surface.project(position)
-        out = position - foot
-        depth = self.body.tip.radius - float(np.copysign(np.linalg.norm(out), out @ normal))
-        return TipLoad(self.contact, position, -max(depth, 0.0) * normal)
+    def sphere_at(self, centre: Array) -> SphereLoad:
+        """The sphere at a place (3,) mm, on the shortest way from where it does not touch."""
+        normal = self.surface.project(centre)[1]
+        return SphereLoad(self.contact, centre, -max(self._depth(centre), 0.0) * normal)
 
     # --- answers -------------------------------------------------------------------------------
 
@@ -130,7 +165,81 @@ class FullProblem:
         self, step: Step, past: Past | None = None, start: Array | None = None
     ) -> Equilibrium:
         """Full solution at the end of a time step; see ``FullModel.solve``."""
-        return self.model.solve(self.load(step), past, step.dt, start)
+        if isinstance(step, TipPosition):
+            return self._touch(step, past, start)
+        return self.model.solve(self.load_vector(step), past, step.dt, start)
+
+    def _touch(self, step: TipPosition, past: Past | None, start: Array | None) -> Equilibrium:
+        """Under the tip, at once or else step by step on the way in."""
+        if past is None and self.model.prony and step.dt > 0.0:
+            past = self.model.at_rest
+        try:
+            return self._settle(step, past, start)
+        except NoEquilibrium:
+            way = self._depth(step.position) * self.surface.project(step.position)[1]
+        for share in np.linspace(1.0, 0.0, RAMP + 1)[1:]:
+            on = replace(step, position=step.position + share * way)
+            found = self._settle(on, past, start)
+            start = found.displacement
+        return found
+
+    def _settle(self, step: TipPosition, past: Past | None, start: Array | None) -> Equilibrium:
+        """Under the tip, where the energy is stationary in the place; see ``mechanics.tip``."""
+        weights = step_weights(self.model.prony, step.dt)
+        time = (0.0, 0.0) if past is None else held(self.body.tip, past.dent, weights)
+        known = start if start is not None or past is None else past.displacement
+        radius = self.body.tip.radius
+        place, normal = self._nearest(step.position, known)
+        wall, last, largest = np.zeros(3), None, 0.0
+        for made in range(MOST_PLACES):
+            load, x = self.tip_at(place, step.position, normal, *time)
+            found = self.model.solve(load, past, step.dt, start)
+            if past is not None:
+                dent = dented(past.dent, weights, load.law, float(np.linalg.norm(found.force)))
+                found = replace(found, past=replace(found.past, dent=dent))
+            if found.place is None:
+                if last is not None:  # a step too long
+                    place, normal = (last[0] + x) / 2, last[1]
+                    continue
+                if past is None and self._depth(step.position) > 0.0:
+                    break
+                return found
+            newton, barred = found.place.step(load.tangents @ wall)
+            length = max(float(np.linalg.norm(newton)), 1e-12)
+            wanted = newton * min(1.0, LONGEST * radius / length) * (0.5 if made > 6 else 1.0)
+            place = self.surface.project(x + wanted @ load.tangents)[0]
+            moved = load.tangents @ (place - x)
+            meet_wall(wanted, moved, barred)
+            short = length < NEAREST * radius
+            share = 1.0 if short else float(np.clip(moved @ newton / length**2, 0.0, 1.0))
+            force = found.place.force(newton, share)
+            turned = force / np.linalg.norm(force) - normal
+            largest = max(largest, float(np.linalg.norm(force)))
+            slight = largest < SLIGHT * self.body.tip.modulus * radius**2
+            if slight or max(np.linalg.norm(moved) / radius, np.linalg.norm(turned)) < NEAREST:
+                return replace(found, tangent=found.place.tangent(barred))
+            wall, last = barred @ load.tangents, (x, normal)
+            normal, start = normal + turned, found.displacement
+        raise NoEquilibrium("load: the tip finds no place to touch; lower the depth")
+
+    def _depth(self, centre: Array) -> float:
+        """How deep (mm) a tip is in the surface at rest."""
+        foot, normal, _ = self.surface.project(centre)
+        out = centre - foot
+        return self.body.tip.radius - float(np.copysign(np.linalg.norm(out), out @ normal))
+
+    def _nearest(self, centre: Array, displacement: Array | None) -> tuple[Array, Array]:
+        """Place whose deformed surface is nearest to the tip, at a displacement; normal there."""
+        place, normal, _ = self.surface.project(centre)
+        for _ in range(MOST_PLACES):
+            if displacement is None:
+                break
+            load, x = self.tip_at(place, centre, normal)
+            moved, normal = load.nearer(displacement)
+            place = self.surface.project(x + moved @ load.tangents)[0]
+            if np.linalg.norm(place - x) < 1e-3 * self.body.tip.radius:
+                break
+        return place, normal
 
     def press_at(
         self, x: Array, normal: Array, traction: Array, start: Array | None = None

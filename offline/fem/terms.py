@@ -7,17 +7,28 @@ and knows nothing of other terms.  The elastic tissue is the term that every bod
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+import math
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 
 from palpate.offline.fem import assembly
-from palpate.shared.arrays import Array, Numbers
-from palpate.shared.mechanics import sphere, viscosity
-from palpate.shared.mechanics.sphere import Tip, TipSurface, Touching, room_for
+from palpate.shared.arrays import Array
+from palpate.shared.mechanics import viscosity
+from palpate.shared.mechanics.tip import (
+    LONGEST,
+    SEEN,
+    Tip,
+    follow,
+    next_place,
+    push,
+    pushed,
+    settle,
+)
 
 if TYPE_CHECKING:
+    from palpate.offline.fem.contact import SphereLoad
     from palpate.offline.fem.model import FullModel
     from palpate.offline.fem.potential import Potential
 
@@ -28,6 +39,7 @@ class Reaction(NamedTuple):
     force: Array  # (3,) mN, on the tool
     tangent: Array  # (3, 3) mN/mm, derivative of the force in the tool's position
     penetration: float  # mm, largest
+    place: Place | None = None  # of a tip that touches
 
 
 @dataclass(frozen=True)
@@ -79,81 +91,127 @@ class DeadLoad:
         return Reaction(-self.forces.reshape(-1, 3).sum(axis=0), np.zeros((3, 3)), 0.0)
 
 
-class TipContact:
-    """The surface of a full model where a rigid tip can touch it, with room for what it touches."""
-
-    def __init__(self, model: FullModel, surface: TipSurface, tip: Tip) -> None:
-        self.tip = tip
-        self.surface = surface
-        self.size = model.tissue.young * tip.radius**2
-        """The force is not known beforehand; this one dents the tissue by about the radius."""
-        self._all = np.arange(len(surface.faces), dtype=np.int32)
-        self.slots = model.face_slots(surface.faces)
-        self.touching: Touching = room_for(surface, len(surface.faces))
-
-    def touch(
-        self, position: Array, displacement: Array, wanted: float
-    ) -> tuple[Numbers, float, float]:
-        """Write to ``touching`` what ``sphere.touch`` finds; return faces (f, k), energy, depth."""
-        count, energy, deepest = sphere.touch(
-            self.tip, self.surface, self._all, position, displacement.reshape(-1, 3),
-            self.touching, wanted,
-        )  # fmt: skip
-        return self.surface.faces[self.touching.face[:count]], energy, deepest
-
-
 @dataclass(frozen=True)
 class TipLoad:
-    """A rigid tip held at a place, against the surface of a body."""
+    """The rigid tip that touches at a place and pushes along a normal; see ``mechanics.tip``."""
 
-    contact: TipContact
-    position: Array  # (3,) mm, centre of the tip
-    approach: Array  # (3,) mm, its way from ``position - approach``, where it had no contact
+    tip: Tip
+    nodal: Array  # (MEANS, nodes), see ``footprint.means`` of that place
+    tangents: Array  # (2, 3) there
+    bent: Array  # (2, 2) 1/mm, curvature along them
+    away: Array  # (3,) mm, from there to the tip's centre
+    normal: Array  # (3,)
+    law: tuple[float, float, float, float]  # beta, relief, loss, held
     lower: ClassVar[str] = "depth"
 
     @property
     def size(self) -> float:
-        """See ``DeadLoad``."""
-        return self.contact.size
+        """See ``DeadLoad``: about the force, which is not known beforehand."""
+        depth = min(max(self._penetration(0.0), 1e-6 * self.tip.radius), self.tip.radius)
+        return self.tip.modulus * math.sqrt(self.tip.radius * depth) * depth
 
     def at(self, fraction: float) -> TipLoad:
-        """See ``DeadLoad``."""
-        return replace(self, position=self.position - (1.0 - fraction) * self.approach)
+        """See ``DeadLoad``; at 0 the tip is where it just does not touch the surface at rest."""
+        out = (1.0 - fraction) * max(self._penetration(0.0), 0.0)
+        return replace(self, away=self.away + out * self.normal)
+
+    def _penetration(self, moved: Array | float) -> float:
+        """In a surface that has moved (3,) mm in the mean."""
+        return self.tip.radius - float(self.normal @ (self.away - moved))
+
+    def touch(self, displacement: Array) -> Touch:
+        """What the tip does to a displacement (3 nodes,) mm."""
+        away = self.away - self.nodal[0] @ displacement.reshape(-1, 3)
+        gap, depth = float(np.linalg.norm(away)), self.tip.radius - float(self.normal @ away)
+        return Touch(away / gap, gap, depth, *push(*self.law, depth))
 
     def add_force(self, displacement: Array, force: Array) -> float:
-        """See ``DeadLoad``; the energy is that of the penalty."""
-        faces, energy, _ = self.contact.touch(self.position, displacement, sphere.FORCE)
-        np.subtract.at(force.reshape(-1, 3), faces, self.contact.touching.force[: len(faces)])
-        return energy
+        """See ``DeadLoad``."""
+        found = self.touch(displacement)
+        force.reshape(-1, 3)[:] += found.force * np.outer(self.nodal[0], self.normal)
+        return found.energy
 
     def add_stiffness(self, displacement: Array, data: Array, convex: bool) -> None:
-        """See ``DeadLoad``."""
-        wanted = sphere.CONVEX if convex else sphere.STIFFNESS
-        faces, _, _ = self.contact.touch(self.position, displacement, wanted)
-        touching = self.contact.touching
-        slots = self.contact.slots[touching.face[: len(faces)]]
-        assembly.scatter_faces(touching.stiffness[: len(faces)], slots, data)
+        """See ``DeadLoad``; its stiffness is that of a ``spring``."""
+
+    def spring(self, displacement: Array) -> tuple[Array, float]:
+        """Direction (3 nodes,) and stiffness (mN/mm) of the law at a displacement (3 nodes,) mm."""
+        return np.outer(self.nodal[0], self.normal).ravel(), self.touch(displacement).stiffness
+
+    def nearer(self, displacement: Array) -> tuple[Array, Array]:
+        """Step (2,) mm towards the place whose deformed surface is nearest; the normal there."""
+        g, H = self._settled(displacement.ravel(), np.zeros((SEEN, SEEN)), 1.0, 0.0)
+        moved, force = np.empty(2), self.touch(displacement.ravel()).towards.copy()
+        length = next_place(g, H, np.zeros(2), moved)
+        share = min(1.0, LONGEST * self.tip.radius / max(length, 1e-12))
+        size = pushed(g, H, moved, share, force)
+        return share * moved, force / size
+
+    def _settled(
+        self, displacement: Array, compliance: Array, force: float, stiffness: float
+    ) -> tuple[Array, Array]:
+        """See ``tip.settle``."""
+        found, u = self.touch(displacement), displacement.reshape(-1, 3)
+        g, H, (one, both, two) = (
+            np.empty(SEEN),
+            np.empty((SEEN, SEEN)),
+            self.nodal[3:] @ u @ self.normal,
+        )
+        settle(
+            compliance, force, stiffness, found.gap, self.normal, found.towards,
+            self.tangents + self.nodal[1:3] @ u, np.array([[one, both], [both, two]]) - self.bent,
+            g, H,
+        )  # fmt: skip
+        return g, H
 
     def reaction(self, potential: Potential, displacement: Array) -> Reaction:
-        """See ``DeadLoad``.
+        """See ``DeadLoad``."""
+        found, means = self.touch(displacement), np.einsum("n,ij->nij", self.nodal[0], np.eye(3))
+        if found.force == 0.0:
+            return Reaction(np.zeros(3), np.zeros((3, 3)), 0.0)
+        turned = np.einsum("an,i->nia", self.nodal[1:3], self.normal)
+        seen = np.concatenate([means, turned], axis=2).reshape(-1, SEEN)[potential.free]
+        compliance = potential.compliance(displacement[potential.free], seen)
+        g, H = self._settled(displacement, compliance, found.force, found.stiffness)
+        place = Place(g, H, found.force * found.towards)
+        return Reaction(place.pushes, place.tangent(np.zeros(2)), found.penetration, place)
 
-        With ``own`` the second derivative of the potential in the tip's position and ``coupling``
-        minus the mixed one, the tangent is ``coupling^T K^-1 coupling - own``.
-        """
-        free, touching = potential.free, self.contact.touching
-        potential.factorise(displacement[free], 0.0)
-        faces, _, deepest = self.contact.touch(self.position, displacement, sphere.STIFFNESS)
-        K = touching.stiffness[: len(faces)].copy()
-        for i, j in ((1, 0), (2, 0), (2, 1)):
-            K[:, i, j] = K[:, j, i]
-        coupling = np.zeros((len(displacement) // 3, 3, 3))
-        np.add.at(coupling, faces, np.einsum("fijab->faij", K))
-        coupling = coupling.reshape(-1, 3)[free]
-        return Reaction(
-            force=-touching.force[: len(faces)].sum(axis=(0, 1)),
-            tangent=coupling.T @ potential.solve(coupling) - touching.own,
-            penetration=deepest,
-        )
+
+class Touch(NamedTuple):
+    """What the tip does to a state at a given place."""
+
+    towards: Array  # (3,) from the smoothed surface to the tip's centre
+    gap: float  # mm, between these
+    penetration: float  # mm
+    force: float  # mN
+    stiffness: float  # mN/mm
+    energy: float  # mN mm
+
+
+class Place(NamedTuple):
+    """How an equilibrium under the tip changes with its place and centre; see ``tip.settle``."""
+
+    g: Array  # (SEEN,) mN
+    H: Array  # (SEEN, SEEN) mN/mm
+    pushes: Array  # (3,) mN, force on the tool now
+
+    def step(self, wall: Array) -> tuple[Array, Array]:
+        """Newton's step (2,) mm of the place along the tangents, and the wall that bars it."""
+        moved, barred = np.empty(2), wall.copy()
+        next_place(self.g, self.H, barred, moved)
+        return moved, barred
+
+    def force(self, step: Array, share: float) -> Array:
+        """Force (3,) mN on the tool after a share of a step (2,) mm of the place."""
+        force = self.pushes.copy()
+        pushed(self.g, self.H, step, share, force)
+        return force
+
+    def tangent(self, wall: Array) -> Array:
+        """Derivative (3, 3) mN/mm of the force on the tool in its position."""
+        tangent = np.empty((3, 3))
+        follow(self.H, wall, np.empty((2, 3)), tangent)
+        return tangent
 
 
 @dataclass(frozen=True)
@@ -162,6 +220,7 @@ class Past:
 
     displacement: Array  # (nodes, 3) mm, the last
     points: Array  # (terms + 1, e, q, 6), at quadrature points
+    dent: Array = field(default_factory=lambda: np.zeros(1))  # see ``mechanics.tip``
 
 
 class PastStress:
@@ -191,16 +250,16 @@ class PastStress:
 def advanced(model: FullModel, past: Past, displacement: Array, weights: viscosity.Weights) -> Past:
     """The past after a step that ends at a displacement (nodes, 3) mm."""
     if not model.prony:
-        return Past(displacement, past.points)
+        return Past(displacement, past.points, past.dent)
     points = past.points.copy()
     m = np.empty(points.shape[1:])
     assembly.drive(model.connectivity, model.gradients, displacement.reshape(-1), m)
     viscosity.advance(m.reshape(-1), weights, points.reshape(len(points), -1))
-    return Past(displacement, points)
+    return Past(displacement, points, past.dent)
 
 
-AppliedLoad = DeadLoad | TipLoad
+AppliedLoad: TypeAlias = "DeadLoad | TipLoad | SphereLoad"
 """A term that can be applied little by little."""
 
-Term = AppliedLoad | PastStress
+Term: TypeAlias = "AppliedLoad | PastStress"
 """A part of the potential energy of a body."""

@@ -20,7 +20,14 @@ from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.tensors import SYMMETRIC
 from palpate.shared.mechanics.viscosity import step_weights
 from palpate.shared.reduced.corrections import Secants, forget_secants
-from palpate.shared.reduced.past import Elastic, Memory, Remembering, opened, remembering
+from palpate.shared.reduced.past import (
+    Elastic,
+    Memory,
+    Remembering,
+    opened,
+    remembering,
+    set_step,
+)
 from palpate.shared.reduced.points import (
     LANES,
     Points,
@@ -199,8 +206,7 @@ class Galerkin(Method):
         past, found = self.content.past, self.content.q
         if past.in_time:
             times = step_weights(self.problem.model.prony, dt)
-            for own, weights in zip(past.time, times, strict=True):
-                own[:] = weights
+            set_step(past, times)
             found = past.records[0]
             found[:] = state
         else:

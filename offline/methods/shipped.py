@@ -30,9 +30,7 @@ class Shipped(Method):
 
     def __init__(self, problem: FullProblem, atlas: ReducedModel, way: Way = "cold") -> None:
         label = {"cold": "artifact", "in time": "artifact"}.get(way, f"artifact, {way}")
-        tips = atlas.models.tips
-        unknowns = tips.modes if way == "tip" and tips is not None else atlas.models.mix
-        super().__init__(problem, unknowns.shape[-1], label)
+        super().__init__(problem, atlas.models.mix.shape[-1], label)
         self._atlas, self._way = atlas, way
         self._warm = None if way == "cold" else atlas.new_warm()
 

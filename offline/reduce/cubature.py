@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr_delete, qr_insert, solve, solve_triangular
 
-from palpate.offline.fem.problem import FullProblem, Step
+from palpate.offline.fem.problem import FullProblem, Load
 from palpate.shared.arrays import Array, Field, Ints
 from palpate.shared.mechanics.tissue import Law
 from palpate.shared.reduced.features import RESIDUAL_FEATURES, residual_features
@@ -226,7 +226,7 @@ def fit_residual(
     frame: Array,
     centre: Array,
     nodal: Field,
-    known: Sequence[tuple[Step, Array, float, Array]],
+    known: Sequence[tuple[Load, Array, float, Array]],
 ) -> Array:
     """Fit the log of the relative residual (RESIDUAL_FEATURES,) left in the full model by answers.
 
@@ -245,7 +245,7 @@ def fit_residual(
     return fitted
 
 
-def residuals_left(problem: FullProblem, displacements: Array, loads: Sequence[Step]) -> Array:
+def residuals_left(problem: FullProblem, displacements: Array, loads: Sequence[Load]) -> Array:
     """What displacements (k, 3 n) mm leave of loads in the full model, relative to them, (k,).
 
     Both are measured as displacements in the energy of the rest state; infinite where the
@@ -255,7 +255,7 @@ def residuals_left(problem: FullProblem, displacements: Array, loads: Sequence[S
     left, sound = np.zeros_like(displacements), np.ones(len(loads), dtype=bool)
     for i, (u, load) in enumerate(zip(displacements, loads, strict=True)):
         _, smallest = model.internal(u, left[i])
-        problem.load(load).add_force(u, left[i])
+        left[i] -= problem.load_vector(load).ravel()
         sound[i] = smallest > 0.0
     left, moved = left[:, free].T, displacements[:, free].T
     energies = np.sum(left * model.solve_linear(left), axis=0)

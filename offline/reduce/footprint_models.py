@@ -13,11 +13,12 @@ from palpate.offline.reduce.join import deviatoric_of, half, nodal_modes, with_p
 from palpate.offline.reduce.layout import Patch
 from palpate.offline.reduce.ritz import RITZ_VECTORS, Footprint, Region, local_modes, whole_numbers
 from palpate.offline.reduce.sampling import cone, fewer, tangents
-from palpate.offline.reduce.tip_models import compile_tip_query, endless, train_tip
 from palpate.shared.arrays import Array, Field
+from palpate.shared.geometry.surface import Surface, SurfaceIndex
 from palpate.shared.local_models import LocalModels, ViscousModels
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import pressure_limit
+from palpate.shared.mechanics.tip import CURVATURE_FIELDS
 from palpate.shared.reduced.features import (
     CHANGES,
     CHANGING,
@@ -70,6 +71,16 @@ This, ``LOADS`` and ``RESIDUAL_LOADS`` are for the usual tolerance; see ``reduce
 """
 
 
+NO_LIMIT = 1e9
+"""Kilopascals and millimetres: in training any pressure and depth is in range."""
+
+
+def endless(surface: Surface) -> SurfaceIndex:
+    """The surface with a load range without end: see ``mechanics.footprint.pressure_limit``."""
+    fields = [NO_LIMIT, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, NO_LIMIT, *[0.0] * CURVATURE_FIELDS]
+    return surface.ground(np.tile(fields, (len(surface.vertices), 1)))
+
+
 @dataclass(frozen=True)
 class RandomLoads:
     """Random loads on a patch."""
@@ -116,9 +127,8 @@ class LocalTrainer:
         tables = press_models(problem.body, models, problem.scene)
         self.rows, self.law = cubature.points_alone(tables.points)
         self._radius = problem.scene.endoscope.radius
-        self._workspace = Workspace(
-            tables, endless(problem.surface), np.zeros((2, PRESS_FEATURES)), Elastic()
-        )
+        index, unknown = endless(problem.surface), np.zeros((2, PRESS_FEATURES))
+        self._workspace = Workspace(tables, problem.body.tip, index, unknown, Elastic())
 
     def solve(self, load: Load) -> Sample | None:
         """Solve a load independently of the last; None if there is no equilibrium."""
@@ -158,14 +168,10 @@ def compile_query(problem: FullProblem) -> None:
         stored, factors,
     )  # fmt: skip
     LocalTrainer(problem, models).solve(Load(x, normal, 0.0))
-    if problem.scene.endoscope.tip:
-        compile_tip_query(problem, models)
 
 
-def train_patch(
-    problem: FullProblem, region: Region, patch: Patch, tip: bool = True
-) -> LocalModels:
-    """Train one local model, with ``tip`` under the tip, too, if the scene has one.
+def train_patch(problem: FullProblem, region: Region, patch: Patch) -> LocalModels:
+    """Train one local model.
 
     ``region`` has the Ritz vectors of the patch's footprints. The tables are of one local model and
     no pairs, and lack the basis of the region, which is large.
@@ -188,9 +194,7 @@ def train_patch(
     samples = trained.answers(loads.any, GUESS_LOADS)
     directions, change = _fit_tangent(trained, samples[:TANGENT_LOADS])
     residual = _fit_residual(problem, models, trained, loads)
-    tips = viscous = None
-    if tip and scene.endoscope.tip:
-        tips = train_tip(problem, patch, models, region.orthonormal, rng)
+    viscous = None
     if model.prony:
         soft = deviatoric_of(model, models, models.modes[0])
         viscous = ViscousModels(soft, np.zeros((0, 2), np.int32), soft[:0])
@@ -202,7 +206,6 @@ def train_patch(
         directions=half(directions),
         change=half(change),
         residuals=residual[None],
-        tips=tips,
         viscous=viscous,
     )
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,21 +11,18 @@ from scipy.spatial import cKDTree
 from palpate.offline.fem.model import FullModel
 from palpate.offline.reduce.ritz import Region
 from palpate.shared.arrays import Array, Field, Numbers
-from palpate.shared.local_models import LocalModels, LocalTips, ViscousModels
+from palpate.shared.local_models import LocalModels, ViscousModels
 
-Tables = TypeVar("Tables", LocalModels, LocalTips)
-
-NEXT, FOLLOWED = 1.6, 2.0
-"""Distance of centres, in extents of a patch, up to which one takes over the other's answer, and
-its history."""
+FOLLOWED = 2.0
+"""Distance of centres, in extents of a patch, up to which one takes over the other's history."""
 
 
 def with_points(
-    tables: Tables, points: NDArray[np.integer[Any]], weights: Array, **others: Any
-) -> Tables:
+    models: LocalModels, points: NDArray[np.integer[Any]], weights: Array
+) -> LocalModels:
     """One local model with other cubature points."""
-    own = {"points": points.astype(np.int32), "weights": weights, **others}
-    return replace(tables, point_from=np.array([0, len(points)]), **own)
+    point_from = np.array([0, len(points)])
+    return replace(models, point_from=point_from, points=points.astype(np.int32), weights=weights)
 
 
 def half(values: Array) -> Field:
@@ -47,30 +44,22 @@ def join(
         region=region,
         extent=parts[0].extent,
         blend=parts[0].blend,
-        tips=None,
         viscous=None,
     )
-    followed = neighbours(models, FOLLOWED * models.extent)
-    tips = [part.tips for part in parts if part.tips is not None]
-    if tips:
-        pairs = followed if model.prony else neighbours(models, NEXT * models.extent)
-        modes = np.concatenate([tip.modes for tip in tips])
-        own = {} if model.prony else {"deviatoric": None}
-        products = overlaps(model, models, modes, pairs)
-        models = replace(models, tips=_joined(tips, pairs=pairs, overlaps=products, **own))
     soft = [part.viscous.deviatoric for part in parts if part.viscous is not None]
     if soft:
+        followed = neighbours(models, FOLLOWED * models.extent)
         products = overlaps(model, models, models.modes, followed)
         models = replace(models, viscous=ViscousModels(np.concatenate(soft), followed, products))
     return models
 
 
-def _joined(parts: Sequence[Tables], **own: Any) -> Tables:
+def _joined(parts: Sequence[LocalModels], **own: Any) -> LocalModels:
     """Tables one after the other, but for fields of their own."""
     own["point_from"] = np.concatenate([[0], np.cumsum([len(part.points) for part in parts])])
     for name in {field.name for field in fields(parts[0])} - own.keys():
         own[name] = np.concatenate([getattr(part, name) for part in parts])
-    return type(parts[0])(**own)
+    return LocalModels(**own)
 
 
 def neighbours(models: LocalModels, reach: float) -> Numbers:

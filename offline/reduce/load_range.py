@@ -42,6 +42,7 @@ from palpate.shared.errors import QueryError
 from palpate.shared.local_models import Estimators, LocalModels
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import TIP_DEPTH
+from palpate.shared.mechanics.tip import approach
 from palpate.shared.model import ReducedModel
 
 NEAR = 0.1
@@ -157,7 +158,7 @@ def load_range(problem: FullProblem, position: Array) -> Array:
     """Load range (LIMIT_FIELDS,) at a surface point; see ``mechanics.footprint.pressure_limit``.
 
     The limit along the normal is where the tissue moves by the scene's indentation, or beyond
-    which it has no equilibrium; the depth of the tip is how far the footprint has sunk then.
+    which it has no equilibrium; the depth of the tip is where it has the force of that pressure.
     """
     model = problem.model.relaxed  # for as long as it takes
     nodal, normal = problem.unit_load(position)
@@ -176,9 +177,17 @@ def load_range(problem: FullProblem, position: Array) -> Array:
         return model.solve(force, start=start, smallest_step=1.0).displacement
 
     limit, _, moved = pressure_that_moves(full, wanted, *near)
-    depth = 0.0 if moved is None else -float(nodal @ moved @ normal) / nodal.sum()
+    depth = _tip_depth(problem, position, limit * nodal.sum())
+    depth -= 0.0 if moved is None else float(nodal @ moved @ normal) / nodal.sum()
     depth = min(max(depth, SHALLOWEST), DEEPEST * problem.scene.endoscope.radius)
     return np.array([limit, *np.diag(C), C[0, 1], C[0, 2], C[1, 2], depth])
+
+
+def _tip_depth(problem: FullProblem, position: Array, force: float) -> float:
+    """Depth (mm) of a tip of this force in the surface as it moves a footprint; held for ever."""
+    beta, relief, *_ = problem.tip_at(position, position, position)[0].law
+    loss = problem.body.tip.lost * sum(share for share, _ in problem.model.prony)
+    return approach(beta, relief, force / (1.0 - loss))
 
 
 class Search(NamedTuple):

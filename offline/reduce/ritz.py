@@ -22,7 +22,6 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from palpate.offline.fem.model import FullModel
 from palpate.offline.fem.problem import FullProblem
@@ -43,9 +42,6 @@ TANGENTIAL = 0.6
 
 POINTS_IN_BASIS = 50
 """Footprints all of whose Ritz vectors make up a basis; of further ones only the linear do."""
-
-RESPONSES = 24
-"""Modes that the responses to nodal forces add to those of footprints, for the rigid tip."""
 
 RESOLUTION = 2e-6
 """Displacement (mm) that a step of a stored mode amounts to where the mode is at work: a mode of
@@ -215,12 +211,6 @@ def region(problem: FullProblem, footprints: list[Footprint], modes: int) -> Reg
     basis, _ = energy_pod(model, np.hstack(wanted), modes)
     vectors = vectors.reshape(len(model.free), -1)
     amplitude = np.sqrt(np.mean(((model.rest_stiffness @ basis).T @ vectors) ** 2, axis=1))
-    if problem.scene.endoscope.tip:
-        points = np.array([footprint.point for footprint in footprints])
-        responses = _nodal_responses(problem, points, basis)
-        # in front, where a truncation does not reach; in the finest steps
-        basis = np.hstack([responses, basis])
-        amplitude = np.concatenate([np.full(responses.shape[1], np.inf), amplitude])
     largest = np.abs(basis).max(axis=0)
     steps = np.clip(RESOLUTION / amplitude, largest / np.iinfo(np.int16).max, largest / 100)
     stored = np.round(basis / steps).astype(np.int16)
@@ -237,25 +227,6 @@ def region(problem: FullProblem, footprints: list[Footprint], modes: int) -> Reg
         orthonormal=np.linalg.inv(L).T.astype(np.float32),
         ritz=np.moveaxis(ritz, 1, 0).astype(np.float32),
     )
-
-
-def _nodal_responses(problem: FullProblem, points: Array, basis: Array) -> Array:
-    """Modes (free dofs, <= RESPONSES) of the responses to normal forces on single nodes.
-
-    The nodes are those near the points (k, 3) mm.  Footprints spread a load over a disc, which a
-    rigid tip does not; what the basis holds already is left out.
-    """
-    model, radius = problem.model, problem.scene.endoscope.radius
-    nodes = problem.body.touchable[1]
-    nodes = nodes[~problem.mesh.clamped[nodes]]
-    nodes = nodes[cKDTree(points).query(problem.mesh.nodes[nodes])[0] < radius]
-    loads = np.zeros((len(problem.mesh.nodes), 3, len(nodes)))
-    for i, node in enumerate(nodes):
-        loads[node, :, i] = problem.surface.project(problem.mesh.nodes[node])[1]
-    responses = model.solve_linear(loads.reshape(-1, len(nodes))[model.free])
-    for _ in range(2):  # twice is enough for orthogonality
-        responses -= basis @ ((model.rest_stiffness @ basis).T @ responses)
-    return energy_pod(model, responses, RESPONSES)[0]
 
 
 def _ritz(problem: FullProblem, footprint: Footprint) -> Array:

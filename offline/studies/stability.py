@@ -110,7 +110,7 @@ def stability(
         if in_time
         else ("stability", METHODS, Stage.STABILITY_SNAPSHOTS, SNAPSHOTS)
     )
-    wanted = [name for name in methods or rows if name != TIP or atlas.models.viscous_tips]
+    wanted = [name for name in methods or rows if name != TIP or (atlas.has_tip and in_time)]
     if in_time:
         asked = histories(atlas, problem, False, cases, seed, many)
         touched = histories(atlas, problem, True, cases, seed, many) if TIP in wanted else {}

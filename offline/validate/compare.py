@@ -139,7 +139,6 @@ def _single(
     if answer.tip:
         at, names = answer.position, ("depth", "depth_limit", "penetration")
         errors["tangent"] = relative(answer.tangent, full.tangent[0])
-        errors["penetration_over_depth"] = answer.penetration / answer.depth
         shares = {}
     else:
         at, names = answer.contact_point, ("pressure", "departure", "residual")
@@ -240,7 +239,7 @@ def opened(artifact: Path, *kinds: Kind) -> tuple[ReducedModel, FullProblem]:
     """
     model = ReducedModel.load(artifact)
     for kind in kinds:
-        if lack := kind.lacks(model.models):
+        if lack := kind.lacks(model.scene):
             raise QueryError("scene", f"{model.name!r} {lack}")
     return model, FullProblem.of_artifact(read_artifact(artifact))
 

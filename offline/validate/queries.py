@@ -14,9 +14,9 @@ from palpate.offline.reduce.sampling import (
 )
 from palpate.offline.run.streams import Stage, stream
 from palpate.shared.arrays import Array
-from palpate.shared.local_models import LocalModels
 from palpate.shared.mechanics.footprint import TIP_DEPTH, pressure_limit
 from palpate.shared.model import ReducedModel
+from palpate.shared.scene import Scene
 
 MOVEMENTS = 4
 """Of the tool in a history, after it has been pressed on."""
@@ -200,11 +200,13 @@ class Kind(NamedTuple):
         steps = random_positions if self.tip else random_loads
         return [[step] for step in steps(model, count, rng)]
 
-    def lacks(self, models: LocalModels) -> str | None:
-        """What local models lack to answer this kind."""
-        if self.tip and models.tips is None:
+    def lacks(self, scene: Scene) -> str | None:
+        """What a scene lacks for queries of this kind."""
+        if self.tip and not scene.endoscope.tip:
             return "was trained without a tip"
-        return "is elastic and has no histories" if self.in_time and not models.viscous else None
+        return (
+            "is elastic and has no histories" if self.in_time and not scene.tissue.prony else None
+        )
 
 
 FIELDS = "displacement", "von_mises"
@@ -215,7 +217,7 @@ LOADS = Kind(
 TIP = Kind(
     "touches", True, False, Stage.TIP_VALIDATION, "validation_tip",
     "full solutions under the tip", 1.0, 0.96,
-    (*FIELDS, "force"), ("tangent", "penetration_over_depth"),
+    (*FIELDS, "force"), ("tangent",),
 )  # fmt: skip
 HISTORIES = Kind(
     "histories", False, True, Stage.HISTORY_VALIDATION, "validation_histories",

@@ -138,7 +138,9 @@ class Reply(NamedTuple):
     contact_point: Annotated[Array, "float32", "mm", "on the tissue", (3,)]
     normal: Annotated[Array, "float32", "", "outward, unit, at the contact", (3,)]
     depth: Annotated[float, "float32", "mm", "of the tip below the surface at rest"]
-    penetration: Annotated[float, "float32", "mm", "of the tip into the deformed surface"]
+    penetration: Annotated[
+        float, "float32", "mm", "of the tip in the surface as a footprint moves it"
+    ]
     error_displacement: _Estimate
     error_von_mises: _Estimate
     error_force: _Estimate

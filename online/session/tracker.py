@@ -3,7 +3,7 @@
 A position is first tried as it is, from the warm start of the last. If no equilibrium is found
 there, the way to it from the last good position is walked in smaller and smaller strides, for as
 long as there is time; the answer is the farthest good position. Where tissue snaps there is no such
-way: the search for where it comes to rest goes on from position to position.
+way: the next position is searched for from rest.
 
 In visco-elastic tissue as much time passes between two answers as between the `client_time` of
 their frames, and the tool moved evenly in it. A way that is walked in strides takes its time in the
@@ -36,12 +36,6 @@ In Hertz's theory the force goes with the depth d as d^1.5; linearised at d, it 
 it was measured to be wrong by up to 5 % for 95 % of steps of this length in any direction.
 """
 
-MOST_ITERATIONS = 8
-"""Largest number of iterations of one solve; a step that takes more is walked in strides."""
-
-PATIENCE = 6
-"""Positions over which the search for an equilibrium goes on before it starts from rest."""
-
 SHORTEST = 1.0 / 64.0
 """Stride, as a part of the way, that is not halved any more."""
 
@@ -71,7 +65,7 @@ class ToolTracker:
         self.snapshots: dict[int, tuple[Past | None, Answer | None]] = {}
         self._past: Past | None = self._rest
         self._good: Answer | None = None
-        self._lost = 0
+        self._lost = False
         self._warm.forget()
         self._clock: float | None = None
         self._span = self._reached = 0.0
@@ -83,7 +77,7 @@ class ToolTracker:
     def restore(self, number: int) -> None:
         """Go back to a snapshot and search from there; the client's time goes on."""
         self._past, self._good = self.snapshots[number]
-        self._lost = 0
+        self._lost = False
         self._warm.forget()
 
     def follow(
@@ -131,26 +125,21 @@ class ToolTracker:
                 if self._solve((1.0 - ahead) * last + ahead * target, ahead) != _SOLVED:
                     stride *= 0.5
         if self._reached == 0.0:
-            self._lost += 1
-            if self._lost % PATIENCE == 0:
-                self._warm.forget()
-            else:
-                self._warm.resume()
+            self._lost = True
+            self._warm.forget()
         return steps
 
     def _solve(self, position: Array, share: float) -> int:
         """Solve a position at a share of the way; keep its answer or return why there is none."""
         dt = 0.0 if self._past is None else (share - self._reached) * self._span
         try:
-            touch = self._model.touch(
-                position, past=self._past, dt=dt, warm=self._warm, most=MOST_ITERATIONS
-            )
+            touch = self._model.touch(position, past=self._past, dt=dt, warm=self._warm)
         except QueryError:
             return _BELOW_SURFACE
         if not (touch.converged and _is_finite(touch)):
             return _NO_EQUILIBRIUM
         self._past, self._good = touch.past, touch
-        self._reached, self._lost = share, 0
+        self._reached, self._lost = share, False
         return _SOLVED
 
 

@@ -7,6 +7,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
+from scipy.spatial import cKDTree
 
 from palpate.shared.arrays import Array, Ints, Numbers
 
@@ -55,6 +56,10 @@ def _closest_on_triangle(p, vertices, first, second, third):
 UPRIGHT = 0.7
 """Cosine between the normal and the way to a point below which it is beside the surface, beyond its
 rim, rather than above or below."""
+
+
+FACING = 0.5
+"""Cosine between the normals of two points of one side of a body."""
 
 
 class SurfaceIndex(NamedTuple):
@@ -181,11 +186,47 @@ class Surface:
         """For compiled code, with fields (v, k) given at the vertices."""
         return self._index._replace(values=np.ascontiguousarray(values))
 
+    def curvature(self, radius: float) -> Array:
+        """Curvature (v, 6) 1/mm at the vertices: xx, yy, zz, xy, xz, yz; positive where convex.
+
+        It is the change of the normal with the place, fitted to vertices within a radius (mm) that
+        face the same way.
+        """
+        own, other = cKDTree(self.vertices).query_pairs(radius, output_type="ndarray").T
+        facing = np.sum(self.normals[own] * self.normals[other], axis=1) > FACING
+        own, other = own[facing], other[facing]
+        one, two = np.concatenate([own, other]), np.concatenate([other, own])
+        away, turned = (
+            self.vertices[two] - self.vertices[one],
+            self.normals[two] - self.normals[one],
+        )
+        frames = tangent_frames(self.normals)
+        s = np.einsum("nai,ni->na", frames[one], away)
+        t = np.einsum("nai,ni->na", frames[one], turned)
+        # least squares of t = [[a, b], [b, c]] s
+        A = np.zeros((len(s), 2, 3))
+        A[:, 0, :2] = A[:, 1, 1:] = s
+        left, right = np.zeros((len(self.vertices), 3, 3)), np.zeros((len(self.vertices), 3))
+        np.add.at(left, one, np.einsum("nab,nac->nbc", A, A))
+        np.add.at(right, one, np.einsum("nab,na->nb", A, t))
+        fitted = np.einsum("vab,vb->va", np.linalg.pinv(left, rcond=1e-6), right)
+        bent = fitted[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+        tensor = np.einsum("vai,vab,vbj->vij", frames, bent, frames)
+        return np.asarray(tensor[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
+
     def rim(self) -> Ints:
         """Vertices on the border of the surface: ends of edges that belong to one triangle."""
         edges = np.sort(np.vstack([self.triangles[:, [i, (i + 1) % 3]] for i in range(3)]), axis=1)
         unique, count = np.unique(edges, axis=0, return_counts=True)
         return np.unique(unique[count == 1])
+
+
+def tangent_frames(normals: Array) -> Array:
+    """Two unit tangents (n, 2, 3) of each of unit normals (n, 3)."""
+    least = np.eye(3)[np.abs(normals).argmin(axis=1)]
+    first = least - np.sum(least * normals, axis=1, keepdims=True) * normals
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(normals, first)], axis=1)
 
 
 def _clusters(centres: Array, members: Ints) -> list[Ints]:

@@ -72,6 +72,85 @@ def footprint(surface, x, normal, radius, nodal):
     return area
 
 
+MEANS = 6
+"""Weights of nodes that ``means`` writes: of the mean, and of its derivatives 1, 2, 11, 12, 22."""
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def means(surface, x, normal, tangents, bent, radius, nodal):
+    """Nodal weights of the mean of a field under a footprint, and of its change with the place.
+
+    Parameters
+    ----------
+    surface, x, normal, radius
+        As of ``footprint``.
+    tangents : ndarray, shape (2, 3)
+        Unit vectors along which the footprint is moved.
+    bent : ndarray, shape (2, 2), 1/mm
+        Curvature along them, by which the footprint turns.
+    nodal : ndarray, shape (MEANS, n), out
+        The mean is ``sum nodal[0] field``; the others are 1/mm and 1/mm^2.
+
+    Returns
+    -------
+    area : float, mm^2
+        Force per pressure.
+    """
+    nodal[:] = 0.0
+    inverse, total = 1.0 / (radius * radius), np.zeros(MEANS)
+    weights = np.empty(MEANS)
+    for g in range(len(surface.areas)):
+        s = facing = 0.0
+        for i in range(3):
+            s += (surface.points[g, i] - x[i]) ** 2 * inverse
+        if s < 1.0:
+            for i in range(3):
+                facing += surface.normals[g, i] * normal[i]
+            if facing > 0.0:
+                # derivatives of s and of what faces the footprint, which turns as it moves
+                a = b = height = one = two = 0.0
+                for i in range(3):
+                    away = surface.points[g, i] - x[i]
+                    a -= 2.0 * inverse * away * tangents[0, i]
+                    b -= 2.0 * inverse * away * tangents[1, i]
+                    height += away * normal[i]
+                    one += surface.normals[g, i] * tangents[0, i]
+                    two += surface.normals[g, i] * tangents[1, i]
+                one, two = bent[0, 0] * one + bent[0, 1] * two, bent[1, 0] * one + bent[1, 1] * two
+                area, rest = surface.areas[g], 1.0 - s * s
+                profile, first, second = rest * rest, -4.0 * s * rest, 12.0 * s * s - 4.0
+                second, plane = second * facing, 2.0 * inverse * first * facing
+                weights[0] = area * profile * facing
+                weights[1] = area * (first * facing * a + profile * one)
+                weights[2] = area * (first * facing * b + profile * two)
+                weights[3] = area * (second * a * a + 2.0 * first * a * one)
+                weights[3] += area * plane * (1.0 + bent[0, 0] * height)
+                weights[4] = area * (second * a * b + first * (a * two + b * one))
+                weights[4] += area * plane * bent[0, 1] * height
+                weights[5] = area * (second * b * b + 2.0 * first * b * two)
+                weights[5] += area * plane * (1.0 + bent[1, 1] * height)
+                for m in range(MEANS):
+                    total[m] += weights[m]
+                    for k in range(surface.nodes.shape[1]):
+                        nodal[m, surface.nodes[g, k]] += weights[m] * surface.shape[g, k]
+    area = total[0]
+    total /= max(area, 1e-12)
+    _, a, b, aa, ab, bb = total
+    for n in range(nodal.shape[1]):
+        if nodal[0, n] != 0.0:
+            for m in range(MEANS):
+                nodal[m, n] /= area
+            # derivatives of a quotient
+            mean = nodal[0, n]
+            nodal[1, n] -= a * mean
+            nodal[2, n] -= b * mean
+            one, two = nodal[1, n], nodal[2, n]
+            nodal[3, n] -= aa * mean + 2.0 * a * one
+            nodal[4, n] -= ab * mean + a * two + b * one
+            nodal[5, n] -= bb * mean + 2.0 * b * two
+    return area
+
+
 LIMIT_FIELDS = 8
 """Values that describe the load range at a surface point: see ``pressure_limit``."""
 

@@ -1,23 +1,14 @@
 """Newton steps of a local model: by secants or by its tangent; see ``reduced.problem``."""
 
 import math
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from palpate.shared.arrays import Array, Field
+from palpate.shared.arrays import Array
 from palpate.shared.compiled import methods
-from palpate.shared.reduced.points import (
-    FAST,
-    Points,
-    back_substitute,
-    cholesky,
-    distance,
-    linearise,
-    lower_products,
-    superpose,
-)
+from palpate.shared.reduced.points import FAST, superpose
 
 LEAST_CURVATURE = 1e-2
 """Cosine between a step and the change of force it causes, below which it is not a secant."""
@@ -44,63 +35,31 @@ class Secants(NamedTuple):
             step[i] = -step[i]
 
 
-class TangentWork(NamedTuple):
-    """Working memory of a tangent with so many points."""
-
-    state: Annotated[Field, "state tangent_points"]  # what ``points.increments`` needs
-    units: Annotated[Field, "9, 9 tangent_points"]  # in tiles, gradients with one component
-    moduli: Annotated[Field, "9, 9 tangent_points"]  # in tiles, kPa
-    products: Annotated[Field, "r, 9 tangent_points"]  # with the modes, in tiles
-    whole: Annotated[Array, "r, r"]  # lower triangle
-
-
 @methods()
-class Tangent(NamedTuple):
-    """A tangent whose tissue part serves again while answer and past move little."""
+class TouchedSecants(NamedTuple):
+    """The same beside the tip's law, which is a spring along its normal."""
 
-    points: Points  # of the tangent: those of the residual, or fewer where it need not be exact
-    bulk: Array  # (r, r) tissue's part without the linear part of the past
-    formed: Array  # (3, r) state, past and loss at which that was formed
-    lag: float  # change of answer and past, relative to the answer, that it serves for
-    factor: Array  # (r, r) lower Cholesky factor
-    work: TangentWork
+    secants: Secants
+    along: Array  # (r,) mean displacement along the normal
+    found: Array  # see ``terms.Contact``; its second number is the stiffness
+    answer: Array  # (r,) scratch
 
     def prepare(self, problem, q, shift):
-        """Factorise the tangent at q, shifted; False if it is not positive definite."""
-        past, formed, size = problem.past, self.formed, max(np.dot(q, q), 1e-12)
-        known = distance(q, formed[0]) <= self.lag**2
-        known = known and not past.has_moved(formed[1:], size, self.lag)
-        while True:
-            if not known:
-                _form_bulk(self, problem, q)
-            past.soften_tangent(self.bulk, self.work.whole)
-            problem.load.stiffen(q, shift, self.work.whole)
-            if cholesky(self.work.whole, shift, self.factor):
-                return True
-            if distance(q, formed[0]) == 0.0:  # formed at this very state
-                return False
-            known = False
+        """The secants are always those of the last steps."""
+        return True
 
     def step(self, problem, residual, step):
-        """Write ``step = - tangent^-1 residual``."""
-        for j in range(len(step)):
-            step[j] = -residual[j]
-        back_substitute(self.factor, step)
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _form_bulk(correction, problem, q):
-    """Form the tissue's part of the tangent at q, lower triangle."""
-    points, work, own = correction.points, problem.work, correction.work
-    H = work.H[: points.gradients.shape[1]]
-    points.strain(q, work.stepped, H)
-    linearise(H, points.weights, points.law, own.state)
-    problem.past.form_products(points, H, own)
-    lower_products(points.gradients, own.products, correction.bulk)
-    for j in range(len(q)):
-        correction.bulk[j, j] += 1.0
-    correction.formed[0] = q
-    problem.past.note(correction.formed[1:])
+        """Write ``step = - (tangent + spring)^-1 residual`` by Sherman and Morrison's formula."""
+        self.secants.step(problem, residual, step)
+        along, answer, stiffness = self.along, self.answer, self.found[1]
+        superpose(self.secants.inverse, along, answer)
+        moved = compliance = 0.0
+        for i in range(len(step)):
+            moved += along[i] * step[i]
+            compliance += along[i] * answer[i]
+        share = stiffness * moved / (1.0 + stiffness * compliance)
+        for i in range(len(step)):
+            step[i] -= share * answer[i]
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)

@@ -108,21 +108,3 @@ def estimate_errors(coefficients, features, errors):
     """Estimated errors: ``log error = c . features``."""
     for i in range(len(coefficients)):
         errors[i] = math.exp(np.dot(coefficients[i], features))
-
-
-TIP_DEGREE = 3
-"""Of the tip's first guess in the depth."""
-
-TIP_FEATURES = 6 * TIP_DEGREE
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def tip_features(frame, centre, x, depth, out):
-    """Polynomials in the depth (degree 1-3) and the place along the surface (0-2), mm."""
-    s, t = _from_centre(frame, centre, x)
-    power = 1.0
-    for degree in range(TIP_DEGREE):
-        power *= depth
-        k = 6 * degree
-        out[k], out[k + 1], out[k + 2] = power, power * s, power * t
-        out[k + 3], out[k + 4], out[k + 5] = power * s * s, power * s * t, power * t * t

@@ -4,7 +4,9 @@ from typing import Annotated, Any, NamedTuple
 
 from palpate.shared.arrays import Array
 from palpate.shared.geometry.surface import SurfaceIndex
+from palpate.shared.mechanics.tip import Tip
 from palpate.shared.reduced.blend import Active
+from palpate.shared.reduced.press import PressModels, PressScratch, PressWarm
 
 Number = Annotated[Array, "1"]
 Vector = Annotated[Array, "3"]
@@ -25,11 +27,11 @@ class Outcome(NamedTuple):
     tilt: Number  # degrees, of a load's direction from the inward normal
     limit: Number  # kPa or mm, largest trained pressure or depth
     depth: Number  # mm, of the tip in the undeformed surface
-    area: Number  # mm^2, force over pressure
+    area: Number  # mm^2, force over pressure of a footprint
     departure: Number  # from the linear response, relative to it
     residual: Number  # of an answer at once: relative residual of such in the full model
-    penetration: Number  # mm, of the tip in the deformed surface
-    touched: Number  # number of faces
+    penetration: Number  # mm, of the tip in the smoothed deformed surface
+    touched: Number  # number of local models that the tip touches
     foot: Vector  # mm, on the surface, nearest to the position
     upward: Vector  # outward normal there
     direction: Vector  # of a load
@@ -40,17 +42,18 @@ class Outcome(NamedTuple):
     errors: Vector  # estimated: displacement, von Mises stress, force
     tangent: Annotated[Array, "3, 3"]  # mN/mm
     features: Annotated[Array, "features"]  # of the error estimate, with room for the most
-    limits: Annotated[Array, "limits"]  # load range there, see ``mechanics.footprint``
+    limits: Annotated[Array, "limits"]  # load range there, see ``mechanics.footprint``; curvature
 
 
 class Solver(NamedTuple):
     """All that a query reads, and all that it writes; made by ``reduced.workspace``."""
 
-    models: Any  # PressModels or TouchModels
-    surface: SurfaceIndex  # values at its vertices: the load range
+    models: PressModels
+    tip: Tip
+    surface: SurfaceIndex  # values at its vertices: the load range, and the curvature
     coefficients: Array  # (2 or 3, features) of the error estimate: displacement, von Mises, force
     past: Any  # Elastic or Remembering
     active: Active
-    warm: Any  # PressWarm or TouchWarm
-    scratch: Any  # PressScratch or TouchScratch
+    warm: PressWarm
+    scratch: PressScratch
     outcome: Outcome

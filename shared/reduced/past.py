@@ -25,14 +25,9 @@ from palpate.shared.mechanics.viscosity import Weights
 from palpate.shared.reduced.blend import MAX_ACTIVE
 from palpate.shared.reduced.points import (
     FAST,
-    LANES,
-    PAST_STATE,
     SYMMETRIC,
-    add_past_increments,
     add_past_stress,
-    contract,
     drive_points,
-    increments,
     predict_points,
     superpose,
 )
@@ -99,21 +94,6 @@ class Elastic(NamedTuple):
         """No force, no energy."""
         return 0.0
 
-    def soften_tangent(self, bulk, tangent):
-        """``tangent = bulk``."""
-        tangent[:] = bulk
-
-    def form_products(self, points, H, work):
-        """Write the change of the points' stress with every mode, see ``corrections.Tangent``."""
-        increments(points.law, work.state, points.gradients, work.products)
-
-    def has_moved(self, formed, size, lag):
-        """There is nothing to move."""
-        return False
-
-    def note(self, formed):
-        """There is nothing to note."""
-
     def external_force(self, load, external, origin):
         """Write the load (r,); return its size."""
         external[:] = load
@@ -129,14 +109,13 @@ class Elastic(NamedTuple):
 class Step(NamedTuple):
     """What the past does at the end of a time step, and working memory; see ``problem``."""
 
-    model: Annotated[Ints, "1"]  # that it is known of
+    model: Annotated[Ints, "1"]  # that it is known of; -1 before the first of a step
     mean: Annotated[Array, "r"]  # h
     exerted: Annotated[Array, "r"]  # D h
     loss: Annotated[Array, "1"]  # l
     B: Annotated[Field, "6 c"]  # in tiles, what the past drives the points to
     S: Annotated[Field, "6 c"]  # in tiles, kPa, minus the stress of the linear part
     softer: Annotated[Array, "r"]  # D q of the last evaluation
-    state: Annotated[Field, "state"]  # see ``points.add_past_increments``
 
 
 @methods()
@@ -152,6 +131,8 @@ class Remembering(NamedTuple):
     def begin_step(self, mu, k, slot):
         """Find what is known of a step of model k before it is solved."""
         memory, time, step = memory_of(self, slot), self.time, self.step
+        if step.model[0] == k:
+            return
         step.mean[:] = 0.0
         for a in range(len(time.share)):
             kept, old = time.share[a] * time.decay[a], time.share[a] * time.old[a]
@@ -202,37 +183,6 @@ class Remembering(NamedTuple):
             energy -= (0.5 * lost + step.exerted[i]) * q[i]
         return energy
 
-    def soften_tangent(self, bulk, tangent):
-        """``tangent = bulk - l D``."""
-        _subtract(bulk, self.step.loss[0], self.deviatoric[self.step.model[0]], tangent)
-
-    def form_products(self, points, H, work):
-        """Write the change of the points' stress with every mode, see ``corrections.Tangent``.
-
-        In training a tangent may have fewer points than the residual, of which no past is known.
-        """
-        if len(self.step.B) * 9 != len(H) * 6:
-            increments(points.law, work.state, points.gradients, work.products)
-            return
-        # there are more modes than components of a gradient, so the moduli of the points come first
-        increments(points.law, work.state, work.units, work.moduli)
-        add_past_increments(
-            H, self.step.B, points.weights, points.law.mu, self.step.loss[0], work.units,
-            self.step.state, work.moduli,
-        )  # fmt: skip
-        contract(work.moduli, points.gradients, work.products)
-
-    def has_moved(self, formed, size, lag):
-        """Whether the past differs by more than ``lag`` from ``formed`` (2, r)."""
-        moved, mean = 0.0, self.step.mean
-        for j in range(len(mean)):
-            moved += (mean[j] - formed[0, j]) ** 2
-        return not (moved <= lag**2 * size and abs(self.step.loss[0] - formed[1, 0]) <= lag)
-
-    def note(self, formed):
-        """Write the past at which a tangent is formed (2, r)."""
-        formed[0], formed[1, 0] = self.step.mean, self.step.loss[0]
-
     def external_force(self, load, external, origin):
         """Write load and past (r,); return their size.  Secants of another past are of no use."""
         size, exerted = 0.0, self.step.exerted
@@ -270,8 +220,15 @@ def remembering(deviatoric: Field, terms: int, points: int) -> Remembering:
         deviatoric=deviatoric,
         records=np.zeros((MAX_ACTIVE, record_size(terms, modes, points))),
         time=Weights(*np.zeros((4, terms))),
-        step=room(Step, r=modes, c=points, state=PAST_STATE * LANES),
+        step=room(Step, r=modes, c=points),
     )
+
+
+def set_step(past: Remembering, weights: Weights) -> None:
+    """Go on by a time step of such weights: what is known of another is not known of that."""
+    for own, value in zip(past.time, weights, strict=True):
+        own[:] = value
+    past.step.model[0] = -1
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -279,15 +236,6 @@ def memory_of(past, slot):
     """What is remembered in a slot."""
     terms, modes = len(past.time.share), len(past.step.mean)
     return opened(past.records[slot], terms, modes, len(past.step.B) // SYMMETRIC)
-
-
-@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def _subtract(A, factor, D, out):
-    """``out = A - factor D``: A, out (r, r) float64, D (r, r) float32."""
-    for i in range(len(A)):
-        a, d, o = A[i], D[i], out[i]
-        for j in range(len(a)):
-            o[j] = a[j] - factor * d[j]
 
 
 # --- the path of answers -------------------------------------------------------------------------

@@ -18,10 +18,8 @@ from palpate.shared.mechanics.tensors import (
     SYMMETRIC,
     add,
     add_identity,
-    cofactor,
     combine,
     constant,
-    det,
     inline,
     isochoric,
     load,
@@ -44,9 +42,6 @@ TILE = 9 * LANES
 
 STATE = 18
 """Numbers that describe the tangent at a point: see ``mechanics.tissue.Law``."""
-
-PAST_STATE = 26
-"""Numbers that describe the tangent of the past at a point."""
 
 
 @methods()
@@ -156,52 +151,6 @@ def increments(law, state, gradients, out):
                 store(subtract(D, tissue.rest_stress(G, moduli[0], moduli[1])[1]), d, c, LANES)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def contract(moduli, gradients, out):
-    """``out = moduli : gradients``, (m, 9 c) in tiles; row i of ``moduli`` is of component i."""
-    n = LANES
-    for tile in range(gradients.shape[1] // TILE):
-        at = TILE * tile
-        m0, m1, m2 = moduli[0, at : at + TILE], moduli[1, at : at + TILE], moduli[2, at : at + TILE]
-        m3, m4, m5 = moduli[3, at : at + TILE], moduli[4, at : at + TILE], moduli[5, at : at + TILE]
-        m6, m7, m8 = moduli[6, at : at + TILE], moduli[7, at : at + TILE], moduli[8, at : at + TILE]
-        for mode in range(len(gradients)):
-            h, d = gradients[mode, at : at + TILE], out[mode, at : at + TILE]
-            for c in range(LANES):
-                h0, h1, h2 = h[c], h[n + c], h[2 * n + c]
-                h3, h4, h5 = h[3 * n + c], h[4 * n + c], h[5 * n + c]
-                h6, h7, h8 = h[6 * n + c], h[7 * n + c], h[8 * n + c]
-                for i in range(9):
-                    k = n * i + c
-                    d[k] = (
-                        h0 * m0[k] + h1 * m1[k] + h2 * m2[k]
-                        + h3 * m3[k] + h4 * m4[k] + h5 * m5[k]
-                        + h6 * m6[k] + h7 * m7[k] + h8 * m8[k]
-                    )  # fmt: skip
-
-
-@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def lower_products(A, B, K):
-    """Lower triangle of ``K = A B^T``: A, B (4 k, n) float32; some entries above it as well."""
-    for k in range(0, len(A), 4):
-        p, q, r, s = B[k], B[k + 1], B[k + 2], B[k + 3]  # these stay in the first-level cache
-        for i in range(k, len(A), 2):
-            a, b = A[i], A[i + 1]
-            ap = aq = ar = a_s = bp = bq = br = bs = np.float32(0.0)
-            for n in range(len(a)):
-                x, y = a[n], b[n]
-                ap += x * p[n]
-                aq += x * q[n]
-                ar += x * r[n]
-                a_s += x * s[n]
-                bp += y * p[n]
-                bq += y * q[n]
-                br += y * r[n]
-                bs += y * s[n]
-            K[i, k], K[i, k + 1], K[i, k + 2], K[i, k + 3] = ap, aq, ar, a_s
-            K[i + 1, k], K[i + 1, k + 1], K[i + 1, k + 2], K[i + 1, k + 3] = bp, bq, br, bs
-
-
 @njit(cache=True, error_model="numpy", nogil=True)
 def added_energy(weights, law, J, part, linear):
     """Energy that the tissue law adds to linear elasticity's, after ``nonlinear_stress``."""
@@ -209,16 +158,6 @@ def added_energy(weights, law, J, part, linear):
     for c in range(len(weights)):
         energy += weights[c] * (law.at(c).energy(J[c], part[c]) - linear[c])
     return energy
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def distance(q, other):
-    """Squared distance of a state from another, relative to its size."""
-    size = total = 0.0
-    for j in range(len(q)):
-        size += q[j] * q[j]
-        total += (q[j] - other[j]) ** 2
-    return total / max(size, 1e-12)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -360,36 +299,6 @@ def drive_points(H, m, linear):
             G = load(h, c, LANES)
             store_packed(viscosity.driven(add_identity(G, 1.0)), d, c, LANES)
             store_packed(packed(twice_deviator(G, trace(G) / np.float32(3.0))), e, c, LANES)
-
-
-@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def add_past_increments(H, B, weights, mu, loss, gradients, state, out):
-    """Add the tangent of ``add_past_stress`` times the gradient of every mode: (m, 9 c) in tiles.
-
-    That is ``viscosity.increment``, and ``2 mu loss dev sym h`` less of the linear part.
-    ``state`` (PAST_STATE * LANES,) is scratch.
-    """
-    for tile in range(len(weights) // LANES):
-        h, b = _tile(H, tile, 9), _tile(B, tile, SYMMETRIC)
-        w, m = _tile(weights, tile, 1), _tile(mu, tile, 1)
-        for c in range(LANES):
-            F = add_identity(load(h, c, LANES), 1.0)
-            modulus = m[c] * isochoric(det(F, cofactor(F)))
-            past = unpacked(load_packed(b, c, LANES))
-            G, FB, past, third = viscosity.linearise(F, past, w[c] * modulus)
-            store(G, state, c, LANES)
-            store(FB, state, 9 * LANES + c, LANES)
-            store_packed(packed(past), state, 18 * LANES + c, LANES)
-            state[24 * LANES + c], state[25 * LANES + c] = third, loss * w[c] * m[c]
-        for mode in range(len(gradients)):
-            g, d = _tile(gradients[mode], tile, 9), _tile(out[mode], tile, 9)
-            for c in range(LANES):
-                G, FB = load(g, c, LANES), load(state, 9 * LANES + c, LANES)
-                past = unpacked(load_packed(state, 18 * LANES + c, LANES))
-                third, lost = state[24 * LANES + c], state[25 * LANES + c]
-                D = viscosity.increment(load(state, c, LANES), FB, past, third, G)
-                linear = scale(lost, twice_deviator(G, trace(G) / np.float32(3.0)))
-                store(add(load(d, c, LANES), add(linear, D)), d, c, LANES)
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc"})

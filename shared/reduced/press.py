@@ -35,7 +35,7 @@ from palpate.shared.reduced.corrections import Secants, forget_secants
 from palpate.shared.reduced.features import estimate_errors, load_features, log_residual
 from palpate.shared.reduced.points import FAST, Points, back_substitute, cholesky, superpose
 from palpate.shared.reduced.problem import Problem, Work, newton_method
-from palpate.shared.reduced.terms import Dead
+from palpate.shared.reduced.terms import Dead, TipScratch, TipWarm
 
 TOLERANCE, TOLERANCE_IN_TIME = 1.5e-3, 2e-3
 """Residual at equilibrium relative to load and past: in the energy norm of the rest state both are
@@ -86,6 +86,7 @@ class PressWarm(NamedTuple):
     past: Annotated[Array, "slots, r"]  # force of the past in it, on linear tissue
     inverse: Annotated[Array, "slots, r, r"]  # see ``corrections.Secants``
     origin: Annotated[Array, "slots, 2, r"]
+    tip: TipWarm
 
 
 class PressScratch(NamedTuple):
@@ -110,6 +111,7 @@ class PressScratch(NamedTuple):
     residual_features: Annotated[Array, "residual_features"]
     nodal: Annotated[Array, "nodes"]  # most of a model
     surface: Annotated[Array, "clusters"]  # see ``geometry.surface.locate``
+    tip: TipScratch
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -160,7 +162,7 @@ def press(solver, pressure, radius):
         k = active.number[slot]
         area = _load(models, k, outcome, pressure, radius, solver.scratch)
         outcome.area[0] = area
-        _anticipate(solver, k, pressure)
+        anticipate(solver, k, pressure)
         _solve(solver, k, slot)
         r = q.shape[1]
         for i in range(3):
@@ -197,7 +199,7 @@ def _load(models, k, outcome, pressure, radius, scratch):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _anticipate(solver, k, pressure):
+def anticipate(solver, k, pressure):
     """Take the cubature's defect off ``scratch.load`` of model k and write its first guess.
 
     Beyond the range of pressures what is fitted stays what it is at its end.
@@ -256,7 +258,7 @@ def _solve(solver, k, slot):
         elif attempt == 1:
             start[:] = guess
             forget_secants(inverse, origin)
-            _first_tangent(models.directions[k], models.change[k], scratch, inverse)
+            first_tangent(models.directions[k], models.change[k], scratch, inverse)
             warm.past[slot] = missed[:] = 0.0
             past.follow(inverse, guess, warm.past[slot], missed, scratch.change, start)
         else:
@@ -290,7 +292,7 @@ def _solve(solver, k, slot):
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def _first_tangent(directions, table, scratch, inverse):
+def first_tangent(directions, table, scratch, inverse):
     """Add to the inverse (r, r) of the tangent at rest what the load changes in few directions.
 
     With ``V`` these directions and ``K`` the tangent in them, that is ``V^T (K^-1 - I) V``; a ``K``

@@ -14,12 +14,13 @@ At the end of a time step the equilibrium minimises
 ``D``  deviatoric part of the rest stiffness in the modes; ``l = sum g_a new_a`` (``mechanics
        .viscosity``), ``h = sum g_a (decay_a z_a + old_a q_n)`` of the past answers' means ``z_a``
 ``psi``  what the past at a point, ``B_c``, adds to the energy; ``psi_0`` its linear part
-``f``  dead load; ``Phi`` contact potential of the rigid tip at ``x``
+``f``  dead load; ``Phi`` energy of the law of the rigid tip at ``x``
 
 Each line of it is one member of a ``Problem``, and each member has a type for every case: tissue
-without a past (``Elastic``) or with one (``Remembering``), a ``Dead`` load or ``Contact``, and a
-correction by the inverse tangent that ``Secants`` make up or by a factorised ``Tangent``.  A
-further past, load or correction is a named tuple with the same methods.
+without a past (``Elastic``) or with one (``Remembering``), a ``Dead`` load or the tip as well
+(``Pushed``), and a correction by the inverse tangent that ``Secants`` make up, beside the law's
+spring in ``TouchedSecants``.  A further past, load or correction is a named tuple with the same
+methods.
 """
 
 from typing import Annotated, Any, NamedTuple
@@ -50,8 +51,8 @@ class Problem(NamedTuple):
 
     points: Points
     past: Any  # past.Elastic or past.Remembering
-    load: Any  # Dead or Contact
-    correction: Any  # Secants or Tangent
+    load: Any  # Dead or Pushed
+    correction: Any  # Secants or TouchedSecants
     work: Work
 
     def potential(self, u, residual):

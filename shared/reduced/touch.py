@@ -1,126 +1,63 @@
 """The rigid tip on local models: at once, or at the end of a time step.
 
-Theory.  See ``reduced.problem`` for the potential: the load is the contact potential ``Phi`` of
-``mechanics.sphere`` at the nodes of the surface near the local model.  Nothing else is known of the
-load: the tip's centre ``x`` is the query.  Force on the tool and tangent of an equilibrium are
+Theory.  See ``mechanics.tip`` for the energy that the tip adds to that of a local model, and
+``reduced.problem`` for the latter.  At a place ``X`` of the surface and under a force along a
+normal ``n`` the state is a minimum, sought like that under a load; the law's stiffness is a spring
+beside the secants.  Place and normal are those where the energy is stationary: a few rounds of
+Newton's method, each with gradient ``g`` and second derivatives ``H`` of the energy in place and
+centre, the state in equilibrium.  Force on the tool and tangent are
 
-    F = - dPhi/dx,   dF/dx = B^T K^-1 B - d2Phi/dx2,   B = d2Phi/(dq dx),  K = d2Pi/dq2,
+    F = - g_c,    dF/dc = H_cX H_XX^-1 H_Xc - H_cc.
 
-the past being what it is.  Contact is too stiff for secants, so the tangent is factorised.
+At the rim of the surface the place stays on it, as where a tip touches an edge.
 
-A search starts from the last answer and its derivative ``K^-1 B`` in the tip's position, from a
-neighbour's answer projected on the model's modes in the energy of the rest state, from what the
-tissue remembers, or from a polynomial in place and depth.  Forces of neighbouring models are
-blended; the tangent has the derivatives of the weights, too.
+A search starts where the last answer's place and force have followed the tip, or at the point of
+the surface nearest to it.  Forces of neighbouring models are blended at one place; the tangent has
+the derivatives of the weights, too.
 """
 
 import math
-from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
 
-from palpate.shared.arrays import Array, Field, Ints, Numbers
 from palpate.shared.compiled import bind_compiled
 from palpate.shared.geometry.surface import UPRIGHT, locate
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import TIP_DEPTH
-from palpate.shared.mechanics.sphere import Tip, TipSurface
+from palpate.shared.mechanics.tip import LONGEST, follow, meet_wall, next_place, pushed
 from palpate.shared.reduced.blend import MAX_ACTIVE, activate, weight_gradients
-from palpate.shared.reduced.contact_search import (
-    MAX_ITERATIONS,
-    TOLERANCE,
-    along_the_way_in,
-    to_minimum,
-)
-from palpate.shared.reduced.corrections import Tangent, TangentWork
-from palpate.shared.reduced.features import (
-    TIP_FEATURES,
-    estimate_errors,
-    log_residual,
-    tip_features,
-)
-from palpate.shared.reduced.points import Points, project
-from palpate.shared.reduced.problem import Problem, Work
-from palpate.shared.reduced.terms import Contact, ContactWork, reaction
+from palpate.shared.reduced.contact import press_at_place
+from palpate.shared.reduced.features import estimate_errors, log_residual
 
-LEAST_SHARE = 0.1
-"""Weight of a model below which its residual may not be larger still: that counts by weight."""
+ELSEWHERE = 3
+"""Status where the place has moved to local models whose past the step did not begin with."""
 
-LAG_AT_ONCE, LAG_IN_TIME = 0.01, 0.03
-"""Change of answer and past, relative to the answer, up to which the tissue's part of the tangent
-serves again.  In time both change at every step, and forming the tangent takes as long as all the
-rest.  The contact's part never serves again: it is far stiffer and changes as fast as the tip
-moves."""
+MOST_ROUNDS = 24
+"""Places at which a state is sought; from the eighth on, steps to the next are halved."""
 
-SKIN = 0.02
-"""Distance from the surface, in radii of the tip, at which contact is looked for: the triangles
-that say where the surface is cut its curves."""
+NEAR = 2e-3
+"""Step to the next place, in radii of the tip, and turn of the normal that are not taken: the force
+is corrected to first order."""
 
+SHALLOW = 4e-3
+"""Depth, in radii of the tip, up to which the place is that at rest: the triangles that say where
+the surface is cut its curves by as much."""
 
-class TouchModels(NamedTuple):
-    """Local models of the tip; ``*_from[k] : *_from[k + 1]`` are the rows of model k."""
+RAMP = 8
+"""Steps of the way in where an equilibrium cannot be found in one jump."""
 
-    centres: Array  # (3, p) mm, of a tip at the middle of the model, half as deep as may be
-    frames: Array  # (p, 3, 3) rows: outward normal and two tangents
-    blend: float  # mm
-    points: Points
-    tangent_points: Points  # the same, or fewer for a tangent that need not be exact
-    guess: Field  # (p, TIP_FEATURES, r) of the answer
-    tip: Tip
-    surface: TipSurface
-    node_from: Ints  # (p + 1,)
-    nodes: Numbers  # (s,) of the surface, near the model
-    modes: Field  # (s, 3, r) mm
-    face_from: Ints  # (p + 1,)
-    faces: Numbers  # (t,) of the surface, near the model
-    corners: Numbers  # (t, k) their nodes, counted from the model's first
-    neighbour_from: Ints  # (p + 1,)
-    neighbours: Numbers  # (o,) models whose answers can be projected
-    transfer: Field  # (o, r, r) from their modes to the model's
-    residuals: Array  # (p, RESIDUAL_FEATURES) log of the residual; the load is the depth
-
-
-class TouchWarm(NamedTuple):
-    """The models of the last equilibrium, to start the next from."""
-
-    number: Annotated[Ints, "slots"]  # -1 for an empty slot
-    q: Annotated[Array, "slots, r"]
-    slope: Annotated[Array, "slots, 3, r"]  # 1/mm, K^-1 B there
-    position: Annotated[Array, "3"]  # mm
-    bulk: Annotated[Array, "slots, r, r"]  # see ``corrections.Tangent``
-    formed: Annotated[Array, "slots, 3, r"]
-
-
-class TouchScratch(NamedTuple):
-    """Working memory of a query."""
-
-    work: Work
-    newton: Annotated[Array, "4, r"]
-    x: Annotated[Array, "3"]  # mm
-    q: Annotated[Array, "slots, r"]  # answers, or where searches have ended
-    slope: Annotated[Array, "slots, 3, r"]
-    factor: Annotated[Array, "r, r"]  # of the last model's tangent
-    coupling: Annotated[Array, "3, r"]  # its B
-    forces: Annotated[Array, "slots, 3"]  # mN, of the models
-    tangents: Annotated[Array, "slots, 3, 3"]  # mN/mm
-    tangent: TangentWork
-    contact: ContactWork
-    features: Annotated[Array, "features"]  # of the position
-    residual_features: Annotated[Array, "residual_features"]
-    inward: Annotated[Array, "3"]
-    surface: Annotated[Array, "clusters"]  # see ``geometry.surface.locate``
+LEAST_FACING = 0.1
+"""Cosine between force and surface normal below which a place is none."""
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def place(solver, x, last):
-    """Find where the tip's centre ``x`` (3,) mm lies, and the local models that answer.
+def place(solver, x):
+    """Find where the tip's centre ``x`` (3,) mm lies over the surface at rest.
 
-    Off the tissue, models are chosen about ``last``, where it touched last: tissue with a past goes
-    on without a load.  Writes the nearest point of the surface and its normal, the depth and its
-    limit.
+    Writes the nearest point of the surface and its normal, the depth and its limit.
     """
-    models, outcome, tip = solver.models, solver.outcome, solver.models.tip
+    outcome, radius = solver.outcome, solver.tip.radius
     distance = locate(
         solver.surface, x, solver.scratch.surface, outcome.foot, outcome.upward, outcome.limits
     )
@@ -130,173 +67,239 @@ def place(solver, x, last):
         above += (x[i] - outcome.foot[i]) * outcome.upward[i]
     beside = abs(above) < UPRIGHT * distance
     outcome.distance[0], outcome.beside[0] = distance, 1.0 if beside else 0.0
-    outcome.depth[0] = tip.radius - (distance if beside else math.copysign(distance, above))
-    at = x if outcome.depth[0] > -SKIN * tip.radius else last
-    activate(models.centres, models.blend, at, solver.warm.number, solver.active)
-    weight_gradients(models.centres, models.blend, at, solver.active)
+    outcome.depth[0] = radius - (distance if beside else math.copysign(distance, above))
+    outcome.point[:] = outcome.foot
+    outcome.normal[:] = outcome.upward
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def touch(solver, x, most):
-    """Answer a tip at ``x`` (3,) mm that ``place`` has placed; at once, estimate its errors.
+def begin(solver, x, last):
+    """Choose where the search for a tip at ``x`` that ``place`` has placed begins, and its models.
 
-    Parameters
-    ----------
-    solver : Bound of Solver
-        Its memory is the starting point on entry and holds the answers on return if all models have
-        one.  Its past then is at the end of the step.
-    x : ndarray, shape (3,), mm
-    most : int
-        Iterations in one local model; only with ``MAX_ITERATIONS`` is the way in tried, too, where
-        a jump fails.
+    Off the tissue that is about ``last``, where it touched last: tissue with a past goes on without
+    a load.
     """
-    outcome, scratch, active = solver.outcome, solver.scratch, solver.active
-    outcome.status[0] = outcome.iterations[0] = outcome.energy[0] = 0.0
-    outcome.penetration[0] = outcome.touched[0] = 0.0
-    outcome.min_jacobian[0] = 1.0
-    outcome.force[:] = 0.0
-    outcome.tangent[:] = 0.0
+    warm, tip, outcome = solver.warm.tip, solver.scratch.tip, solver.outcome
+    normal, size = tip.contact.normal, 0.0
+    away = 0.0
+    for i in range(3):
+        away += (x[i] - warm.centre[i]) ** 2
+    known = warm.known[0] == 1.0 and away < (LONGEST * solver.tip.radius) ** 2
+    if not known:
+        warm.force[:] = 0.0
+    for i in range(3):
+        tip.place[i] = outcome.foot[i]
+        normal[i] = outcome.upward[i]
+        if outcome.depth[0] <= 0.0:
+            tip.place[i] = last[i]
+        elif known:
+            tip.place[i] = warm.place[i]
+            normal[i] = warm.force[i]
+            for j in range(3):
+                tip.place[i] += warm.follows[i, j] * (x[j] - warm.centre[j])
+                normal[i] += warm.tangent[i, j] * (x[j] - warm.centre[j])
+        size += normal[i] ** 2
+    size = math.sqrt(size)
+    if np.dot(normal, outcome.upward) < LEAST_FACING * size:  # contact is about to end
+        normal[:] = outcome.upward
+    else:
+        normal /= size
+    _go(solver)
+    _choose(solver)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _go(solver):
+    """Go to the place wanted, if it is on the surface."""
+    outcome, scratch = solver.outcome, solver.scratch
+    locate(
+        solver.surface, scratch.tip.place, scratch.surface, outcome.foot, outcome.upward,
+        outcome.limits,
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _choose(solver):
+    """Choose the models that answer at the outcome's place; False if a past of one is not known."""
+    models, active = solver.models, solver.active
+    activate(models.centres, models.blend, solver.outcome.foot, solver.warm.number, active)
     for slot in range(MAX_ACTIVE):
-        if active.weight[slot] > 0.0:
-            _solve(solver, active.number[slot], slot, x, most)
-    if outcome.status[0] == newton.CONVERGED:
-        for slot in range(MAX_ACTIVE):
-            if active.weight[slot] > 0.0:
-                share, force = active.weight[slot], scratch.forces[slot]
-                for i in range(3):
-                    outcome.force[i] += share * force[i]
-                    for j in range(3):
-                        outcome.tangent[i, j] += (
-                            share * scratch.tangents[slot, i, j]
-                            + force[i] * active.gradient[slot, j]
-                        )
-    _remember(solver, x)
-    _act(solver, x)
-    # or ``transfer.estimate_history`` estimates
-    if outcome.touched[0] > 0.0 and not solver.past.in_time:
-        _estimate(solver, x)
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _solve(solver, k, slot, x, most):
-    """Equilibrium of model k, its force and tangent, into the slot."""
-    scratch, outcome = solver.scratch, solver.outcome
-    q, depth = scratch.q[slot], outcome.depth[0]
-    _start(solver, k, slot, x, q)
-    scratch.x[:] = x
-    scratch.contact.latest[:] = np.inf
-    problem = local_problem(solver, k, slot)
-    tolerance = TOLERANCE / max(solver.active.weight[slot], LEAST_SHARE)
-    status, iterations, energy, smallest = to_minimum(
-        problem, q, scratch.newton, max(depth, 0.0), tolerance, most
-    )
-    if status != newton.CONVERGED and depth > 0.0 and most == MAX_ITERATIONS:
-        status, more, energy, smallest = along_the_way_in(
-            problem, q, scratch.newton, depth, outcome.upward, most
-        )
-        iterations += more
-    outcome.status[0] = max(outcome.status[0], float(status))
-    outcome.iterations[0] = max(outcome.iterations[0], float(iterations))
-    outcome.min_jacobian[0] = min(outcome.min_jacobian[0], smallest)
-    if status != newton.CONVERGED:
-        return
-    coupling, force = scratch.coupling, scratch.forces[slot]
-    residual, step = scratch.newton[0], scratch.newton[1]
-    reaction(
-        problem.load, scratch.factor, coupling, scratch.slope[slot], force, scratch.tangents[slot]
-    )
-    problem.correct(residual, step)
-    energy += 0.5 * np.dot(residual, step)
-    q += step
-    for i in range(3):
-        force[i] += np.dot(coupling[i], step)
-    touching = scratch.contact.touching
-    outcome.energy[0] += solver.active.weight[slot] * energy
-    outcome.penetration[0] = max(outcome.penetration[0], touching.deepest[0])
-    outcome.touched[0] += touching.touched[0]
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def local_problem(solver, k, slot):
-    """Local model k under the tip at ``scratch.x``, by reference."""
-    models, warm, scratch = solver.models, solver.warm, solver.scratch
-    nodes = slice(models.node_from[k], models.node_from[k + 1])
-    faces = slice(models.face_from[k], models.face_from[k + 1])
-    solver.past.begin_step(models.points.law.mu[k], k, slot)
-    contact = Contact(
-        models.tip, models.surface, scratch.x, models.nodes[nodes], models.modes[nodes],
-        models.faces[faces], models.corners[faces], scratch.contact,
-    )  # fmt: skip
-    lag = LAG_IN_TIME if solver.past.in_time else LAG_AT_ONCE
-    tangent = Tangent(
-        bind_compiled(models.tangent_points.of(k)), warm.bulk[slot], warm.formed[slot], lag,
-        scratch.factor, scratch.tangent,
-    )  # fmt: skip
-    return bind_compiled(
-        Problem(
-            bind_compiled(models.points.of(k)),
-            solver.past,
-            bind_compiled(contact),
-            bind_compiled(tangent),
-            scratch.work,
-        )
-    )
-
-
-# --- where a search starts -----------------------------------------------------------------------
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _start(solver, k, slot, x, q):
-    """Write where the search of model k starts, (r,)."""
-    warm, depth = solver.warm, max(solver.outcome.depth[0], 0.0)
-    if warm.number[slot] == k:
-        _follow(warm, slot, x, q)
-        return
-    warm.formed[slot] = np.inf
-    if _from_neighbour(solver, k, x, q):
-        return
-    solver.past.last_answer(slot, q)
-    if not np.any(q):
-        first_guess(solver.models, k, x, depth, solver.scratch.features, q)
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _follow(warm, slot, x, q):
-    """Follow the derivatives of the last answer to the position x."""
-    q[:] = warm.q[slot]
-    for i in range(3):
-        q += (x[i] - warm.position[i]) * warm.slope[slot, i]
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _from_neighbour(solver, k, x, q):
-    """Project the answer of the nearest neighbour that has one, as it is at x; False without."""
-    models, warm, distance = solver.models, solver.warm, solver.active.distance
-    source, at, least = -1, -1, np.inf
-    for i in range(models.neighbour_from[k], models.neighbour_from[k + 1]):
-        n = models.neighbours[i]
-        for slot in range(MAX_ACTIVE):
-            if warm.number[slot] == n and distance[n] < least:
-                source, at, least = slot, i, distance[n]
-    if source < 0:
-        return False
-    followed = solver.scratch.work.stepped
-    _follow(warm, source, x, q)
-    followed[:] = q
-    project(models.transfer[at], followed, q)
+        own = active.number[slot]
+        if solver.past.in_time and own >= 0 and own != solver.scratch.tip.begun[slot]:
+            return False
     return True
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def first_guess(models, k, x, depth, features, q):
-    """Write the trained first guess of model k with the tip at x so deep, (r,)."""
-    tip_features(models.frames[k], models.centres[:, k], x, depth, features)
-    q[:] = 0.0
-    for f in range(TIP_FEATURES):
-        row = models.guess[k, f]
-        for j in range(len(q)):
-            q[j] += features[f] * row[j]
+def touch(solver, x):
+    """Answer a tip at ``x`` (3,) mm whose search has begun; at once, estimate its errors.
+
+    The solver's memory is the starting point on entry and holds the answers on return.  Its past
+    then is at the end of the step; where it ends ``ELSEWHERE`` the step begins again with the
+    models that are active then.
+    """
+    outcome, depth = solver.outcome, solver.outcome.depth[0]
+    solver.scratch.tip.begun[:] = solver.active.number
+    outcome.iterations[0] = 0.0
+    _settle(solver, x)
+    if outcome.status[0] not in (newton.CONVERGED, ELSEWHERE) and depth > 0.0:
+        _walk_in(solver, x, depth)
+    if outcome.status[0] == newton.CONVERGED:
+        _end_step(solver)
+    # or ``transfer.estimate_history`` estimates
+    if outcome.touched[0] > 0.0 and not solver.past.in_time:
+        _estimate(solver)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _settle(solver, x):
+    """Find place, normal, and state under a tip at x, from where the search has begun."""
+    outcome, tip = solver.outcome, solver.scratch.tip
+    cold, sure = solver.warm.tip.known[0] == 0.0, False
+    tip.wall[:] = 0.0
+    for made in range(MOST_ROUNDS):
+        if made > 0 and not _choose(solver):
+            outcome.status[0] = ELSEWHERE
+            break
+        press_at_place(solver, x, sure)
+        if outcome.status[0] != newton.CONVERGED:
+            break
+        if outcome.touched[0] == 0.0:
+            if made > 0:
+                _go_back(solver)
+                continue
+            # right off the tissue, or above the dent that the past has left
+            if outcome.depth[0] > 0.0 and not solver.past.in_time:
+                outcome.status[0] = newton.EXHAUSTED
+            break
+        if outcome.depth[0] < SHALLOW * solver.tip.radius:
+            break
+        _step(solver, made)
+        moved, turned = _move(solver), _turn(solver)
+        if moved < NEAR * solver.tip.radius and turned < NEAR:
+            if sure or not cold:
+                break
+            sure = True
+        if made + 1 == MOST_ROUNDS or np.dot(tip.contact.normal, outcome.upward) < LEAST_FACING:
+            outcome.status[0] = newton.EXHAUSTED
+            break
+    outcome.tangent[:] = 0.0
+    if outcome.status[0] == newton.CONVERGED and outcome.touched[0] > 0.0:
+        _react(solver)
+    else:
+        outcome.force[:] = 0.0
+    _remember(solver, x)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _walk_in(solver, x, depth):
+    """Go the way in step by step, from where the tip does not touch: for where a jump fails."""
+    outcome = solver.outcome
+    place(solver, x)
+    way, at = depth * outcome.upward, np.empty(3)
+    solver.warm.number[:] = -1
+    for i in range(1, RAMP + 1):
+        for j in range(3):
+            at[j] = x[j] + (1.0 - i / RAMP) * way[j]
+        place(solver, at)
+        begin(solver, at, outcome.foot)
+        if not _choose(solver):
+            outcome.status[0] = ELSEWHERE
+            return
+        _settle(solver, at)
+        if outcome.status[0] != newton.CONVERGED:
+            return
+
+
+# --- from place to place -------------------------------------------------------------------------
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _step(solver, made):
+    """Choose the next place by Newton's step."""
+    outcome, tip, most = solver.outcome, solver.scratch.tip, LONGEST * solver.tip.radius
+    for p in range(2):
+        tip.barred[p] = np.dot(tip.tangents[p], tip.wall)
+    length = next_place(tip.g, tip.H, tip.barred, tip.moved)
+    shorter = min(1.0, most / max(length, 1e-12)) * (0.5 if made > 6 else 1.0)
+    tip.last[:] = outcome.foot
+    tip.before[:] = tip.contact.normal
+    tip.place[:] = outcome.foot
+    for p in range(2):
+        tip.step[p] = tip.moved[p]
+        tip.wanted[p] = shorter * tip.step[p]
+        for i in range(3):
+            tip.place[i] += tip.wanted[p] * tip.tangents[p, i]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _move(solver):
+    """Go to the next place, as far as the surface goes; return how far, mm."""
+    outcome, tip = solver.outcome, solver.scratch.tip
+    _go(solver)
+    for p in range(2):
+        tip.moved[p] = 0.0
+        for i in range(3):
+            tip.moved[p] += tip.tangents[p, i] * (outcome.foot[i] - tip.last[i])
+    meet_wall(tip.wanted, tip.moved, tip.barred)
+    for i in range(3):
+        tip.wall[i] = tip.tangents[0, i] * tip.barred[0] + tip.tangents[1, i] * tip.barred[1]
+    return math.sqrt(tip.moved[0] ** 2 + tip.moved[1] ** 2)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _go_back(solver):
+    """Go half-way back to where there was contact."""
+    tip, outcome = solver.scratch.tip, solver.outcome
+    for i in range(3):
+        tip.place[i] = 0.5 * (tip.last[i] + outcome.foot[i])
+    tip.contact.normal[:] = tip.before
+    _go(solver)
+    outcome.status[0] = newton.EXHAUSTED  # until the next round
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _turn(solver):
+    """Turn the normal to the force at the next place; return by how much."""
+    outcome, tip = solver.outcome, solver.scratch.tip
+    normal, turn, along, length = tip.contact.normal, 0.0, 0.0, 0.0
+    for p in range(2):
+        along += tip.moved[p] * tip.step[p]
+        length += tip.step[p] ** 2
+    share = min(max(along / max(length, 1e-300), 0.0), 1.0)
+    # so short a step leads to where it is wanted
+    share = share if length > (NEAR * solver.tip.radius) ** 2 else 1.0
+    force = pushed(tip.g, tip.H, tip.step, share, outcome.force)
+    for i in range(3):
+        own = outcome.force[i] / max(force, 1e-300)
+        turn += (own - normal[i]) ** 2
+        normal[i] = own
+        solver.warm.tip.force[i] = outcome.force[i]
+    return math.sqrt(turn)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _react(solver):
+    """Write the tangent on the tool, and how the place follows the tip."""
+    outcome, tip, models, active = (
+        solver.outcome, solver.scratch.tip, solver.models, solver.active,
+    )  # fmt: skip
+    follows = solver.warm.tip.follows
+    follow(tip.H, tip.barred, tip.turned, outcome.tangent)
+    weight_gradients(models.centres, models.blend, outcome.foot, active)
+    for i in range(3):
+        for j in range(3):
+            follows[i, j] = 0.0
+            for p in range(2):
+                follows[i, j] += tip.tangents[p, i] * tip.turned[p, j]
+    for slot in range(MAX_ACTIVE):
+        if active.weight[slot] > 0.0:
+            for j in range(3):
+                change = 0.0
+                for i in range(3):
+                    change += active.gradient[slot, i] * follows[i, j]
+                for i in range(3):
+                    outcome.tangent[i, j] += tip.forces[slot, i] * change
 
 
 # --- what is kept --------------------------------------------------------------------------------
@@ -304,55 +307,48 @@ def first_guess(models, k, x, depth, features, q):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _remember(solver, x):
-    """Start the next search from these answers; from those before where one is no equilibrium."""
-    warm, scratch, active = solver.warm, solver.scratch, solver.active
-    found = solver.outcome.status[0] == newton.CONVERGED
+    """Start the next search from this answer; write where the force acts on the tip."""
+    tip, outcome = solver.warm.tip, solver.outcome
+    force = math.sqrt(np.dot(outcome.force, outcome.force))
+    tip.known[0] = 1.0 if force > 0.0 else 0.0
+    tip.centre[:] = x
+    tip.place[:] = outcome.foot
+    tip.force[:] = outcome.force
+    tip.tangent[:] = outcome.tangent
+    if force > 0.0:
+        for i in range(3):
+            outcome.normal[i] = outcome.force[i] / force
+            outcome.point[i] = x[i] - solver.tip.radius * outcome.normal[i]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _end_step(solver):
+    """Take the past to the end of its step."""
+    active = solver.active
     for slot in range(MAX_ACTIVE):
         if active.weight[slot] > 0.0:
-            k = active.number[slot]
-            if found:
-                warm.q[slot] = scratch.q[slot]
-                warm.slope[slot] = scratch.slope[slot]
-                points = solver.models.points.of(k)
-                solver.past.end_step(points, scratch.work, slot, scratch.q[slot], True)
-            elif k != warm.number[slot]:
-                warm.formed[slot] = np.inf  # of another model, or far off
-    if found:
-        warm.number[:] = active.number
-        warm.position[:] = x
+            points = bind_compiled(solver.models.points.of(active.number[slot]))
+            solver.past.end_step(points, solver.scratch.work, slot, solver.warm.q[slot], True)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _act(solver, x):
-    """Write where the force acts on the tip; without one, the surface point nearest to it."""
-    outcome = solver.outcome
-    outcome.point[:] = outcome.foot
-    outcome.normal[:] = outcome.upward
-    pushed = math.sqrt(np.dot(outcome.force, outcome.force))
-    if pushed > 0.0:
-        for i in range(3):
-            outcome.normal[i] = outcome.force[i] / pushed
-            outcome.point[i] = x[i] - solver.models.tip.radius * outcome.normal[i]
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _estimate(solver, x):
+def _estimate(solver):
     """Estimated errors of an answer at once.
 
     The features: 1, the depth over its limit and its log, smallest det F, the normal (where on the
     body), and the logs of force over depth (mN/mm), of the energy over that of a linear spring, and
-    of the residual that such answers leave in the full model.
+    of the residual that a load of this force leaves in the full model.
     """
-    outcome, features, inward = solver.outcome, solver.outcome.features, solver.scratch.inward
+    outcome, features = solver.outcome, solver.outcome.features
     pushed = math.sqrt(np.dot(outcome.force, outcome.force))
     depth = max(outcome.depth[0], 1e-6)
     share = depth / max(outcome.limit[0], 1e-6)
-    inward[:] = -outcome.upward
     features[0], features[1], features[2] = 1.0, share, math.log(share)
     features[3] = outcome.min_jacobian[0]
     features[4:7] = outcome.upward
     features[7] = math.log(max(pushed / depth, 1e-6))
     features[8] = math.log(max(2.0 * outcome.energy[0] / max(pushed * depth, 1e-9), 1e-3))
-    features[9] = log_residual(solver, x, inward, share)
+    load = pushed / max(outcome.area[0] * outcome.limits[0], 1e-9)
+    features[9] = log_residual(solver, outcome.foot, outcome.direction, load)
     count = solver.coefficients.shape[1]
     estimate_errors(solver.coefficients, features[:count], outcome.errors)

@@ -71,11 +71,13 @@ class Past(NamedTuple):
     main : int
         The local model that had most weight; -1 at rest.
     position : ndarray, shape (3,), mm, or None
-        The last contact point; under the tip, where it was over the surface last.
+        The last contact point.
     features : ndarray, shape (HISTORY_FEATURES,)
         Of the error estimate so far, see ``estimate_history``.
     tip : bool
         Whether it is of the rigid tip; loads do not go on from there.
+    dent : ndarray, shape (terms + 1,), mN
+        What the tip's law remembers; see ``mechanics.tip``.
     """
 
     time: float = 0.0
@@ -84,6 +86,7 @@ class Past(NamedTuple):
     position: Array | None = None
     features: Array = np.array([1.0, 0.0, _NOTHING, 1.0, 0.0, 0.0, 0.0, 0.0, _NOTHING])
     tip: bool = False
+    dent: Array = np.zeros(1)
 
 
 REST = Past()

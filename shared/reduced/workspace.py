@@ -6,7 +6,6 @@ itself remembers is a value of its own, ``transfer.Past``.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from palpate.shared.arrays import Array
 from palpate.shared.compiled import bind, room
 from palpate.shared.geometry.surface import SurfaceIndex
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS
-from palpate.shared.mechanics.sphere import BLOCK
+from palpate.shared.mechanics.tip import CURVATURE_FIELDS, Tip
 from palpate.shared.mechanics.viscosity import step_weights
 from palpate.shared.reduced.blend import MAX_ACTIVE, Active
 from palpate.shared.reduced.features import (
@@ -23,13 +22,10 @@ from palpate.shared.reduced.features import (
     LOAD_FEATURES,
     RESIDUAL_FEATURES,
     TANGENT_FEATURES,
-    TIP_FEATURES,
 )
 from palpate.shared.reduced.outcome import PRESS_FEATURES, Outcome, Solver
-from palpate.shared.reduced.past import Elastic, Remembering
-from palpate.shared.reduced.points import LANES, STATE
+from palpate.shared.reduced.past import Elastic, Remembering, set_step
 from palpate.shared.reduced.press import PressModels, PressScratch, PressWarm
-from palpate.shared.reduced.touch import TouchModels, TouchScratch, TouchWarm
 
 
 class Workspace:
@@ -37,9 +33,10 @@ class Workspace:
 
     Parameters
     ----------
-    models : PressModels or TouchModels
+    models : PressModels
+    tip : Tip
     index : SurfaceIndex
-        With the load range.
+        With the load range and the curvature.
     coefficients : ndarray, shape (2 or 3, features)
         Of the error estimate.
     past : Elastic or Remembering
@@ -51,13 +48,12 @@ class Workspace:
         Its members.
     features : int
         Of the error estimate.
-    tip : bool
-        Whether it is for the tip.
     """
 
     def __init__(
         self,
-        models: PressModels | TouchModels,
+        models: PressModels,
+        tip: Tip,
         index: SurfaceIndex,
         coefficients: Array,
         past: Elastic | Remembering,
@@ -65,33 +61,21 @@ class Workspace:
         r, c = models.points.gradients.shape[1], models.points.weights.shape[1]
         sizes = {"slots": MAX_ACTIVE, "r": r, "c": c, "p": models.centres.shape[1]}
         sizes |= {"clusters": len(index.radii), "residual_features": RESIDUAL_FEATURES}
-        self.warm: Any
-        self.scratch: Any
-        self.tip = isinstance(models, TouchModels)
-        if isinstance(models, PressModels):
-            self.warm = room(PressWarm, **sizes)
-            self.scratch = room(
-                PressScratch, **sizes, features=LOAD_FEATURES, tangent_features=TANGENT_FEATURES,
-                changing=CHANGING, changes=CHANGES, nodes=int(np.diff(models.node_from).max()),
-            )  # fmt: skip
-        else:
-            self.warm = room(TouchWarm, **sizes)
-            k, ends = models.surface.corner_shape.shape
-            self.scratch = room(
-                TouchScratch, **sizes, features=TIP_FEATURES, nodes=len(models.surface.nodes),
-                state=STATE, tangent_points=models.tangent_points.weights.shape[1],
-                f=int(np.diff(models.face_from).max()), k=k, block=BLOCK, ends=ends,
-            )  # fmt: skip
-            units = self.scratch.tangent.units.reshape(9, -1, 9, LANES)
-            units[np.arange(9), :, np.arange(9)] = 1.0
+        self.warm = room(PressWarm, **sizes)
+        self.scratch = room(
+            PressScratch, **sizes, features=LOAD_FEATURES, tangent_features=TANGENT_FEATURES,
+            changing=CHANGING, changes=CHANGES, nodes=int(np.diff(models.node_from).max()),
+        )  # fmt: skip
         self.past, self._dt = past, math.nan
         self.active = room(Active, **sizes)
-        self.outcome = room(Outcome, features=PRESS_FEATURES, limits=LIMIT_FIELDS)
+        self.outcome = room(
+            Outcome, features=PRESS_FEATURES, limits=LIMIT_FIELDS + CURVATURE_FIELDS
+        )
         self.features = coefficients.shape[1]
         self.solver = bind(
             Solver(
-                models, index, np.ascontiguousarray(coefficients), past, self.active, self.warm,
-                self.scratch, self.outcome,
+                models, tip, index, np.ascontiguousarray(coefficients), past, self.active,
+                self.warm, self.scratch, self.outcome,
             )
         )  # fmt: skip
         self.active.number[:] = -1
@@ -101,21 +85,13 @@ class Workspace:
         """Make the next answer that at the end of a time step (s) of tissue that remembers."""
         assert isinstance(self.past, Remembering)
         if dt != self._dt:
-            for own, weights in zip(self.past.time, step_weights(prony, dt), strict=True):
-                own[:] = weights
-            self._dt = dt
+            self._weights, self._dt = step_weights(prony, dt), dt
+        set_step(self.past, self._weights)
 
     def forget(self) -> None:
         """Make the next answer independent of the last."""
         self.warm.number[:] = -1
-
-    def resume(self) -> None:
-        """Start the next search under the tip where the last one ended, without equilibrium."""
-        warm = self.warm
-        warm.number[:] = self.active.number
-        warm.q[:] = self.scratch.q
-        warm.formed[:] = np.inf
-        warm.slope[:] = 0.0  # the answer to another position is unknown
+        self.warm.tip.known[0] = 0.0
 
     def answering(self) -> list[tuple[int, int, float]]:
         """Slot, number and weight of the local models that answer."""
@@ -146,9 +122,3 @@ class Warm:
         """Make the next answer independent of the last."""
         for part in self._made.values():
             part.forget()
-
-    def resume(self) -> None:
-        """Start under the tip where the last search ended, which found no equilibrium."""
-        for (tip, _), part in self._made.items():
-            if tip:
-                part.resume()

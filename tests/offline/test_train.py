@@ -15,7 +15,7 @@ from palpate.offline.scenes import find_scene
 from palpate.offline.train import is_of, train
 from palpate.shared.artifact import read_artifact
 from palpate.shared.model import ReducedModel
-from palpate.shared.reduced import press, touch
+from palpate.shared.reduced import press
 
 from ..conftest import PALPATE
 
@@ -129,7 +129,7 @@ def test_what_is_there_is_not_trained_again_and_a_changed_scene_is(
 def test_one_compilation_serves_training_and_queries(atlas, problem):
     compile_query(problem)
     atlas.press(atlas.surface.vertices[0], 0.1)
-    queries = press.place, press.press, touch.place, touch.touch
+    queries = press.place, press.press
     known = [len(query.signatures) for query in queries]
     by_columns = np.asfortranarray(atlas.limits)
     other = ReducedModel(

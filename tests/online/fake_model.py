@@ -20,16 +20,12 @@ DEEPEST_TRAINED = 1.0
 
 
 class Memory:
-    """Where the tip was, and how often a search has gone on."""
+    """Where the tip was."""
 
     last: np.ndarray | None = None
-    gone_on = 0
 
     def forget(self) -> None:
         vars(self).clear()
-
-    def resume(self) -> None:
-        self.gone_on += 1
 
 
 class FakeModel:
@@ -38,9 +34,9 @@ class FakeModel:
     Above `collapse` (kPa) it has no equilibrium; `poison` makes its answers NaN.
 
     A tip meets a bed of springs of `stiffness` (mN/mm). Deeper than `deepest` (mm) there is no
-    equilibrium, but for a search that has gone on `snap` times; none is found more than `stride`
-    (mm) from the last contact. Without `has_tip` there is no answer to a tip at all. With `in_time`
-    the force grows with the time since rest, and `steps` are those that were taken.
+    equilibrium; none is found more than `stride` (mm) from the last contact. Without `has_tip`
+    there is no answer to a tip at all. With `in_time` the force grows with the time since rest, and
+    `steps` are those that were taken.
     """
 
     pressure_max = 8.0
@@ -49,7 +45,6 @@ class FakeModel:
     stiffness = 20.0
     deepest = 1.5
     stride = np.inf
-    snap = 0
     has_tip = True
     models = SimpleNamespace(viscous=None)
 
@@ -124,7 +119,7 @@ class FakeModel:
 
     def touch(
         self, position: Any, *, past: Past | None = None, dt: float = 0.0,
-        warm: Memory | None = None, most: int = 40,
+        warm: Memory | None = None,
     ) -> Answer:  # fmt: skip
         if not self.has_tip:
             raise QueryError("position", "no tip")
@@ -137,8 +132,7 @@ class FakeModel:
         if depth > radius:
             raise QueryError("position", "the tip's centre lies below the surface")
         leap = state.last is not None and np.linalg.norm(position - state.last) > self.stride
-        snapped = 0 < self.snap <= state.gone_on
-        converged = (depth <= self.deepest or snapped) and not leap
+        converged = depth <= self.deepest and not leap
         if converged:
             state.last = position
         contact, pressed = depth > 0.0, max(depth, 0.0)

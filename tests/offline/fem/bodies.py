@@ -2,12 +2,12 @@
 
 import numpy as np
 
+from palpate.offline.fem.contact import SphereContact
 from palpate.offline.fem.mesh import build_mesh
 from palpate.offline.fem.model import FullModel
-from palpate.offline.fem.terms import TipContact
+from palpate.offline.fem.sphere import sphere_of, sphere_surface
 from palpate.offline.scenes import find_scene
 from palpate.shared.mechanics.neo_hookean import NeoHookeanTissue
-from palpate.shared.mechanics.sphere import tip_of, tip_surface
 
 YOUNG, POISSON = 15.0, 0.45
 ELEMENTS = ("hex8", "hex20")
@@ -27,11 +27,11 @@ def body(element, divisions, size, poisson=POISSON, prony=()):
     return FullModel(mesh, tissue_of(poisson, prony))
 
 
-def tip_contact(model, radius):
+def sphere_contact(model, radius):
     """Contact of a block's top with a rigid tip."""
     mesh = model.mesh
-    surface = tip_surface(mesh.nodes, mesh.faces, mesh.accessible, radius)
-    return TipContact(model, surface, tip_of(radius, YOUNG))
+    surface = sphere_surface(mesh.nodes, mesh.faces, mesh.accessible, radius)
+    return SphereContact(model, surface, sphere_of(radius, YOUNG))
 
 
 def support_force(model, displacement):

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
+from palpate.offline.fem.contact import SphereLoad
 from palpate.offline.fem.potential import Projected
-from palpate.offline.fem.terms import DeadLoad, PastStress, TipLoad
+from palpate.offline.fem.terms import DeadLoad, PastStress
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.viscosity import step_weights
 
-from .bodies import body, support_force, tip_contact
+from .bodies import body, sphere_contact, support_force
 
 PRONY = ((0.3, 0.1), (0.2, 1.0))
 RADIUS = 2.0
@@ -26,9 +27,9 @@ def dead_load(model):
 
 
 @pytest.fixture(scope="module")
-def tip_load(model):
+def sphere_load(model):
     position = np.array([2.1, 2.0, 1.7 + RADIUS])
-    return TipLoad(tip_contact(model, RADIUS), position, np.array([0.0, 0.0, -0.3]))
+    return SphereLoad(sphere_contact(model, RADIUS), position, np.array([0.0, 0.0, -0.3]))
 
 
 @pytest.fixture(scope="module")
@@ -38,12 +39,12 @@ def past(model, dead_load):
     return model.solve(dead_load, pressed.past, 0.2).past
 
 
-@pytest.fixture(params=["dead_load", "tip_load"])
+@pytest.fixture(params=["dead_load", "sphere_load"])
 def load(request):
     return request.getfixturevalue(request.param)
 
 
-@pytest.fixture(params=["dead_load", "tip_load", "past"])
+@pytest.fixture(params=["dead_load", "sphere_load", "past"])
 def term(request, model):
     found = request.getfixturevalue(request.param)
     remembers = request.param == "past"
@@ -104,4 +105,4 @@ def test_a_load_comes_little_by_little(model, load):
 def test_the_tool_feels_what_holds_the_body(model, load):
     found = model.solve(load)
     np.testing.assert_allclose(found.force, support_force(model, found.displacement), atol=1e-8)
-    assert found.tangent.any() == isinstance(load, TipLoad)
+    assert found.tangent.any() == isinstance(load, SphereLoad)

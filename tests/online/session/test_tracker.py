@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from palpate.online.session.frames import Flag, Reason
-from palpate.online.session.tracker import LONGEST, PATIENCE, ToolTracker
+from palpate.online.session.tracker import LONGEST, ToolTracker
 
 from ..fake_model import FakeModel
 
@@ -69,22 +69,11 @@ def test_where_equilibria_end_the_tool_stops(model):
     assert model.deepest - 1.5 / 32 <= answer.touch.depth <= model.deepest
 
 
-def test_where_tissue_snaps_the_search_goes_on_from_position_to_position(model):
-    tracker, good = begun(model, 5.0, 5.0, 7.0 - model.deepest, snap=3)
-    heights = (5.4, 5.3, 5.2, 5.1)
-    answers = [tracker.follow((5.0, 5.0, z), 10.0, 0.01 * i) for i, z in enumerate(heights)]
-    assert all(is_fallback(answer, good) for answer in answers[:3])
-    assert [answer.steps for answer in answers[1:]] == [1, 1, 1]
-    assert answers[3].flags == TOUCHING & ~Flag.IN_RANGE
-    assert answers[3].touch.position[2] == 5.1
-
-
-def test_a_search_that_finds_nothing_starts_again_from_rest(model):
-    tracker, good = begun(model, 5.0, 5.0, 7.0 - model.deepest, stride=0.3, snap=PATIENCE)
-    for _ in range(2 * PATIENCE):
-        assert is_fallback(tracker.follow((5.0, 5.0, 5.2), budget=0.0), good)
-    if not model.steps:
-        assert tracker.follow((8.0, 5.0, 6.5), budget=0.0).flags == TOUCHING
+def test_where_there_is_no_way_the_next_position_is_searched_for_from_rest(model):
+    tracker, good = begun(model, 5.0, 5.0, 6.5, stride=0.3)
+    assert is_fallback(tracker.follow((9.0, 5.0, 6.5), budget=0.0, now=0.01), good)
+    found = tracker.follow((9.0, 5.0, 6.5), budget=0.0, now=0.02)
+    assert (found.flags, found.steps) == (TOUCHING, 1)
 
 
 def test_a_position_that_makes_no_sense_falls_back_at_once_and_takes_no_time(model):
@@ -133,14 +122,6 @@ def test_a_snapshot_brings_back_the_state(model):
     tracker.restore(0)
     again = tracker.follow((5.0, 5.0, 6.4), 0.0, 0.11)
     np.testing.assert_array_equal(again.touch.force, first.touch.force)
-
-
-def test_a_restored_state_knows_nothing_of_a_search(model):
-    tracker, good = begun(model, 5.0, 5.0, 7.0 - model.deepest, snap=2)
-    tracker.snapshot(0)
-    for now in (0.01, 0.02, 0.03):
-        assert is_fallback(tracker.follow((5.0, 5.0, 5.3), 0.0, now), good)
-        tracker.restore(0)
 
 
 def test_the_clients_time_passes():

@@ -68,3 +68,18 @@ def test_a_far_position_lands_on_the_rim(surface):
     x, _, distance = surface.project(np.array([1000.0, 0.0, 0.0]))
     assert x[0] == pytest.approx(3.0)
     assert distance == pytest.approx(997.0, rel=1e-4)
+
+
+def test_curvature_is_that_of_a_ball_and_of_a_cylinder():
+    """Convex is positive; along the cylinder's axis there is none."""
+    for axis in (np.zeros(3), np.array([0.0, 1.0, 0.0])):
+        x, y = np.meshgrid(*2 * [np.linspace(-1.5, 1.5, 13)], indexing="ij")
+        z = np.sqrt(25.0 - x**2 - (0.0 if axis.any() else y**2))
+        vertices = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+        normals = vertices - np.outer(vertices @ axis, axis)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        ball = Surface(vertices, np.zeros((0, 3), np.int32), normals)
+        flat = np.einsum("ni,nj->nij", normals, normals) + np.outer(axis, axis)
+        expected = (np.eye(3) - flat) / 5.0
+        found = ball.curvature(1.0)[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)
+        assert np.abs(found - expected).max() < 2e-3

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from palpate.shared.mechanics.footprint import SurfaceQuadrature, footprint
+from palpate.shared.mechanics.footprint import MEANS, SurfaceQuadrature, footprint, means
 
 RADIUS = 2.0
 DISC = 8 / 15 * math.pi * RADIUS**2  # pi R^2 times the mean of (1 - rho^4)^2 over the disc
@@ -93,3 +93,27 @@ def test_load_fades_in_smoothly_over_the_rim():
     assert (np.diff(areas) >= 0).all()
     assert areas[0] == 0.0
     assert areas[-1] == pytest.approx(DISC, rel=1e-5)
+
+
+@pytest.mark.parametrize("x", [[5.0, 5.0, 0.0], [9.2, 5.3, 0.0]], ids=["inside", "at an edge"])
+def test_means_change_with_the_place_as_their_derivatives_say(x):
+    surface, normal = plane(), np.array([0.0, 0.0, 1.0])
+    tangents, flat = np.array([[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0]]), np.zeros((2, 2))
+    field = np.sin(surface.points[:, 0]) * np.cos(0.7 * surface.points[:, 1])
+
+    def found(shift=(0.0, 0.0)):
+        nodal = np.empty((MEANS, len(surface.points)))
+        means(surface, np.array(x) + shift @ tangents, normal, tangents, flat, RADIUS, nodal)
+        return nodal @ field
+
+    area, nodal = press(surface, x)
+    mean, one, two, *second = found(np.zeros(2))
+    assert mean == pytest.approx(nodal @ field / area, rel=1e-12)
+    h = 0.05
+    for axis, slope in ((0, one), (1, two)):
+        step = h * np.eye(2)[axis]
+        ahead, behind = found(step), found(-step)
+        assert slope == pytest.approx((ahead[0] - behind[0]) / (2 * h), abs=2e-3)
+        for other in (0, 1):
+            expected = (ahead[1 + other] - behind[1 + other]) / (2 * h)
+            assert second[axis + other] == pytest.approx(expected, abs=1e-2)

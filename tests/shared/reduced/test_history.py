@@ -245,34 +245,6 @@ def test_the_tangent_is_the_derivative_of_the_force_of_a_step(tip):
         assert np.abs(tangent[:, axis] - slope).max() <= 0.015 * np.abs(tangent).max()
 
 
-def test_a_search_cut_short_goes_on_where_it_ended(tip, atlas):
-    past, x = follow(tip, HOLD)[-1].past, tip.place(0.3, 1.0)
-    whole, warm = atlas.touch(x, past=past, dt=0.01), atlas.new_warm()
-    assert whole.iterations > 1
-    answer = atlas.touch(x, past=past, dt=0.01, warm=warm, most=1)
-    assert not answer.converged
-    assert answer.past is past
-    for _ in range(whole.iterations):
-        if not answer.converged:
-            warm.resume()
-            answer = atlas.touch(x, past=past, dt=0.01, warm=warm, most=1)
-    assert answer.converged
-    assert answer.past.time == past.time + 0.01
-    np.testing.assert_allclose(answer.force, whole.force, atol=1e-3 * np.abs(whole.force).max())
-
-
-def test_a_closed_path_costs_work(tip):
-    """In small steps, in, aside, out and back, at several speeds."""
-    ticks = np.linspace(0, 3, 61)
-    for dt in (1e-3, 1e-2, 0.1):
-        shares = np.interp(ticks, (0, 1, 2, 3), (-0.02, 0.8, 0.8, -0.02))
-        asides = np.interp(ticks, (0, 1, 2, 3), (0.0, 0.0, 0.8, 0.8))
-        answers = follow(tip, [(s, a, dt) for s, a in zip(shares, asides, strict=True)])
-        x, force = (np.array([getattr(a, name) for a in answers]) for name in ("position", "force"))
-        work = -np.sum((force[1:] + force[:-1]) / 2 * np.diff(x, axis=0), axis=1)
-        assert 0.02 * work[:20].sum() < work.sum() < work[work > 0].sum()
-
-
 # --- trust and refusals --------------------------------------------------------------------------
 
 
@@ -338,7 +310,7 @@ def test_what_is_wrong_is_named(tool, wrong, field):
 
 
 def test_deviatoric_stiffness_is_between_none_and_all(atlas):
-    for viscous in (atlas.models.viscous, atlas.models.viscous_tips):
+    for viscous in (atlas.models.viscous,):
         for D in viscous.deviatoric.astype(float):
             values = np.linalg.eigvalsh(D)
             assert values[0] > 0.0

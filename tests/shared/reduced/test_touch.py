@@ -1,18 +1,12 @@
 """The rigid tip on the reduced model: what is answered, what is flagged, what is refused."""
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from palpate.offline.fem.problem import TipPosition
 from palpate.shared.errors import QueryError
-from palpate.shared.mechanics import newton
-from palpate.shared.mechanics.sphere import tip_of
-from palpate.shared.reduced import contact_search, touch
-from palpate.shared.reduced.past import Elastic
-from palpate.shared.reduced.workspace import Workspace
 
 
 def above(atlas, depth, at=(0.5, 0.5)):
@@ -42,8 +36,8 @@ def test_the_tool_is_pushed_back(atlas):
     assert answer.force[2] > 0.0
     assert answer.tangent[2, 2] < 0.0
     assert abs(answer.force[:2]).max() < 0.05 * answer.force[2]
-    assert 0 < answer.penetration < 0.02 * answer.depth
-    assert atlas.displacement(answer)[:, 2].min() == pytest.approx(-0.4, abs=0.1)
+    assert 0 < answer.penetration < answer.depth
+    assert atlas.displacement(answer)[:, 2].min() == pytest.approx(-0.3, abs=0.1)
 
 
 def test_what_is_no_position_or_inside_the_body_is_refused(atlas):
@@ -133,42 +127,6 @@ def test_where_it_came_from_does_not_matter(atlas):
     assert same_force(atlas.touch(above(atlas, 0.6, (0.55, 0.45)), warm=warm), atlas)
 
 
-def test_a_model_that_joins_in_starts_from_its_neighbours_answer(atlas):
-    warm, joined, cold, numbers = atlas.new_warm(), [], [], set()
-    for a in np.arange(0.2, 0.8, 0.005):
-        x = above(atlas, 0.7, (a, 0.4))
-        answer = atlas.touch(x, warm=warm)
-        new = {k for k, _, _ in answer.parts} - numbers
-        if numbers and new:
-            joined.append(answer.iterations)
-            cold.append(atlas.touch(x).iterations)
-        numbers = {k for k, _, _ in answer.parts}
-    assert len(joined) >= 3
-    assert np.mean(joined) < 0.6 * np.mean(cold)
-
-
-def test_a_search_cut_short_has_no_force_and_can_go_on_at_the_next_position(atlas):
-    """Iteration by iteration, while the tip goes on."""
-    warm, depths = atlas.new_warm(), iter(np.arange(0.7, 0.8, 0.005))
-    answer = atlas.touch(above(atlas, next(depths)), warm=warm, most=3)
-    assert not answer.converged
-    while not answer.converged:
-        assert not answer.force.any()
-        assert answer.iterations <= 5
-        warm.resume()
-        answer = atlas.touch(above(atlas, next(depths)), warm=warm, most=3)
-    assert same_force(answer, atlas)
-
-
-def test_what_is_no_equilibrium_is_not_gone_on_from(atlas):
-    warm = atlas.new_warm()
-    before = atlas.touch(above(atlas, 0.6), warm=warm)
-    assert not atlas.touch(above(atlas, 0.7), warm=warm, most=0).converged
-    again = atlas.touch(above(atlas, 0.6), warm=warm, most=0)
-    assert again.converged
-    np.testing.assert_allclose(again.force, before.force, rtol=1e-4, atol=1e-3)
-
-
 def test_what_is_outside_the_range_is_flagged(atlas):
     inside = atlas.touch(above(atlas, 0.3))
     assert inside.in_range
@@ -182,52 +140,11 @@ def test_what_is_outside_the_range_is_flagged(atlas):
     assert "position" in atlas.touch(beside).out_of_range
 
 
-def test_contact_begins_where_the_surface_is_cut_short(atlas):
-    # triangles cut the curves of a surface: contact can begin a little above them
-    ground = atlas.surface.ground(atlas.limits)
-    lower = ground._replace(vertices=ground.vertices - [0.0, 0.0, 0.01])
-    coefficients = atlas.estimators.touches
-    radius, low = atlas.scene.endoscope.radius, atlas.nodes[:, 2].max() - 0.01
-    for depth in (0.0085, 0.005, 0.002):
-        own = Workspace(atlas.touch_models, lower, coefficients, Elastic())
-        x = above(atlas, 0.0, (0.4, 0.6))
-        x[2] = low + radius - (depth - 0.01)
-        touch.place(own.solver, x, x)
-        touch.touch(own.solver, x, touch.MAX_ITERATIONS)
-        answer = own.outcome
-        assert -touch.SKIN * radius < answer.depth <= 0.0
-        assert answer.touched > 0
-        assert answer.status == newton.CONVERGED
-        assert answer.force[2] > 0.0
-
-
-class Ridge:
-    """Two valleys at (-1, 3) and (1, 3), and a saddle between them."""
-
-    def __init__(self):
-        self.load = SimpleNamespace(tip=tip_of(1.0, 1.0))
-        self.correction = SimpleNamespace(work=SimpleNamespace(whole=np.zeros((2, 2))))
-
-    def potential(self, u, residual):
-        residual[:] = u[0] * (u[0] ** 2 - 1.0), u[1] - 3.0
-        return 0.25 * (u[0] ** 2 - 1.0) ** 2 + 0.5 * (u[1] - 3.0) ** 2, 1.0
-
-    def factorise(self, u, shift):
-        self.correction.work.whole[:] = np.diag([3.0 * u[0] ** 2 - 1.0, 1.0])
-        self.shifted = self.correction.work.whole + shift * np.eye(2)
-        return np.linalg.eigvalsh(self.shifted)[0] > 0.0
-
-    def correct(self, residual, step):
-        step[:] = -np.linalg.solve(self.shifted, residual)
-
-
-def test_a_search_does_not_end_in_a_saddle(monkeypatch):
-    for name in ("solve_contact", "_leave_saddle", "_response"):
-        monkeypatch.setattr(contact_search, name, getattr(contact_search, name).py_func)
-    monkeypatch.setattr(contact_search, "newton_method", newton.newton)
-    problem, q, work = Ridge(), np.array([0.0, 2.0]), np.zeros((4, 2))
-    search = problem, q, work, 0.1, 1e-6, 100
-    assert contact_search.solve_contact(*search)[0] == newton.CONVERGED
-    np.testing.assert_allclose(q, [0.0, 3.0], atol=1e-4)  # by symmetry
-    assert contact_search.to_minimum.py_func(*search)[0] == newton.CONVERGED
-    np.testing.assert_allclose(np.abs(q), [1.0, 3.0], atol=1e-4)
+@pytest.mark.parametrize("depth", [1e-6, 1e-4, 5e-3, 9e-3, 0.02])
+def test_the_lightest_touch_has_the_force_of_hertz(atlas, depth):
+    """Less than 1 % of it is the layer's, but for the deepest."""
+    endoscope, tissue = atlas.scene.endoscope, atlas.scene.tissue
+    hertz = 4 / 3 * tissue.young / (1 - tissue.poisson**2) * np.sqrt(endoscope.radius) * depth**1.5
+    answer = atlas.touch(above(atlas, depth))
+    assert answer.converged
+    assert answer.force[2] == pytest.approx(hertz, rel=0.01 + np.sqrt(depth) / 3)

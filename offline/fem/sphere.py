@@ -62,7 +62,7 @@ FORCE, STIFFNESS, CONVEX = 0.0, 1.0, 2.0
 """What is wanted of ``touch``; for integers the compiler would make a version of it each."""
 
 
-class Tip(NamedTuple):
+class Sphere(NamedTuple):
     """The tip and its penalty."""
 
     radius: float  # mm
@@ -70,7 +70,7 @@ class Tip(NamedTuple):
     onset: float  # mm
 
 
-class TipSurface(NamedTuple):
+class SphereSurface(NamedTuple):
     """Faces that a tip can touch, with b blocks of ``BLOCK`` integration points each."""
 
     nodes: Array  # (n, 3) mm, at rest
@@ -98,12 +98,12 @@ class Touching(NamedTuple):
     ends: Annotated[Array, "4, ends"]  # scratch: as ``gap``, of the corners of blocks
 
 
-def tip_of(radius: float, young: float) -> Tip:
+def sphere_of(radius: float, young: float) -> Sphere:
     """Tip of a radius (mm) for a tissue of Young's modulus ``young`` (kPa)."""
-    return Tip(radius, HARDNESS * young / radius, ONSET * radius)
+    return Sphere(radius, HARDNESS * young / radius, ONSET * radius)
 
 
-def tip_surface(nodes: Array, faces: Numbers, accessible: Flags, radius: float) -> TipSurface:
+def sphere_surface(nodes: Array, faces: Numbers, accessible: Flags, radius: float) -> SphereSurface:
     """Faces that a tip on the accessible ones can touch: those and their smooth continuation.
 
     Parameters
@@ -126,7 +126,7 @@ def tip_surface(nodes: Array, faces: Numbers, accessible: Flags, radius: float) 
     at_ends, _ = shape(reference, ends)
     placed = np.einsum("fai,qa->fqi", nodes[touched], at_ends)[:, corners]  # (f, b, 4, 3)
     diagonals = np.linalg.norm(placed[:, :, :2] - placed[:, :, 2:], axis=-1).max(axis=-1)
-    return TipSurface(
+    return SphereSurface(
         nodes=nodes,
         faces=np.ascontiguousarray(touched, dtype=np.int32),
         shape=np.ascontiguousarray(N.reshape(-1, BLOCK, N.shape[1]).transpose(0, 2, 1)),
@@ -187,7 +187,7 @@ def _with_smooth_neighbours(nodes: Array, faces: Numbers, accessible: Flags) -> 
     return np.flatnonzero(kept)
 
 
-def room_for(surface: TipSurface, f: int) -> Touching:
+def room_for(surface: SphereSurface, f: int) -> Touching:
     """Memory for what touches f faces of a surface."""
     k, ends = surface.corner_shape.shape
     return room(Touching, f=f, k=k, block=BLOCK, ends=ends)
@@ -251,7 +251,7 @@ def touch(tip, surface, near, x, moved, touching, wanted):
     Parameters
     ----------
     tip : Tip
-    surface : TipSurface
+    surface : SphereSurface
     near : ndarray, shape (s,), int32
         Faces to look at.
     x : ndarray, shape (3,), mm

@@ -3,21 +3,21 @@
 import numpy as np
 import pytest
 
-from palpate.shared.geometry.elements import QUAD8_NODES, QUAD_CORNERS
-from palpate.shared.mechanics.sphere import (
+from palpate.offline.fem.sphere import (
     FORCE,
     SPACING,
     STIFFNESS,
     penalty,
     room_for,
-    tip_of,
-    tip_surface,
+    sphere_of,
+    sphere_surface,
     touch,
 )
+from palpate.shared.geometry.elements import QUAD8_NODES, QUAD_CORNERS
 
-from .material_point import rotation
+from ...shared.mechanics.material_point import rotation
 
-TIP = tip_of(2.0, 15.0)
+TIP = sphere_of(2.0, 15.0)
 
 
 def plate(kind=8):
@@ -31,7 +31,7 @@ def plate(kind=8):
 
 
 def surface_of(nodes, faces):
-    return tip_surface(nodes, faces, np.ones(len(faces), bool), TIP.radius)
+    return sphere_surface(nodes, faces, np.ones(len(faces), bool), TIP.radius)
 
 
 def pressed(surface, x, moved, wanted=FORCE):
@@ -142,5 +142,5 @@ def test_the_surface_goes_on_round_a_blunt_edge_only(degrees, goes_on):
     bent, (x, _, z), angle = nodes.copy(), nodes.T, np.radians(degrees)
     bent[:, ::2] = np.where(x > 0, [x * np.cos(angle), -x * np.sin(angle)], [x, z]).T
     accessible = bent[faces].mean(axis=1)[:, 0] < 0
-    surface = tip_surface(bent, faces, accessible, TIP.radius)
+    surface = sphere_surface(bent, faces, accessible, TIP.radius)
     assert len(surface.faces) == (4 if goes_on else 2)
