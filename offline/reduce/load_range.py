@@ -270,8 +270,13 @@ def path_independent_share(model: ReducedModel, x: Array, turn: float = 0.0) -> 
 
 
 def _depends_on_way(model: ReducedModel, x: Array, share: float, turn: float) -> bool:
-    """Whether a tip that comes sliding finds another equilibrium than one pressed in."""
+    """Whether a tip that comes sliding finds another equilibrium than one pressed in, or that none.
+
+    A tip that is pressed in and finds none has slipped off.
+    """
     pressed = model.touch(Place.at(model, x).touch(share).position)
+    if not pressed.converged:
+        return True
     state = model.new_warm()
     for angle in turn + 2.0 * np.pi * np.arange(WAYS) / WAYS:
         state.forget()
@@ -331,7 +336,7 @@ GIVING_WAY = Search(
 )  # fmt: skip
 SLIPPING_OFF = Search(
     "slipping off", TIP_DEPTH, Stage.SLIPPING_OFF, _contact, path_independent_share,
-    first=2, closer=4, reach=1.0,
+    first=6, closer=8, reach=1.0,
 )  # fmt: skip
 
 SEARCHES = GIVING_WAY, SLIPPING_OFF
