@@ -63,7 +63,7 @@ MODEL, MODEL_AND_DOF = 0.35, 1.75e-4
 """Core seconds that training takes for a local model, and more for each degree of freedom; all
 stages shared out.  Measured on elastic scenes of 1900 to 7800 degrees of freedom, warm cache."""
 
-TIP, TIME = 3.0, 2.0
+TIP, TIME = 1.2, 2.0
 """How many times as long it takes for the rigid tip as well, and for visco-elastic tissue."""
 
 TRIAL_PATCHES = 8

@@ -107,17 +107,18 @@ class TipLoad:
     @property
     def size(self) -> float:
         """See ``DeadLoad``: about the force, which is not known beforehand."""
-        depth = min(max(self._penetration(0.0), 1e-6 * self.tip.radius), self.tip.radius)
+        depth = min(max(self._depth, 1e-6 * self.tip.radius), self.tip.radius)
         return self.tip.modulus * math.sqrt(self.tip.radius * depth) * depth
 
     def at(self, fraction: float) -> TipLoad:
         """See ``DeadLoad``; at 0 the tip is where it just does not touch the surface at rest."""
-        out = (1.0 - fraction) * max(self._penetration(0.0), 0.0)
+        out = (1.0 - fraction) * max(self._depth, 0.0)
         return replace(self, away=self.away + out * self.normal)
 
-    def _penetration(self, moved: Array | float) -> float:
-        """In a surface that has moved (3,) mm in the mean."""
-        return self.tip.radius - float(self.normal @ (self.away - moved))
+    @property
+    def _depth(self) -> float:
+        """In the surface at rest, mm."""
+        return self.tip.radius - float(self.normal @ self.away)
 
     def touch(self, displacement: Array) -> Touch:
         """What the tip does to a displacement (3 nodes,) mm."""
@@ -152,11 +153,8 @@ class TipLoad:
     ) -> tuple[Array, Array]:
         """See ``tip.settle``."""
         found, u = self.touch(displacement), displacement.reshape(-1, 3)
-        g, H, (one, both, two) = (
-            np.empty(SEEN),
-            np.empty((SEEN, SEEN)),
-            self.nodal[3:] @ u @ self.normal,
-        )
+        one, both, two = self.nodal[3:] @ u @ self.normal
+        g, H = np.empty(SEEN), np.empty((SEEN, SEEN))
         settle(
             compliance, force, stiffness, found.gap, self.normal, found.towards,
             self.tangents + self.nodal[1:3] @ u, np.array([[one, both], [both, two]]) - self.bent,

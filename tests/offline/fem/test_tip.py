@@ -8,6 +8,8 @@ from palpate.offline.fem.problem import FullProblem, TipPosition
 from palpate.offline.scenes import find_scene
 from palpate.shared.scene import parse_scene
 
+from .bodies import hertz_on_a_layer
+
 SLAB = """
 name = "slab"
 geometry.kind = "block"
@@ -25,19 +27,6 @@ load.max_indentation = 0.3
 """
 
 
-def hertz_on_a_layer(depth, radius=3.0, height=12.0, young=4.0, poisson=0.45):
-    """Hertz's force on a bonded layer (Dimitriadis et al., Biophys. J. 82 (2002) 2798, eq. 12)."""
-    a = -(1.2876 - 1.4678 * poisson + 1.3442 * poisson**2) / (1 - poisson)
-    b = (0.6387 - 1.0277 * poisson + 1.5164 * poisson**2) / (1 - poisson)
-    chi, pi = np.sqrt(radius * depth) / height, np.pi
-    layer = (
-        1 - 2 * a / pi * chi + 4 * a**2 / pi**2 * chi**2
-        - 8 / pi**3 * (a**3 + 4 * pi**2 / 15 * b) * chi**3
-        + 16 * a / pi**4 * (a**3 + 3 * pi**2 / 5 * b) * chi**4
-    )  # fmt: skip
-    return 4 / 3 * young / (1 - poisson**2) * np.sqrt(radius) * depth**1.5 * layer
-
-
 def over(problem, depth, aside=(0.0, 0.0)):
     """A tip in the middle of the top, or aside, so deep."""
     top = problem.mesh.nodes.max(axis=0)
@@ -49,7 +38,7 @@ def test_a_ball_on_a_layer_is_that_of_hertz_whatever_the_mesh():
     """Faces of 2.9 mm under a tip of 3 mm: the contact's radius is 0.4 to 1.1 mm."""
     problem, depths = FullProblem(parse_scene(SLAB)), np.array([0.05, 0.1, 0.2, 0.4])
     forces = [problem.solve(over(problem, depth)).force[2] for depth in depths]
-    theory = [hertz_on_a_layer(depth) for depth in depths]
+    theory = [hertz_on_a_layer(depth, radius=3.0, height=12.0, young=4.0) for depth in depths]
     np.testing.assert_allclose(forces, theory, rtol=0.012)
     slope = np.polyfit(np.log(depths), np.log(np.divide(forces, theory)), 1)[0]
     assert abs(slope) < 0.01
