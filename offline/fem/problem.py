@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from palpate.offline.fem.contact import SphereContact, SphereLoad
 from palpate.offline.fem.mesh import accessible_surface, build_mesh
@@ -33,6 +34,10 @@ from palpate.shared.mechanics.tip import (
 )
 from palpate.shared.mechanics.viscosity import step_weights
 from palpate.shared.scene import Scene, parse_scene
+
+CLAMPED_LAYER = 1.5
+"""Millimetres from the support within which stress is not compared: at its edges it has no limit,
+and grows with every refinement of the mesh."""
 
 MOST_PLACES = 24
 """Rounds in which the tip finds the place it touches; from the eighth on its steps are halved."""
@@ -101,11 +106,10 @@ class FullProblem:
 
     @cached_property
     def beyond_clamped_layer(self) -> Flags:
-        """Nodes of no element that touches the support, (n,)."""
-        layer = self.mesh.elements[self.mesh.clamped[self.mesh.elements].any(axis=1)]
-        outside = np.ones(len(self.mesh.nodes), dtype=bool)
-        outside[layer] = False
-        return outside
+        """Nodes farther from the support than ``CLAMPED_LAYER``, (n,)."""
+        nodes = self.mesh.nodes
+        distance, _ = cKDTree(nodes[self.mesh.clamped]).query(nodes)
+        return np.asarray(distance > CLAMPED_LAYER)
 
     # --- loads ---------------------------------------------------------------------------------
 
