@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from palpate.shared.arrays import Array
+from palpate.shared.near_field import Contact
 from palpate.shared.reduced.transfer import Local, Past
 
 
@@ -48,6 +49,7 @@ class Answer(NamedTuple):
     depth: float = 0.0  # mm, of the tip in the undeformed surface; negative away from it
     penetration: float = 0.0  # mm, of the tip in the deformed surface as a footprint sees it
     energy: float = 0.0  # mN mm, in tissue and contact; with a past, the potential of the step
+    footprint: Contact | None = None  # that presses, of a tip the one of its force
     time: float = 0.0  # s, since rest, of tissue with a past
     past: Past | None = None  # to go on from; the one before if this answer did not converge
     active: tuple[tuple[int, float, Local], ...] = ()  # with a past: local models and theirs

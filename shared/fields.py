@@ -9,6 +9,7 @@ from palpate.shared.arrays import Array, Field
 from palpate.shared.geometry.quadrature import stress_recovery
 from palpate.shared.local_models import Body, LocalModels
 from palpate.shared.mechanics.stress import nodal_von_mises, remember
+from palpate.shared.near_field import NearFields
 from palpate.shared.reduced.points import expand
 from palpate.shared.reduced.transfer import Transfer
 
@@ -30,6 +31,7 @@ class FieldRecovery:
         self._transfer = transfer
         self._recovery = stress_recovery(body.nodes, body.elements, body.law, precision=np.float32)
         self._stress = np.zeros(len(body.nodes))
+        self._near = NearFields(body)
 
     def coefficients(self, answer: Answer) -> dict[int, Field]:
         """Displacement as coefficients (M,) in the basis of each region that takes part."""
@@ -60,7 +62,8 @@ class FieldRecovery:
     def von_mises(self, answer: Answer, displacement: Field) -> Field:
         """Nodal von Mises stress (n,) kPa of an answer with this displacement of all nodes."""
         B = None if answer.past is None else self._remembered(answer)
-        nodal_von_mises(self._recovery, displacement, B, self._stress)
+        near = self._near.of(answer.footprint)
+        nodal_von_mises(self._recovery, displacement, B, near, self._stress)
         # an answer that did not converge may be beyond single precision
         with np.errstate(over="ignore"):
             return self._stress.astype(np.float32)

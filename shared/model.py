@@ -19,10 +19,12 @@ from palpate.shared.fields import FieldRecovery
 from palpate.shared.geometry.surface import Surface, SurfaceIndex, boundary_triangles
 from palpate.shared.local_models import Body, Estimators, LocalModels
 from palpate.shared.mechanics import newton
-from palpate.shared.mechanics.footprint import TIP_DEPTH
+from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH
 from palpate.shared.mechanics.tip import CURVED_WITHIN, dented, held
+from palpate.shared.near_field import Contact
 from palpate.shared.query import check_place, checked_load, out_of_range, vector
 from palpate.shared.reduced import press, touch
+from palpate.shared.reduced.outcome import Outcome
 from palpate.shared.reduced.past import Elastic, Remembering
 from palpate.shared.reduced.transfer import LeftBehind, Local, Past, Transfer, estimate_history
 from palpate.shared.reduced.workspace import Warm, Workspace
@@ -274,6 +276,7 @@ class ReducedModel:
             residual=found.residual.item(),
             contact_displacement=found.displacement.copy(),
             contact=pressure > 0.0,
+            footprint=_footprint(found, radius) if pressure > 0.0 else None,
             time=0.0 if past is None else past.time + dt,
             past=after if converged else past,
             active=active,
@@ -372,6 +375,7 @@ class ReducedModel:
             tip=True,
             position=at,
             contact=touched,
+            footprint=_footprint(found, radius) if touched else None,
             tangent=found.tangent.copy(),
             depth=depth,
             penetration=found.penetration.item(),
@@ -408,6 +412,17 @@ class ReducedModel:
             displacement = self.fields.displacement(answer)
         stress = self.fields.von_mises(answer, displacement)
         return stress if region == "all" else stress[self.surface_nodes]
+
+
+def _footprint(found: Outcome, radius: float) -> Contact:
+    """What presses in an outcome."""
+    return Contact(
+        found.foot.copy(),
+        found.upward.copy(),
+        found.limits[LIMIT_FIELDS:].copy(),
+        found.force / -found.area.item(),
+        radius,
+    )
 
 
 def _in_time(

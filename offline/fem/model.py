@@ -68,6 +68,7 @@ class Equilibrium:
     tangent: Array
     penetration: float
     place: Place | None
+    foot: Array | None = None  # (3,) mm, where a tip touches the surface at rest
 
 
 @dataclass

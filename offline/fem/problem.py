@@ -33,6 +33,7 @@ from palpate.shared.mechanics.tip import (
     tip_of,
 )
 from palpate.shared.mechanics.viscosity import step_weights
+from palpate.shared.near_field import Contact, NearFields
 from palpate.shared.scene import Scene, parse_scene
 
 CLAMPED_LAYER = 1.5
@@ -221,7 +222,7 @@ class FullProblem:
             largest = max(largest, float(np.linalg.norm(force)))
             slight = largest < SLIGHT * self.body.tip.modulus * radius**2
             if slight or max(np.linalg.norm(moved) / radius, np.linalg.norm(turned)) < NEAREST:
-                return replace(found, tangent=found.place.tangent(barred))
+                return replace(found, tangent=found.place.tangent(barred), foot=x)
             wall, last = barred @ load.tangents, (x, normal)
             normal, start = normal + turned, found.displacement
         raise NoEquilibrium("load: the tip finds no place to touch; lower the depth")
@@ -257,7 +258,9 @@ class FullProblem:
         displacement = self.model.solve(np.outer(nodal, traction), start=start).displacement
         return displacement, nodal @ displacement / nodal.sum()
 
-    def reference(self, steps: Sequence[Step], start: Array | None = None) -> Reference | None:
+    def reference(
+        self, steps: Sequence[Step], start: Array | None = None, near_field: bool = True
+    ) -> Reference | None:
         """What a reduced model is compared with, None where there is no equilibrium.
 
         The first solution is sought from a guess ``start`` (n, 3) mm.
@@ -269,7 +272,9 @@ class FullProblem:
             except NoEquilibrium:
                 return None
             u, past, start = found.displacement, found.past, None
-            fields = u.astype(np.float32), self.von_mises(u, past).astype(np.float32)
+            contact = self.footprint(step, found) if near_field else None
+            stress = self.von_mises(u, past, contact)
+            fields = u.astype(np.float32), stress.astype(np.float32)
             rows.append((*fields, found.force, found.tangent))
         return Reference(*(np.array(part) for part in zip(*rows, strict=True)))
 
@@ -277,14 +282,35 @@ class FullProblem:
     def _recovery(self) -> StressRecovery:
         return stress_recovery(self.mesh.nodes, self.mesh.elements, self.model.law)
 
-    def von_mises(self, displacement: Array, past: Past | None = None) -> Array:
-        """Nodal von Mises stress (n,) kPa at a displacement (n, 3) mm, with which a past ends."""
+    @cached_property
+    def _near(self) -> NearFields:
+        return NearFields(self.body)
+
+    def footprint(self, step: Step, found: Equilibrium | None = None) -> Contact | None:
+        """What presses in a step; of the tip, by the force in what was found."""
+        radius = self.scene.endoscope.radius
+        if isinstance(step, Load):
+            x, normal, _, curvature = self.surface.locate(step.position, self._curvature)
+            return Contact(x, normal, curvature, step.pressure * step.direction, radius)
+        if found is None or found.foot is None:
+            return None
+        x, normal, _, curvature = self.surface.locate(found.foot, self._curvature)
+        pressure = found.force / -self.unit_load_at(x, normal).sum()
+        return Contact(x, normal, curvature, pressure, radius)
+
+    def von_mises(
+        self, displacement: Array, past: Past | None = None, contact: Contact | None = None
+    ) -> Array:
+        """Nodal von Mises stress (n,) kPa at a displacement (n, 3) mm, with which a past ends.
+
+        With the near field of a contact, if that is given.
+        """
         out, u = np.zeros(len(self.mesh.nodes)), np.ascontiguousarray(displacement, dtype=float)
         B = None
         if past is not None and self.model.prony:
             shares = np.array([share for share, _ in self.model.prony])
             B = np.ascontiguousarray(np.einsum("a,aeqi->eiq", shares, past.points[:-1]))
-        nodal_von_mises(self._recovery, u, B, out)
+        nodal_von_mises(self._recovery, u, B, self._near.of(contact), out)
         return out
 
     def under(self, position: Array, displacement: Array) -> Array:

@@ -72,7 +72,7 @@ class Shipped(Method):
         return self._atlas.displacement(state).astype(float)
 
     def von_mises(self, state: Found | None) -> Array:
-        """See ``Method``."""
+        """See ``Method``; as of all others without the near field, which is the same for all."""
         if state is None:
             return np.zeros(len(self._atlas.nodes))
-        return self._atlas.von_mises(state).astype(float)
+        return self._atlas.von_mises(state._replace(footprint=None)).astype(float)

@@ -24,7 +24,10 @@ from palpate.shared.scene import Scene, parse_scene
 
 
 class Fields(NamedTuple):
-    """Displacements and von Mises stresses at the moments of a history."""
+    """Displacements and von Mises stresses at the moments of a history.
+
+    Stresses are without the near field of a contact, which is the same for all methods.
+    """
 
     displacements: NDArray[Any]  # (t, n, 3) mm
     stresses: NDArray[Any]  # (t, n) kPa
@@ -105,7 +108,8 @@ def followed(problem: FullProblem, steps: Steps, tip: bool = False) -> Fields | 
     The steps are of one contact each, which tells the centre of the rigid tip if that presses.
     """
     contacts = [replace(case.contacts[0], dt=dt) for case, dt in steps]
-    found = problem.reference([TipPosition(x.position, x.dt) if tip else x for x in contacts])
+    asked = [TipPosition(x.position, x.dt) if tip else x for x in contacts]
+    found = problem.reference(asked, near_field=False)
     return None if found is None else Fields(found.u, found.s)
 
 

@@ -75,22 +75,19 @@ def surface_quadrature(
 def stress_recovery(
     nodes: Array, elements: Numbers, law: Law, precision: type = np.float64
 ) -> StressRecovery:
-    """Recovery of nodal stresses from 2x2x2 points per element; law (e,)."""
+    """Recovery of nodal stresses from 2x2x2 points per element of one tissue; law (e,)."""
     gradients, _ = volume_quadrature(nodes, elements, 2)
     at, _ = gauss(2, 3)
     to_points, _ = shape(HEX_CORNERS, at)
-    corners = elements[:, :8]
-    midsides = np.empty((0, 3), np.int32)
-    if elements.shape[1] == 20:
-        edges = np.array(HEX_EDGES)
-        ends = corners[:, edges].reshape(-1, 2)
-        midsides = np.unique(np.column_stack([elements[:, 8:].reshape(-1), ends]), axis=0)
-        midsides = midsides[np.unique(midsides[:, 0], return_index=True)[1]]
+    to_corners: Array = np.linalg.inv(to_points).astype(float)
+    at_corners = np.einsum("cq,eqni->enic", to_corners, gradients)
+    count = np.bincount(elements.ravel(), minlength=len(nodes))
     return StressRecovery(
         connectivity=np.ascontiguousarray(elements, dtype=np.int32),
-        gradients=np.ascontiguousarray(np.moveaxis(gradients, 1, 3), dtype=precision),
-        extrapolation=np.linalg.inv(to_points).astype(np.float64),
-        law=law,
-        elements_at=np.bincount(corners.ravel(), minlength=len(nodes)).astype(float),
-        midsides=midsides.astype(np.int32),
+        gradients=np.ascontiguousarray(at_corners, dtype=precision),
+        to_points=to_points,
+        to_corners=to_corners,
+        edges=np.array(HEX_EDGES[: elements.shape[1] - 8], np.int32).reshape(-1, 2),
+        law=law.at(np.zeros(len(nodes), int)),
+        elements_at=np.maximum(count, 1).astype(precision),
     )

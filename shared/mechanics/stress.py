@@ -1,8 +1,9 @@
 """Von Mises stress at the nodes, recovered from the displacement.
 
-The equivalent stress is taken at the Gauss points, where it converges fastest, extrapolated to the
-corners of each element by the trilinear field through its 2x2x2 points, averaged over the elements
-that share a corner, and interpolated to midside nodes.
+Its gradients are taken at the Gauss points, where they converge fastest, carried to the nodes of
+each element by the trilinear field through its 2x2x2 points, and averaged over the elements that
+share a node.  The law makes a stress of what comes out.  Under a contact the gradients recovered
+are those that a near field leaves of the displacement; see ``shared.near_field``.
 """
 
 from typing import NamedTuple
@@ -11,15 +12,17 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from palpate.shared.arrays import Array, Numbers
+from palpate.shared.arrays import Array, Ints, Numbers
 from palpate.shared.mechanics import laws, viscosity
 from palpate.shared.mechanics.tensors import (
     FAST,
     add_identity,
     add_to_packed,
+    constant,
     load,
     load_packed,
     packed,
+    scale,
     trace,
     twice_deviator,
     unpacked,
@@ -28,48 +31,61 @@ from palpate.shared.mechanics.tissue import Law
 
 
 class StressRecovery(NamedTuple):
-    """What recovery needs of a mesh: 2x2x2 points per element."""
+    """What recovery needs of a mesh: 2x2x2 points per element, point index last."""
 
     connectivity: Numbers  # (e, n)
-    gradients: NDArray[np.floating]  # (e, n, 3, 8) 1/mm: point index last, for vector arithmetic
-    extrapolation: Array  # (8, 8) corner from point
-    law: Law  # (e,)
-    elements_at: Array  # (nodes,) number of elements that share a corner node
-    midsides: Numbers  # (k, 3) midside node and the corners either side of it
+    gradients: NDArray[np.floating]  # (e, n, 3, 8) 1/mm: carried from the points to the corners
+    to_points: NDArray[np.floating]  # (8, 8) value at a point from those at the corners
+    to_corners: Array  # (8, 8) and its inverse
+    edges: Numbers  # (n - 8, 2) corners either side of a midside node
+    law: Law  # (nodes,)
+    elements_at: NDArray[np.floating]  # (nodes,) number of elements that share a node
+
+
+class NearField(NamedTuple):
+    """A displacement that a mesh does not follow, at the nodes that it reaches."""
+
+    nodes: Ints  # (k,)
+    displacement: Array  # (k, 3) mm
+    gradient: Array  # (k, 3, 3)
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def nodal_von_mises(mesh, u, B, out):
+def nodal_von_mises(mesh, u, B, near, out):
     """Write the von Mises stress (nodes,) kPa of the displacement ``u`` (nodes, 3) mm to ``out``.
 
-    ``B`` (e, 6, 8) is that of ``mechanics.viscosity``, point index last; None without a past.
-    Displacement gradients are summed in the precision of ``mesh.gradients``, which ``u`` shares.
-    Never negative: extrapolation may undershoot near steep gradients, which is cut at zero.
+    ``B`` (e, 6, 8) is that of ``mechanics.viscosity`` at the points; None without a past.  ``near``
+    is a part of ``u``.  Gradients are summed in the precision of ``mesh.gradients``, which ``u``
+    shares.
     """
+    count, own = len(out), u.copy()
+    sums, H = np.zeros(9 * count, mesh.gradients.dtype), np.empty(72, mesh.gradients.dtype)
+    for k in range(len(near.nodes)):
+        for i in range(3):
+            own[near.nodes[k], i] -= near.displacement[k, i]
     flat = mesh.gradients.reshape(len(mesh.connectivity), -1)
-    H, at_points = np.empty(72, flat.dtype), np.empty(8)
-    out[:] = 0.0
     for e in range(len(mesh.connectivity)):
-        _gradients(mesh.connectivity[e], flat[e], u, H)
-        law = mesh.law.at(e)
-        if B is None:
-            for q in range(8):
-                at_points[q] = laws.von_mises(law, add_identity(load(H, q, 8), 1.0))
-        else:
-            b = B[e].reshape(-1)
-            for q in range(8):
-                past = unpacked(load_packed(b, q, 8))
-                at_points[q] = viscosity.von_mises(law, add_identity(load(H, q, 8), 1.0), past)
-        for corner in range(8):
-            value = 0.0
-            for q in range(8):
-                value += mesh.extrapolation[corner, q] * at_points[q]
-            out[mesh.connectivity[e, corner]] += max(value, 0.0)
-    for node in range(len(mesh.elements_at)):
-        if mesh.elements_at[node] > 0.0:
-            out[node] /= mesh.elements_at[node]
-    for k in range(len(mesh.midsides)):
-        out[mesh.midsides[k, 0]] = 0.5 * (out[mesh.midsides[k, 1]] + out[mesh.midsides[k, 2]])
+        _gradients(mesh.connectivity[e], flat[e], own, H)
+        _add_to_nodes(mesh, e, H, sums)
+    for k in range(len(near.nodes)):
+        node = near.nodes[k]
+        for i in range(9):
+            added = near.gradient[k, i // 3, i % 3] * mesh.elements_at[node]
+            sums[i * count + node] += added
+    if B is None:
+        for n in range(count):
+            F = add_identity(scale(1.0 / mesh.elements_at[n], load(sums, n, count)), 1.0)
+            out[n] = laws.von_mises(mesh.law.at(n), F)
+    else:
+        past, corners = np.zeros(6 * count), np.empty(48)
+        for e in range(len(mesh.connectivity)):
+            _carry(mesh.to_corners, B[e].reshape(-1), corners)
+            _add_to_nodes(mesh, e, corners, past)
+        for n in range(count):
+            share = 1.0 / mesh.elements_at[n]
+            F = add_identity(scale(share, load(sums, n, count)), 1.0)
+            mean = scale(share, unpacked(load_packed(past, n, count)))
+            out[n] = viscosity.von_mises(mesh.law.at(n), F, mean)
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
@@ -80,9 +96,10 @@ def remember(mesh, u, share, B):
     linear part of a small displacement that stands for all shares; point index last.
     """
     flat = mesh.gradients.reshape(len(mesh.connectivity), -1)
-    H = np.empty(72)
+    H, corners = np.empty(72), np.empty(72)
     for e in range(len(mesh.connectivity)):
-        _gradients(mesh.connectivity[e], flat[e], u, H)
+        _gradients(mesh.connectivity[e], flat[e], u, corners)
+        _carry(mesh.to_points, corners, H)
         b = B[e].reshape(-1)
         for q in range(8):
             G = load(H, q, 8)
@@ -94,7 +111,7 @@ def remember(mesh, u, share, B):
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
 def _gradients(connectivity, flat, u, H):
-    """Displacement gradients (72,) at the points of an element."""
+    """Displacement gradients (72,) at the corners of an element."""
     H[:] = 0.0
     for a in range(len(connectivity)):
         node = connectivity[a]
@@ -104,3 +121,28 @@ def _gradients(connectivity, flat, u, H):
             H[k] += x * gradients[k]
             H[24 + k] += y * gradients[k]
             H[48 + k] += z * gradients[k]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def _carry(matrix, values, out):
+    """Carry components (8 k,) from corners to points of an element, or back."""
+    for k in range(0, len(values), 8):
+        for q in range(8):
+            total = 0.0
+            for c in range(8):
+                total += matrix[q, c] * values[k + c]
+            out[k + q] = total
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def _add_to_nodes(mesh, e, corners, sums):
+    """Add components (8 k,) at the corners of an element, and half-way, to sums (k nodes,)."""
+    nodes, edges, count = mesh.connectivity[e], mesh.edges, len(mesh.elements_at)
+    half = constant(0.5, corners[0])
+    for k in range(len(corners) // 8):
+        # unsigned numbers need no check whether they count from the end
+        for c in range(8):
+            sums[np.uint64(k * count + nodes[c])] += corners[8 * k + c]
+        for m in range(len(edges)):
+            both = corners[8 * k + edges[m, 0]] + corners[8 * k + edges[m, 1]]
+            sums[np.uint64(k * count + nodes[8 + m])] += half * both

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from palpate.shared.geometry.elements import HEX20_NODES, HEX_CORNERS, HEX_EDGES
-from palpate.shared.geometry.quadrature import stress_recovery
+from palpate.shared.geometry.elements import HEX20_NODES, HEX_CORNERS, HEX_EDGES, gauss, shape
+from palpate.shared.geometry.quadrature import stress_recovery, volume_quadrature
 from palpate.shared.mechanics.laws import von_mises
 from palpate.shared.mechanics.neo_hookean import NeoHookean
-from palpate.shared.mechanics.stress import nodal_von_mises
+from palpate.shared.mechanics.stress import NearField, nodal_von_mises
 from palpate.shared.mechanics.tissue import lame
+from palpate.shared.near_field import NO_CONTACT
 
 from .material_point import rotation
 
@@ -29,11 +30,11 @@ def pair(reference, rng):
     return nodes, elements.astype(np.int32)
 
 
-def recovered(nodes, elements, u):
+def recovered(nodes, elements, u, near=NO_CONTACT):
     law = NeoHookean(*(np.full(len(elements), value) for value in LAW))
     mesh = stress_recovery(nodes, elements, law)
     out = np.full(len(nodes), np.nan)
-    nodal_von_mises(mesh, u, None, out)
+    nodal_von_mises(mesh, u, None, near, out)
     return out
 
 
@@ -57,9 +58,26 @@ def test_rest_and_rotation_are_free_of_stress(reference, rng):
     assert np.abs(recovered(nodes, elements, nodes @ (Q - np.eye(3)).T)).max() < 1e-11
 
 
-def test_midside_nodes_take_the_mean_of_their_corners(rng):
-    nodes, elements = pair(HEX20_NODES, rng)
-    stress = recovered(nodes, elements, 0.05 * rng.standard_normal(nodes.shape))
-    ends = elements[:, np.array(HEX_EDGES)]
-    np.testing.assert_allclose(stress[elements[:, 8:]], stress[ends].mean(axis=2), rtol=1e-13)
-    assert (stress >= 0).all()
+def test_gradients_are_carried_from_the_points_to_every_node(reference, rng):
+    nodes, elements = pair(reference, rng)
+    u = 0.05 * rng.standard_normal(nodes.shape)
+    gradients, _ = volume_quadrature(nodes, elements, 2)
+    at_points = np.einsum("eqai,eaj->eqji", gradients, u[elements])
+    points, _ = gauss(2, 3)
+    linear, _ = shape(HEX_CORNERS, points)
+    carried, _ = shape(HEX_CORNERS, reference)
+    H = np.zeros((len(nodes), 3, 3))
+    np.add.at(H, elements, np.einsum("aq,eqij->eaij", carried @ np.linalg.inv(linear), at_points))
+    H /= np.bincount(elements.ravel())[:, None, None]
+    expected = [von_mises(LAW, tuple((np.eye(3) + own).ravel())) for own in H]
+    np.testing.assert_allclose(recovered(nodes, elements, u), expected, rtol=1e-10)
+
+
+def test_what_a_near_field_takes_away_it_gives_back(reference, rng):
+    """A linear field is the same, whether elements recover it or the near field knows it."""
+    nodes, elements = pair(reference, rng)
+    H = rng.uniform(-0.2, 0.2, (3, 3))
+    u = nodes @ H.T
+    near = NearField(np.arange(len(nodes)), 0.3 * u, np.tile(0.3 * H, (len(nodes), 1, 1)))
+    expected = von_mises(LAW, tuple((np.eye(3) + H).ravel()))
+    np.testing.assert_allclose(recovered(nodes, elements, u, near), expected, rtol=1e-11)

@@ -1,0 +1,121 @@
+"""Near field of a contact: what a mesh cannot follow of what happens right under the endoscope.
+
+Under a footprint the gradients of the displacement change within a fraction of its radius, less
+than an element.  What becomes of them is known in linear elasticity: the local field of a
+half-space (``mechanics.half_space``), bent to the curvature of the surface.  What a mesh makes of
+that field is nearly its interpolant.  So the interpolant is taken off the displacement of the
+nodes, gradients are recovered from what is left, which is smooth, and those of the local field are
+added.
+
+Moduli are those of tissue at once, also where the past has relaxed it: the stress that is added is
+then right, as it hardly depends on them, with the past ``B`` that the mesh has.
+"""
+
+import math
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from palpate.shared.arrays import Array
+from palpate.shared.local_models import Body
+from palpate.shared.mechanics.half_space import ABOVE, REACH, local_field, pressed
+from palpate.shared.mechanics.stress import NearField
+from palpate.shared.mechanics.tip import bend, tangents_of
+
+
+class Contact(NamedTuple):
+    """A footprint as it presses."""
+
+    place: Array  # (3,) mm, on the surface at rest
+    normal: Array  # (3,) outward there
+    curvature: Array  # (6,) 1/mm there, see ``Surface.curvature``
+    traction: Array  # (3,) kPa, on the tissue at the footprint's centre
+    radius: float  # mm
+
+
+NO_CONTACT = NearField(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+
+
+class NearFields:
+    """Near fields of a body, whose tissue is the same everywhere."""
+
+    def __init__(self, body: Body) -> None:
+        self._nodes = body.nodes
+        self._mu, self._lam = float(body.law.mu[0]), float(body.law.lam[0])
+
+    @cached_property
+    def _table(self) -> Array:
+        return local_field(0.5 * self._lam / (self._lam + self._mu))
+
+    def of(self, contact: Contact | None) -> NearField:
+        """Near field of a contact, if there is one."""
+        if contact is None:
+            return NO_CONTACT
+        n = len(self._nodes)
+        field = NearField(np.empty(n, np.int64), np.empty((n, 3)), np.empty((n, 3, 3)))
+        count = near_field(self._table, self._nodes, contact, 0.5 / self._mu, *field)
+        nodes, displacement, gradient = field
+        return NearField(nodes[:count], displacement[:count], gradient[:count])
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def near_field(table, nodes, contact, softness, numbers, displacement, gradient):
+    """Write the near field at the nodes (n, 3) mm it reaches; return how many these are.
+
+    Parameters
+    ----------
+    table : ndarray
+        See ``half_space.local_field``.
+    contact : Contact
+    softness : float, 1/kPa
+        ``1 / 2 mu``.
+    numbers, displacement, gradient : ndarray, shape (n,), (n, 3) mm, (n, 3, 3), out
+        The first so many are written.
+    """
+    radius, normal, traction = contact.radius, contact.normal, contact.traction
+    Q, bent, away = np.empty((3, 3)), np.empty((2, 2)), np.empty(3)
+    u, H = np.empty(3), np.empty((3, 3))
+    tangents_of(normal, Q[:2])
+    into = -np.dot(traction, normal)
+    shear = traction + into * normal
+    along = math.sqrt(np.dot(shear, shear))
+    if along > 1e-9 * abs(into):
+        Q[0] = shear / along
+    Q[2] = -normal
+    Q[1] = np.cross(Q[2], Q[0])
+    bend(contact.curvature, Q[:2], radius, bent)
+    count = 0
+    for node in range(len(nodes)):
+        far = 0.0
+        for i in range(3):
+            away[i] = (nodes[node, i] - contact.place[i]) / radius
+            far += away[i] ** 2
+        if far > 2.0 * REACH**2:
+            continue
+        x = y = z = 0.0
+        for i in range(3):
+            x += Q[0, i] * away[i]
+            y += Q[1, i] * away[i]
+            z += Q[2, i] * away[i]
+        # the surface falls away where it is convex
+        a = radius * (bent[0, 0] * x + bent[0, 1] * y)
+        b = radius * (bent[1, 0] * x + bent[1, 1] * y)
+        z -= 0.5 * (a * x + b * y)
+        if x * x + y * y > REACH**2 or z > REACH or z < -ABOVE:
+            continue
+        pressed(table, x, y, z, into, along, u, H)
+        numbers[count] = node
+        for i in range(3):
+            # of the gradient in the half-space's own coordinates, row i
+            p = Q[0, i] * H[0, 0] + Q[1, i] * H[1, 0] + Q[2, i] * H[2, 0]
+            q = Q[0, i] * H[0, 1] + Q[1, i] * H[1, 1] + Q[2, i] * H[2, 1]
+            r = Q[0, i] * H[0, 2] + Q[1, i] * H[1, 2] + Q[2, i] * H[2, 2]
+            p, q = softness * (p - a * r), softness * (q - b * r)
+            moved = Q[0, i] * u[0] + Q[1, i] * u[1] + Q[2, i] * u[2]
+            displacement[count, i] = softness * radius * moved
+            for j in range(3):
+                gradient[count, i, j] = p * Q[0, j] + q * Q[1, j] + softness * r * Q[2, j]
+        count += 1
+    return count

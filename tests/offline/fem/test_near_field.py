@@ -1,0 +1,78 @@
+"""Stress under a contact on a coarse mesh, with the near field, beside a fine one."""
+
+import numpy as np
+import pytest
+
+from palpate.offline.fem.problem import FullProblem, Load, TipPosition
+from palpate.offline.scenes import find_scene
+from palpate.shared.near_field import NearFields
+
+PLACE, UP = np.array([5.6, 4.7, 8.0]), np.array([0.0, 0.0, 1.0])
+DOWN, TILTED = [0.0, 0.0, -1.0], [0.48, 0.0, -0.877268]
+
+
+def block(*divisions):
+    scene = find_scene("quick")
+    geometry = scene.geometry.model_copy(update={"divisions": divisions})
+    return FullProblem(scene.model_copy(update={"geometry": geometry}))
+
+
+@pytest.fixture(scope="module")
+def coarse():
+    return block(4, 4, 3)
+
+
+@pytest.fixture(scope="module")
+def fine():
+    return block(16, 16, 12)
+
+
+@pytest.mark.parametrize("direction", [DOWN, TILTED], ids=["pressed", "tilted"])
+def test_it_brings_a_coarse_mesh_nearer_to_a_fine_one(coarse, fine, direction):
+    load = Load(PLACE, np.array(direction), 1.5)
+    exact = fine.von_mises(fine.solve(load).displacement, contact=fine.footprint(load))
+    u = coarse.solve(load).displacement
+    at = np.linalg.norm(coarse.mesh.nodes - PLACE, axis=1) < 4.0
+    same = [
+        np.argmin(np.linalg.norm(fine.mesh.nodes - node, axis=1)) for node in coarse.mesh.nodes[at]
+    ]
+
+    def error(contact):
+        off = coarse.von_mises(u, contact=contact)[at] - exact[same]
+        return np.linalg.norm(off) / np.linalg.norm(exact[same])
+
+    assert error(coarse.footprint(load)) < 0.6 * error(None)
+    assert error(coarse.footprint(load)) < 0.3
+
+
+def test_a_fine_mesh_hardly_needs_it(fine):
+    load = Load(PLACE, np.array(DOWN), 1.5)
+    u = fine.solve(load).displacement
+    own, whole = fine.von_mises(u), fine.von_mises(u, contact=fine.footprint(load))
+    assert np.linalg.norm(own - whole) < 0.07 * np.linalg.norm(whole)
+
+
+def test_it_ends_at_its_reach_and_is_the_gradient_of_its_displacement(coarse):
+    contact = coarse.footprint(Load(PLACE, np.array(TILTED), 1.5))
+    contact = contact._replace(curvature=np.array([0.1, -0.05, 0.0, 0.02, 0.0, 0.0]))
+    points = PLACE + np.array([[0.7, 0.4, -0.6], [-1.5, 1.0, -1.5], [0.0, 0.0, -3.0]])
+    step, shifted = 0.05, [points]
+    for away in step * np.eye(3):
+        shifted += [points + away, points - away]
+    fields = NearFields(coarse.body)
+    fields._nodes = np.vstack([*shifted, [[5.6, 4.7, 1.0], [0.0, 0.0, 8.0]]])
+    found = fields.of(contact)
+    assert list(found.nodes) == list(range(21))
+    u = found.displacement.reshape(7, 3, 3)
+    numeric = np.stack([u[1] - u[2], u[3] - u[4], u[5] - u[6]], axis=2) / (2 * step)
+    scale = np.abs(found.gradient[:3]).max()
+    np.testing.assert_allclose(found.gradient[:3], numeric, atol=0.02 * scale)
+
+
+def test_under_a_tip_it_is_that_of_its_force(coarse):
+    step = TipPosition(PLACE + 1.7 * UP)
+    found = coarse.solve(step)
+    contact = coarse.footprint(step, found)
+    nodal = coarse.unit_load_at(contact.place, contact.normal)
+    np.testing.assert_allclose(contact.traction * nodal.sum(), -found.force, rtol=1e-12)
+    assert coarse.footprint(TipPosition(PLACE + 2.1 * UP)) is None
