@@ -6,12 +6,10 @@ import numpy as np
 
 from palpate.shared.answer import Answer
 from palpate.shared.arrays import Array, Field
-from palpate.shared.geometry.quadrature import stress_recovery
 from palpate.shared.local_models import Body, LocalModels
-from palpate.shared.mechanics.stress import nodal_von_mises, remember
-from palpate.shared.near_field import NearFields
 from palpate.shared.reduced.points import expand
 from palpate.shared.reduced.transfer import Transfer
+from palpate.shared.stress_field import StressField
 
 
 class FieldRecovery:
@@ -29,9 +27,7 @@ class FieldRecovery:
         self._body = body
         self._models = models
         self._transfer = transfer
-        self._recovery = stress_recovery(body.nodes, body.elements, body.law, precision=np.float32)
-        self._stress = np.zeros(len(body.nodes))
-        self._near = NearFields(body)
+        self._stress = StressField(body, np.float32)
 
     def coefficients(self, answer: Answer) -> dict[int, Field]:
         """Displacement as coefficients (M,) in the basis of each region that takes part."""
@@ -61,21 +57,25 @@ class FieldRecovery:
 
     def von_mises(self, answer: Answer, displacement: Field) -> Field:
         """Nodal von Mises stress (n,) kPa of an answer with this displacement of all nodes."""
-        B = None if answer.past is None else self._remembered(answer)
-        near = self._near.of(answer.footprint)
-        nodal_von_mises(self._recovery, displacement, B, near, self._stress)
+        stress = self._stress.von_mises(displacement, self._remembered(answer), answer.footprint)
         # an answer that did not converge may be beyond single precision
         with np.errstate(over="ignore"):
-            return self._stress.astype(np.float32)
+            return stress.astype(np.float32)
 
-    def _remembered(self, answer: Answer) -> Array:
-        """``B`` of ``mechanics.viscosity`` (e, 6, 8) at the points of all elements."""
+    def peaks(self, answer: Answer, displacement: Field) -> tuple[float, float]:
+        """Largest stress and 99th percentile (kPa) of an answer; see ``StressField.peaks``."""
+        return self._stress.peaks(displacement, self._remembered(answer), answer.footprint)
+
+    def _remembered(self, answer: Answer) -> Array | None:
+        """``B`` of ``mechanics.viscosity`` (e, 6, 8) at the points of all elements, of a past."""
+        if answer.past is None:
+            return None
         transfer = self._transfer()
         B = np.zeros((len(self._body.elements), 6, 8))
         for k, share, knot in transfer.knots(answer.active):
             u = self._field(self._by_region([(k, 1.0, knot)]))
-            remember(self._recovery, u, share, B)
+            self._stress.remember(u, share, B)
         lasting = transfer.lasting(answer.time, answer.active)
         if lasting:
-            remember(self._recovery, self._field(self._by_region(lasting)), None, B)
+            self._stress.remember(self._field(self._by_region(lasting)), None, B)
         return B

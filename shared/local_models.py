@@ -11,6 +11,7 @@ from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from palpate.shared.arrays import Array, Field, Flags, Ints, Numbers
 from palpate.shared.artifact import values_of
@@ -21,6 +22,10 @@ from palpate.shared.mechanics.tip import Tip, tip_of
 from palpate.shared.mechanics.tissue import Law
 from palpate.shared.reduced.outcome import HISTORY_FEATURES, PRESS_FEATURES, TOUCH_FEATURES
 from palpate.shared.scene import Scene
+
+CLAMPED_LAYER = 1.5
+"""Millimetres from the support within which stress is not compared: at its edges it has no limit,
+and grows with every refinement of the mesh."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +58,11 @@ class Body(Mesh):
     def gradients(self) -> Array:
         """Gradients of the shape functions (e, 8, n, 3) at the quadrature points, 1/mm."""
         return volume_quadrature(self.nodes, self.elements, 2)[0]
+
+    def beyond_clamped_layer(self, points: Array) -> Flags:
+        """Which of points (k, 3) are farther from the support than ``CLAMPED_LAYER``, (k,)."""
+        distance, _ = cKDTree(self.nodes[self.clamped]).query(points)
+        return np.asarray(distance > CLAMPED_LAYER)
 
     @cached_property
     def boundary(self) -> SurfaceQuadrature:

@@ -413,6 +413,13 @@ class ReducedModel:
         stress = self.fields.von_mises(answer, displacement)
         return stress if region == "all" else stress[self.surface_nodes]
 
+    def peaks(self, answer: Answer, displacement: Field) -> tuple[float, float]:
+        """Largest von Mises stress and its 99th percentile (kPa) outside the clamped layer.
+
+        ``displacement`` is that of all nodes.  See ``StressField.peaks``.
+        """
+        return self.fields.peaks(answer, displacement)
+
 
 def _footprint(found: Outcome, radius: float) -> Contact:
     """What presses in an outcome."""

@@ -42,27 +42,28 @@ class NearFields:
     """Near fields of a body, whose tissue is the same everywhere."""
 
     def __init__(self, body: Body) -> None:
-        self._nodes = body.nodes
         self._mu, self._lam = float(body.law.mu[0]), float(body.law.lam[0])
 
     @cached_property
     def _table(self) -> Array:
         return local_field(0.5 * self._lam / (self._lam + self._mu))
 
-    def of(self, contact: Contact | None) -> NearField:
-        """Near field of a contact, if there is one."""
+    def at(self, points: Array, contact: Contact | None) -> NearField:
+        """Near field of a contact, if there is one, at points (n, 3) mm."""
         if contact is None:
             return NO_CONTACT
-        n = len(self._nodes)
-        field = NearField(np.empty(n, np.int64), np.empty((n, 3)), np.empty((n, 3, 3)))
-        count = near_field(self._table, self._nodes, contact, 0.5 / self._mu, *field)
-        nodes, displacement, gradient = field
-        return NearField(nodes[:count], displacement[:count], gradient[:count])
+        n = len(points)
+        numbers, displacement = np.empty(n, np.int64), np.empty((n, 3))
+        gradient = np.empty((n, 3, 3))
+        count = near_field(
+            self._table, points, contact, 0.5 / self._mu, numbers, displacement, gradient
+        )
+        return NearField(numbers[:count], displacement[:count], gradient[:count])
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def near_field(table, nodes, contact, softness, numbers, displacement, gradient):
-    """Write the near field at the nodes (n, 3) mm it reaches; return how many these are.
+def near_field(table, points, contact, softness, numbers, displacement, gradient):
+    """Write the near field at the points (n, 3) mm it reaches; return how many these are.
 
     Parameters
     ----------
@@ -87,10 +88,10 @@ def near_field(table, nodes, contact, softness, numbers, displacement, gradient)
     Q[1] = np.cross(Q[2], Q[0])
     bend(contact.curvature, Q[:2], radius, bent)
     count = 0
-    for node in range(len(nodes)):
+    for n in range(len(points)):
         far = 0.0
         for i in range(3):
-            away[i] = (nodes[node, i] - contact.place[i]) / radius
+            away[i] = (points[n, i] - contact.place[i]) / radius
             far += away[i] ** 2
         if far > 2.0 * REACH**2:
             continue
@@ -106,7 +107,7 @@ def near_field(table, nodes, contact, softness, numbers, displacement, gradient)
         if x * x + y * y > REACH**2 or z > REACH or z < -ABOVE:
             continue
         pressed(table, x, y, z, into, along, u, H)
-        numbers[count] = node
+        numbers[count] = n
         for i in range(3):
             # of the gradient in the half-space's own coordinates, row i
             p = Q[0, i] * H[0, 0] + Q[1, i] * H[1, 0] + Q[2, i] * H[2, 0]

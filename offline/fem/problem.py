@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from palpate.offline.fem.contact import SphereContact, SphereLoad
 from palpate.offline.fem.mesh import accessible_surface, build_mesh
@@ -17,11 +16,9 @@ from palpate.offline.fem.sphere import sphere_of, sphere_surface
 from palpate.offline.fem.terms import Past, TipLoad
 from palpate.shared.arrays import Array, Field, Flags
 from palpate.shared.artifact import Artifact, values_of
-from palpate.shared.geometry.quadrature import stress_recovery
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.local_models import Body, Mesh
 from palpate.shared.mechanics.footprint import MEANS, footprint, means
-from palpate.shared.mechanics.stress import StressRecovery, nodal_von_mises
 from palpate.shared.mechanics.tip import (
     CURVED_WITHIN,
     LONGEST,
@@ -33,12 +30,9 @@ from palpate.shared.mechanics.tip import (
     tip_of,
 )
 from palpate.shared.mechanics.viscosity import step_weights
-from palpate.shared.near_field import Contact, NearFields
+from palpate.shared.near_field import Contact
 from palpate.shared.scene import Scene, parse_scene
-
-CLAMPED_LAYER = 1.5
-"""Millimetres from the support within which stress is not compared: at its edges it has no limit,
-and grows with every refinement of the mesh."""
+from palpate.shared.stress_field import StressField
 
 MOST_PLACES = 24
 """Rounds in which the tip finds the place it touches; from the eighth on its steps are halved."""
@@ -107,10 +101,8 @@ class FullProblem:
 
     @cached_property
     def beyond_clamped_layer(self) -> Flags:
-        """Nodes farther from the support than ``CLAMPED_LAYER``, (n,)."""
-        nodes = self.mesh.nodes
-        distance, _ = cKDTree(nodes[self.mesh.clamped]).query(nodes)
-        return np.asarray(distance > CLAMPED_LAYER)
+        """Nodes (n,) at which stress is compared; see ``Body``."""
+        return self.body.beyond_clamped_layer(self.mesh.nodes)
 
     # --- loads ---------------------------------------------------------------------------------
 
@@ -279,12 +271,9 @@ class FullProblem:
         return Reference(*(np.array(part) for part in zip(*rows, strict=True)))
 
     @cached_property
-    def _recovery(self) -> StressRecovery:
-        return stress_recovery(self.mesh.nodes, self.mesh.elements, self.model.law)
-
-    @cached_property
-    def _near(self) -> NearFields:
-        return NearFields(self.body)
+    def stress_field(self) -> StressField:
+        """Recovers stress."""
+        return StressField(self.body)
 
     def footprint(self, step: Step, found: Equilibrium | None = None) -> Contact | None:
         """What presses in a step; of the tip, by the force in what was found."""
@@ -305,13 +294,11 @@ class FullProblem:
 
         With the near field of a contact, if that is given.
         """
-        out, u = np.zeros(len(self.mesh.nodes)), np.ascontiguousarray(displacement, dtype=float)
-        B = None
+        u, B = np.ascontiguousarray(displacement, dtype=float), None
         if past is not None and self.model.prony:
             shares = np.array([share for share, _ in self.model.prony])
             B = np.ascontiguousarray(np.einsum("a,aeqi->eiq", shares, past.points[:-1]))
-        nodal_von_mises(self._recovery, u, B, self._near.of(contact), out)
-        return out
+        return self.stress_field.von_mises(u, B, contact)
 
     def under(self, position: Array, displacement: Array) -> Array:
         """Mean displacement (3,) under a footprint, weighted with its pressure."""

@@ -145,7 +145,9 @@ class Reply(NamedTuple):
     error_von_mises: _Estimate
     error_force: _Estimate
     min_jacobian: Annotated[float, "float32", "", "smallest volume ratio; 1 at rest, 0 is collapse"]
-    max_von_mises: Annotated[float, "float32", "kPa", "largest in the body; 0 if not asked for"]
+    max_von_mises: Annotated[
+        float, "float32", "kPa", "largest, 1.5 mm off the support; 0 if not asked for"
+    ]
     p99_von_mises: Annotated[float, "float32", "kPa", "99th percentile of it; 0 if not asked for"]
     model: Annotated[Array, "int32", "", "local models that answer, -1 for none", (MODELS,)]
     weight: Annotated[Array, "float32", "", "their shares", (MODELS,)]

@@ -171,12 +171,11 @@ def recover(model: ReducedModel, touch: Answer, outputs: int) -> Extras:
         everywhere = model.displacement(touch)
     if outputs & _DISPLACEMENT:
         fields.append(everywhere[surface].astype(kind))
-    if outputs & (_VON_MISES | _STRESS):
-        stress = model.von_mises(touch, "all", everywhere)
     if outputs & _VON_MISES:
+        stress = model.von_mises(touch, "all", everywhere)
         fields.append(stress[surface].astype(kind))
     if outputs & _STRESS:
-        largest, percentile = np.percentile(stress, (100.0, 99.0)).tolist()
+        largest, percentile = model.peaks(touch, everywhere)
     return Extras(outputs, coordinates, nodes, largest, percentile, fields)
 
 

@@ -85,8 +85,8 @@ def stress_recovery(
     return StressRecovery(
         connectivity=np.ascontiguousarray(elements, dtype=np.int32),
         gradients=np.ascontiguousarray(at_corners, dtype=precision),
-        to_points=to_points,
-        to_corners=to_corners,
+        to_points=np.ascontiguousarray(to_points.T),
+        to_corners=np.ascontiguousarray(to_corners.T),
         edges=np.array(HEX_EDGES[: elements.shape[1] - 8], np.int32).reshape(-1, 2),
         law=law.at(np.zeros(len(nodes), int)),
         elements_at=np.maximum(count, 1).astype(precision),

@@ -35,7 +35,7 @@ class StressRecovery(NamedTuple):
 
     connectivity: Numbers  # (e, n)
     gradients: NDArray[np.floating]  # (e, n, 3, 8) 1/mm: carried from the points to the corners
-    to_points: NDArray[np.floating]  # (8, 8) value at a point from those at the corners
+    to_points: Array  # (8, 8) values at points from those at corners, last index of the points
     to_corners: Array  # (8, 8) and its inverse
     edges: Numbers  # (n - 8, 2) corners either side of a midside node
     law: Law  # (nodes,)
@@ -43,9 +43,9 @@ class StressRecovery(NamedTuple):
 
 
 class NearField(NamedTuple):
-    """A displacement that a mesh does not follow, at the nodes that it reaches."""
+    """A displacement that a mesh does not follow, at the nodes or other points that it reaches."""
 
-    nodes: Ints  # (k,)
+    points: Ints  # (k,)
     displacement: Array  # (k, 3) mm
     gradient: Array  # (k, 3, 3)
 
@@ -58,17 +58,14 @@ def nodal_von_mises(mesh, u, B, near, out):
     is a part of ``u``.  Gradients are summed in the precision of ``mesh.gradients``, which ``u``
     shares.
     """
-    count, own = len(out), u.copy()
+    count, own = len(out), _without(u, near)
     sums, H = np.zeros(9 * count, mesh.gradients.dtype), np.empty(72, mesh.gradients.dtype)
-    for k in range(len(near.nodes)):
-        for i in range(3):
-            own[near.nodes[k], i] -= near.displacement[k, i]
     flat = mesh.gradients.reshape(len(mesh.connectivity), -1)
     for e in range(len(mesh.connectivity)):
         _gradients(mesh.connectivity[e], flat[e], own, H)
         _add_to_nodes(mesh, e, H, sums)
-    for k in range(len(near.nodes)):
-        node = near.nodes[k]
+    for k in range(len(near.points)):
+        node = near.points[k]
         for i in range(9):
             added = near.gradient[k, i // 3, i % 3] * mesh.elements_at[node]
             sums[i * count + node] += added
@@ -86,6 +83,45 @@ def nodal_von_mises(mesh, u, B, near, out):
             F = add_identity(scale(share, load(sums, n, count)), 1.0)
             mean = scale(share, unpacked(load_packed(past, n, count)))
             out[n] = viscosity.von_mises(mesh.law.at(n), F, mean)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def point_von_mises(mesh, u, B, near, exact, out):
+    """Write the von Mises stress (8 e,) kPa at the points; ``exact`` is the near field there.
+
+    The others are those of ``nodal_von_mises``.
+    """
+    added, own = np.zeros((len(out) // 8, 72)), _without(u, near)
+    for k in range(len(exact.points)):
+        e, q = divmod(exact.points[k], 8)
+        for i in range(9):
+            added[e, 8 * i + q] = exact.gradient[k, i // 3, i % 3]
+    flat = mesh.gradients.reshape(len(mesh.connectivity), -1)
+    corners, H = np.empty(72, flat.dtype), np.empty(72)
+    for e in range(len(mesh.connectivity)):
+        _gradients(mesh.connectivity[e], flat[e], own, corners)
+        _carry(mesh.to_points, corners, H)
+        law, found = mesh.law.at(mesh.connectivity[e, 0]), out[8 * e : 8 * e + 8]
+        for k in range(72):
+            H[k] += added[e, k]
+        if B is None:
+            for q in range(8):
+                found[q] = laws.von_mises(law, add_identity(load(H, q, 8), 1.0))
+        else:
+            b = B[e].reshape(-1)
+            for q in range(8):
+                past = unpacked(load_packed(b, q, 8))
+                found[q] = viscosity.von_mises(law, add_identity(load(H, q, 8), 1.0), past)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _without(u, near):
+    """Displacement of the nodes without a near field."""
+    own = u.copy()
+    for k in range(len(near.points)):
+        for i in range(3):
+            own[near.points[k], i] -= near.displacement[k, i]
+    return own
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
@@ -126,12 +162,11 @@ def _gradients(connectivity, flat, u, H):
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
 def _carry(matrix, values, out):
     """Carry components (8 k,) from corners to points of an element, or back."""
+    out[:] = 0.0
     for k in range(0, len(values), 8):
-        for q in range(8):
-            total = 0.0
-            for c in range(8):
-                total += matrix[q, c] * values[k + c]
-            out[k + q] = total
+        for c in range(8):
+            for q in range(8):
+                out[k + q] += matrix[c, q] * values[k + c]
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)

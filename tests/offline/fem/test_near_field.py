@@ -59,10 +59,9 @@ def test_it_ends_at_its_reach_and_is_the_gradient_of_its_displacement(coarse):
     step, shifted = 0.05, [points]
     for away in step * np.eye(3):
         shifted += [points + away, points - away]
-    fields = NearFields(coarse.body)
-    fields._nodes = np.vstack([*shifted, [[5.6, 4.7, 1.0], [0.0, 0.0, 8.0]]])
-    found = fields.of(contact)
-    assert list(found.nodes) == list(range(21))
+    points = np.vstack([*shifted, [[5.6, 4.7, 1.0], [0.0, 0.0, 8.0]]])
+    found = NearFields(coarse.body).at(points, contact)
+    assert list(found.points) == list(range(21))
     u = found.displacement.reshape(7, 3, 3)
     numeric = np.stack([u[1] - u[2], u[3] - u[4], u[5] - u[6]], axis=2) / (2 * step)
     scale = np.abs(found.gradient[:3]).max()
@@ -76,3 +75,27 @@ def test_under_a_tip_it_is_that_of_its_force(coarse):
     nodal = coarse.unit_load_at(contact.place, contact.normal)
     np.testing.assert_allclose(contact.traction * nodal.sum(), -found.force, rtol=1e-12)
     assert coarse.footprint(TipPosition(PLACE + 2.1 * UP)) is None
+
+
+def test_peaks_are_nearer_to_those_of_a_fine_mesh_than_the_nodes_are(coarse, fine):
+    load = Load(PLACE, np.array(DOWN), 1.5)
+    found = [problem.solve(load).displacement for problem in (coarse, fine)]
+    (largest, high), (exact, exact_high) = (
+        problem.stress_field.peaks(u, None, problem.footprint(load))
+        for problem, u in zip((coarse, fine), found, strict=True)
+    )
+    assert largest == pytest.approx(exact, rel=0.1)
+    assert high == pytest.approx(exact_high, rel=0.1)
+    assert abs(coarse.von_mises(found[0]).max() - exact) > 0.15 * exact
+
+
+def test_the_99th_percentile_is_that_of_volume_outside_the_clamped_layer(coarse):
+    F = np.diag([0.05, 0.0, -0.1])
+    peaks = coarse.stress_field.peaks(coarse.mesh.nodes @ F, None, None)
+    np.testing.assert_allclose(peaks, coarse.von_mises(coarse.mesh.nodes @ F)[0], rtol=1e-10)
+    # a stress that grows with the height: the uppermost hundredth of what counts
+    z = coarse.mesh.nodes[:, 2]
+    u = np.column_stack([0.0 * z, 0.0 * z, -1e-6 * z**2])
+    largest, high = coarse.stress_field.peaks(u, None, None)
+    assert 0.85 * largest < high <= largest
+    np.testing.assert_array_equal(coarse.beyond_clamped_layer, z > 1.5)

@@ -7,7 +7,7 @@ from palpate.shared.geometry.elements import HEX20_NODES, HEX_CORNERS, HEX_EDGES
 from palpate.shared.geometry.quadrature import stress_recovery, volume_quadrature
 from palpate.shared.mechanics.laws import von_mises
 from palpate.shared.mechanics.neo_hookean import NeoHookean
-from palpate.shared.mechanics.stress import NearField, nodal_von_mises
+from palpate.shared.mechanics.stress import NearField, nodal_von_mises, point_von_mises
 from palpate.shared.mechanics.tissue import lame
 from palpate.shared.near_field import NO_CONTACT
 
@@ -81,3 +81,18 @@ def test_what_a_near_field_takes_away_it_gives_back(reference, rng):
     near = NearField(np.arange(len(nodes)), 0.3 * u, np.tile(0.3 * H, (len(nodes), 1, 1)))
     expected = von_mises(LAW, tuple((np.eye(3) + H).ravel()))
     np.testing.assert_allclose(recovered(nodes, elements, u, near), expected, rtol=1e-11)
+
+
+def test_stress_at_the_points_has_the_near_field_there(reference, rng):
+    nodes, elements = pair(reference, rng)
+    law = NeoHookean(*(np.full(len(elements), value) for value in LAW))
+    u, moved = 0.05 * rng.standard_normal((2, *nodes.shape))
+    near = NearField(np.arange(len(nodes)), moved, np.empty((len(nodes), 3, 3)))
+    exact = NearField(np.array([3, 12]), np.empty((2, 3)), 0.1 * rng.standard_normal((2, 3, 3)))
+    gradients, _ = volume_quadrature(nodes, elements, 2)
+    H = np.einsum("eqai,eaj->eqji", gradients, (u - moved)[elements]).reshape(-1, 3, 3)
+    H[exact.points] += exact.gradient
+    out = np.empty(8 * len(elements))
+    point_von_mises(stress_recovery(nodes, elements, law), u, None, near, exact, out)
+    expected = [von_mises(LAW, tuple((np.eye(3) + own).ravel())) for own in H]
+    np.testing.assert_allclose(out, expected, rtol=1e-10)

@@ -1,0 +1,68 @@
+"""Von Mises stress of a body at its nodes, its largest value and its 99th percentile."""
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.shared.arrays import Array, Flags
+from palpate.shared.geometry.elements import gauss, hexahedron, shape
+from palpate.shared.geometry.quadrature import stress_recovery, volume_quadrature
+from palpate.shared.local_models import Body
+from palpate.shared.mechanics.stress import nodal_von_mises, point_von_mises, remember
+from palpate.shared.near_field import Contact, NearFields
+
+HIGHEST = 0.01
+"""Share of the volume with stress above the 99th percentile."""
+
+Displacement = NDArray[np.floating]
+
+
+class StressField:
+    """Recovers stress from displacements (n, 3) mm; not to be shared between threads.
+
+    ``B`` (e, 6, 8) is the past at the points of all elements, see ``mechanics.viscosity``; a
+    contact is what presses, and has a near field.
+    """
+
+    def __init__(self, body: Body, precision: type = np.float64) -> None:
+        self._body = body
+        self._recovery = stress_recovery(body.nodes, body.elements, body.law, precision)
+        self._near = NearFields(body)
+
+    def von_mises(self, u: Displacement, B: Array | None, contact: Contact | None) -> Array:
+        """Nodal stress (n,) kPa."""
+        out, near = np.empty(len(self._body.nodes)), self._near.at(self._body.nodes, contact)
+        nodal_von_mises(self._recovery, u, B, near, out)
+        return out
+
+    def peaks(
+        self, u: Displacement, B: Array | None, contact: Contact | None
+    ) -> tuple[float, float]:
+        """Largest stress and 99th percentile by volume (kPa), outside the clamped layer.
+
+        Both are of the integration points: under a contact there are more of them than of nodes,
+        and stress at the nodes is carried there.
+        """
+        points, volumes, counts = self._points
+        near, exact = (self._near.at(at, contact) for at in (self._body.nodes, points))
+        out = np.empty(len(points))
+        point_von_mises(self._recovery, u, B, near, exact, out)
+        out = out[counts]
+        order = np.argsort(-out)
+        above = np.searchsorted(np.cumsum(volumes[order]), HIGHEST * volumes.sum())
+        return float(out[order[0]]), float(out[order[above]])
+
+    def remember(self, u: Displacement, share: float | None, B: Array) -> None:
+        """See ``stress.remember``."""
+        remember(self._recovery, u, share, B)
+
+    @cached_property
+    def _points(self) -> tuple[Array, Array, Flags]:
+        """Integration points (8 e, 3) mm, volumes (k,) mm^3 of those that count, and which do."""
+        body = self._body
+        N, _ = shape(hexahedron(body.elements.shape[1]), gauss(2, 3)[0])
+        points = np.ascontiguousarray((N @ body.nodes[body.elements]).reshape(-1, 3))
+        counts = body.beyond_clamped_layer(points)
+        _, volumes = volume_quadrature(body.nodes, body.elements, 2)
+        return points, volumes.reshape(-1)[counts], counts
