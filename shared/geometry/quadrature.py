@@ -47,10 +47,14 @@ def volume_quadrature(nodes: Array, elements: Numbers, points: int) -> tuple[Arr
 def surface_quadrature(
     nodes: Array, faces: Numbers, spacing: float = LOAD_SPACING
 ) -> SurfaceQuadrature:
-    """Gauss points of boundary faces, one to each ``spacing`` mm of an edge, feeding mesh nodes."""
+    """Gauss points of boundary faces, one to each ``spacing`` mm of an edge, at least two.
+
+    They feed mesh nodes.
+    """
     X = nodes[faces]
     edges = np.linalg.norm(X[:, [1, 2, 3, 0]] - X[:, :4], axis=2)
     counts = np.ceil(np.maximum(edges[:, :2], edges[:, 2:]) / spacing).astype(int)
+    counts = np.maximum(counts, 2)  # one point loads all nodes of a small face alike
     parts = []
     for along, across in np.unique(counts, axis=0):
         own = np.flatnonzero((counts == (along, across)).all(axis=1))
