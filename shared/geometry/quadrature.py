@@ -6,7 +6,6 @@ from palpate.shared.arrays import Array, Numbers
 from palpate.shared.errors import PalpateError
 from palpate.shared.geometry.elements import (
     HEX_CORNERS,
-    HEX_EDGES,
     gauss,
     hexahedron,
     quadrilateral,
@@ -91,7 +90,6 @@ def stress_recovery(
         gradients=np.ascontiguousarray(at_corners, dtype=precision),
         to_points=np.ascontiguousarray(to_points.T),
         to_corners=np.ascontiguousarray(to_corners.T),
-        edges=np.array(HEX_EDGES[: elements.shape[1] - 8], np.int32).reshape(-1, 2),
         law=law.at(np.zeros(len(nodes), int)),
         elements_at=np.maximum(count, 1).astype(precision),
     )

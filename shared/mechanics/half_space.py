@@ -38,7 +38,7 @@ ABOVE = 1.0
 CELL = 0.05
 """Step of the tables."""
 
-HIGHEST, WAVES = 150.0, 1500
+HIGHEST, WAVES = 80.0, 600
 """Of the integrals: highest wave number, and how many."""
 
 FUNCTIONS = 5

@@ -13,6 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from palpate.shared.arrays import Array, Ints, Numbers
+from palpate.shared.geometry.elements import HEX_EDGES
 from palpate.shared.mechanics import laws, viscosity
 from palpate.shared.mechanics.tensors import (
     FAST,
@@ -29,6 +30,9 @@ from palpate.shared.mechanics.tensors import (
 )
 from palpate.shared.mechanics.tissue import Law
 
+EDGES = np.array(HEX_EDGES)
+"""Corners (12, 2) either side of the midside nodes, a constant for the compiler."""
+
 
 class StressRecovery(NamedTuple):
     """What recovery needs of a mesh: 2x2x2 points per element, point index last."""
@@ -37,7 +41,6 @@ class StressRecovery(NamedTuple):
     gradients: NDArray[np.floating]  # (e, n, 3, 8) 1/mm: carried from the points to the corners
     to_points: Array  # (8, 8) values at points from those at corners, last index of the points
     to_corners: Array  # (8, 8) and its inverse
-    edges: Numbers  # (n - 8, 2) corners either side of a midside node
     law: Law  # (nodes,)
     elements_at: NDArray[np.floating]  # (nodes,) number of elements that share a node
 
@@ -172,12 +175,14 @@ def _carry(matrix, values, out):
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
 def _add_to_nodes(mesh, e, corners, sums):
     """Add components (8 k,) at the corners of an element, and half-way, to sums (k nodes,)."""
-    nodes, edges, count = mesh.connectivity[e], mesh.edges, len(mesh.elements_at)
-    half = constant(0.5, corners[0])
+    nodes, count = mesh.connectivity[e], len(mesh.elements_at)
+    half, midsides = constant(0.5, corners[0]), len(nodes) == 20
     for k in range(len(corners) // 8):
         # unsigned numbers need no check whether they count from the end
         for c in range(8):
             sums[np.uint64(k * count + nodes[c])] += corners[8 * k + c]
-        for m in range(len(edges)):
-            both = corners[8 * k + edges[m, 0]] + corners[8 * k + edges[m, 1]]
-            sums[np.uint64(k * count + nodes[8 + m])] += half * both
+        if midsides:
+            for m in range(12):
+                one, other = np.uint64(8 * k + EDGES[m, 0]), np.uint64(8 * k + EDGES[m, 1])
+                both = corners[one] + corners[other]
+                sums[np.uint64(k * count + nodes[8 + m])] += half * both

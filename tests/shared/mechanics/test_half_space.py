@@ -77,14 +77,14 @@ def test_the_surface_carries_the_footprint_and_nothing_else(load):
         traction = -stress(at(table, (0.6 * r, 0.8 * r, 0.0), load)[1])[:, 2]
         expected = (1 - r**4) ** 2 if r < 1 else 0.0
         np.testing.assert_allclose(
-            traction, [expected * load[1], 0.0, expected * load[0]], atol=1e-4
+            traction, [expected * load[1], 0.0, expected * load[0]], atol=1e-3
         )
 
 
 def test_the_centre_moves_as_the_closed_forms_say(tables):
     mean = 1 - 2 / 5 + 1 / 9  # of the pressure along a radius
-    assert tables[0, 0, 1, 0] == pytest.approx(2 * (1 - POISSON) * mean, rel=1e-5)
-    assert tables[0, 0, 2, 0] == pytest.approx((2 - POISSON) * mean, rel=1e-5)
+    assert tables[0, 0, 1, 0] == pytest.approx(2 * (1 - POISSON) * mean, rel=1e-4)
+    assert tables[0, 0, 2, 0] == pytest.approx((2 - POISSON) * mean, rel=1e-4)
 
 
 @LOADS
