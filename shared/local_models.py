@@ -60,9 +60,12 @@ class Body(Mesh):
         return volume_quadrature(self.nodes, self.elements, 2)[0]
 
     def beyond_clamped_layer(self, points: Array) -> Flags:
-        """Which of points (k, 3) are farther from the support than ``CLAMPED_LAYER``, (k,)."""
+        """Which of points (k, 3) are farther from the support than ``CLAMPED_LAYER``, (k,).
+
+        In a thinner body those farther than half of the farthest.
+        """
         distance, _ = cKDTree(self.nodes[self.clamped]).query(points)
-        return np.asarray(distance > CLAMPED_LAYER)
+        return np.asarray(distance > min(CLAMPED_LAYER, 0.5 * distance.max()))
 
     @cached_property
     def boundary(self) -> SurfaceQuadrature:

@@ -12,7 +12,6 @@ then right, as it hardly depends on them, with the past ``B`` that the mesh has.
 """
 
 import math
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -42,11 +41,9 @@ class NearFields:
     """Near fields of a body, whose tissue is the same everywhere."""
 
     def __init__(self, body: Body) -> None:
-        self._mu, self._lam = float(body.law.mu[0]), float(body.law.lam[0])
-
-    @cached_property
-    def _table(self) -> Array:
-        return local_field(0.5 * self._lam / (self._lam + self._mu))
+        mu, lam = float(body.law.mu[0]), float(body.law.lam[0])
+        self._softness = 0.5 / mu
+        self._table = local_field(0.5 * lam / (lam + mu))
 
     def at(self, points: Array, contact: Contact | None) -> NearField:
         """Near field of a contact, if there is one, at points (n, 3) mm."""
@@ -55,9 +52,8 @@ class NearFields:
         n = len(points)
         numbers, displacement = np.empty(n, np.int64), np.empty((n, 3))
         gradient = np.empty((n, 3, 3))
-        count = near_field(
-            self._table, points, contact, 0.5 / self._mu, numbers, displacement, gradient
-        )
+        found = numbers, displacement, gradient
+        count = near_field(self._table, points, contact, self._softness, *found)
         return NearField(numbers[:count], displacement[:count], gradient[:count])
 
 
