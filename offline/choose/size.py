@@ -75,15 +75,16 @@ def try_patch(problem: FullProblem, patch: Patch) -> TrialResult:
     seconds = list[float]()
     while len(seconds) < TRIAL_LOADS:
         load = loads.any()
-        known = problem.reference([load])
-        if known is None:
-            continue
         started = time.perf_counter()
         sample = trainer.solve(load)
-        seconds.append(time.perf_counter() - started)
+        spent = time.perf_counter() - started
+        u = None if sample is None else (sample.q @ nodal).reshape(-1, 3)
+        known = problem.reference([load], u)
+        if known is None:
+            continue
+        seconds.append(spent)
         errors.append((np.inf, np.inf))
-        if sample is not None:
-            u = (sample.q @ nodal).reshape(-1, 3)
+        if u is not None:
             stress = problem.von_mises(u, contact=problem.footprint(load))
             off = relative(stress[kept], known.s[0][kept])
             errors[-1] = relative(u, known.u[0]), off

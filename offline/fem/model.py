@@ -216,6 +216,7 @@ class FullModel:
         dt: float = 0.0,
         start: Array | None = None,
         smallest_step: float = SMALLEST_STEP,
+        keep: bool = False,
     ) -> Equilibrium:
         """Equilibrium under a load, in one jump if that converges, else in load steps.
 
@@ -231,6 +232,9 @@ class FullModel:
             First guess; the last displacement of the past if absent.
         smallest_step : float
             See ``SMALLEST_STEP``.
+        keep : bool
+            Whether the equilibrium solved for last is near: its factorised tangent serves to begin
+            with, and for the tangent of the reaction, which then is about right.
 
         Raises
         ------
@@ -256,15 +260,17 @@ class FullModel:
         while reached < 1.0:
             fraction = min(1.0, reached + step)
             potential = Potential(self, [load.at(fraction), *tissue])
+            if keep:
+                potential.keep(u)
             status, made, energy, smallest = newton.newton(
-                potential, u, np.empty((4, len(u))), target, KEEP_TANGENT, MAX_ITERATIONS, False,
+                potential, u, np.empty((4, len(u))), target, KEEP_TANGENT, MAX_ITERATIONS, keep,
                 noise=noise,
             )  # fmt: skip
             iterations, load_steps = iterations + made, load_steps + 1
             if status == newton.CONVERGED:
                 converged[:], reached, step = u, fraction, 2.0 * step
                 continue
-            step *= 0.5
+            step, keep = 0.5 * step, False
             if step < smallest_step:
                 raise NoEquilibrium(
                     f"load: no equilibrium found beyond {100 * reached:.0f} % of it; "

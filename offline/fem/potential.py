@@ -28,6 +28,7 @@ class Potential:
 
     def __init__(self, model: FullModel, terms: Sequence[Term]) -> None:
         self.free = model.free
+        self.keeps = False  # see ``keep``
         self.terms = terms
         self._model = model
         self._displacement = np.zeros(3 * len(model.mesh.nodes))
@@ -58,8 +59,12 @@ class Potential:
         return found
 
     def compliance(self, u: Array, seen: Array) -> Array:
-        """``seen^T K^-1 seen`` (k, k) of the tissue's tangent at u alone; seen (free dofs, k)."""
-        self.factorise(u, 0.0)
+        """``seen^T K^-1 seen`` (k, k) of the tissue's tangent alone; seen (free dofs, k).
+
+        The tangent is that at u, or if ``keeps`` the last factorised one.
+        """
+        if not self.keeps:
+            self.factorise(u, 0.0)
         return np.asarray(seen.T @ self._model.solver.solve(seen))
 
     def potential(self, u: Array, residual: Array) -> tuple[float, float]:
@@ -81,6 +86,17 @@ class Potential:
             self._model.solver.factorise(matrix.data)
         except NotPositiveDefinite:
             return False
+        self._press_on_springs()
+        return True
+
+    def keep(self, u: Array) -> None:
+        """Begin at ``u`` with the tangent that the model has factorised last."""
+        self.keeps = True
+        self._displacement[self.free] = u
+        self._press_on_springs()
+
+    def _press_on_springs(self) -> None:
+        """Find what the springs of tips do to the factorised matrix."""
         self._springs = []
         for term in self.terms:
             if isinstance(term, TipLoad):
@@ -89,7 +105,6 @@ class Potential:
                 response = self._model.solver.solve(direction)
                 response *= stiffness / (1.0 + stiffness * (direction @ response))
                 self._springs.append((direction, response))
-        return True
 
     def correct(self, residual: Array, step: Array) -> None:
         """Newton's step for a residual, by the last factorisation."""

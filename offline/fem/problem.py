@@ -190,7 +190,7 @@ class FullProblem:
         wall, last, largest = np.zeros(3), None, 0.0
         for made in range(MOST_PLACES):
             load, x = self.tip_at(place, step.position, normal, *time)
-            found = self.model.solve(load, past, step.dt, start)
+            found = self.model.solve(load, past, step.dt, start, keep=made > 0)
             if past is not None:
                 dent = dented(past.dent, weights, load.law, float(np.linalg.norm(found.force)))
                 found = replace(found, past=replace(found.past, dent=dent))
@@ -214,7 +214,9 @@ class FullProblem:
             largest = max(largest, float(np.linalg.norm(force)))
             slight = largest < SLIGHT * self.body.tip.modulus * radius**2
             if slight or max(np.linalg.norm(moved) / radius, np.linalg.norm(turned)) < NEAREST:
-                return replace(found, tangent=found.place.tangent(barred), foot=x)
+                exact = self.model.solve(load, past, step.dt, found.displacement).place
+                tangent = (exact or found.place).tangent(barred)
+                return replace(found, tangent=tangent, foot=x)
             wall, last = barred @ load.tangents, (x, normal)
             normal, start = normal + turned, found.displacement
         raise NoEquilibrium("load: the tip finds no place to touch; lower the depth")

@@ -2,9 +2,9 @@
 
 At first the range ends at the pressure at which the tissue of the full model moves as far as the
 scene says.  The equilibrium path under ``p f`` starts along ``u_1 = K_0^-1 f`` and bends along its
-second and third derivative at rest.  Galerkin's solution in these three vectors is within some
-percent of the path as far as a scene goes, and costs a fraction of one full solution: it says where
-the full one starts.
+second and third derivative at rest.  Galerkin's solution in these three vectors costs a fraction of
+one full solution, and is within two percent of the path while the residual that it leaves in the
+full model is small.  Where that is not as far as the scene says, full solutions go on from there.
 
 Near a fold of the load path a small error of the force is a large one of the displacement, and
 between the folds of the full and of the reduced model the two lie on different branches: the one
@@ -52,6 +52,10 @@ LEAST = 1e-3
 
 TOLERANCE = 1e-3
 MAX_ITERATIONS = 20
+
+TRUSTED = 0.1
+"""Residual left in the full model up to which Galerkin's solution is believed: as a displacement in
+the energy at rest, relative to the whole."""
 
 DEEPEST = 0.8
 """Largest depth of the tip, in radii: its centre must stay outside the undeformed body."""
@@ -103,10 +107,16 @@ class LoadPath:
         status, *_ = newton.newton(
             path, q, np.empty((4, len(q))), target, 0.0, MAX_ITERATIONS, False
         )
-        if status != newton.CONVERGED:
+        u = self._basis @ q
+        if status != newton.CONVERGED or self._residual(u, load) > TRUSTED * np.linalg.norm(q):
             raise NoEquilibrium("load: no equilibrium found along its path")
         self._q = q
-        return self._model.filled(self._basis @ q).reshape(-1, 3)
+        return self._model.filled(u).reshape(-1, 3)
+
+    def _residual(self, u: Array, load: Array) -> float:
+        """What is left of a load (3 nodes,) at ``u`` (free dofs,), in the energy at rest."""
+        left = load[self._model.free] - self._model.internal_free(u)
+        return float(np.sqrt(left @ self._model.solve_linear(left)))
 
 
 def pressure_that_moves(
@@ -115,16 +125,17 @@ def pressure_that_moves(
     pressure: float,
     exponent: float | None = None,
     start: Array | None = None,
+    stride: float = 2.5,
 ) -> tuple[float, float, Array | None]:
     """Pressure at which a node moves by ``wanted`` mm, or beyond which there is no equilibrium.
 
     ``solve`` finds the displacement (n, 3) at a pressure from a first guess or raises
     ``NoEquilibrium``, as this does if there is none at ``LEAST`` of the first guess either. Taken
     and returned: a pressure (kPa), the power of it by which the displacement grows near there, and
-    a displacement there.
+    a displacement there. From one pressure to the next it is at most ``stride`` times as large.
     """
     least = LEAST * pressure
-    low, high, last = 0.0, np.inf, None
+    low, high, last, power = 0.0, np.inf, None, 1.0
     state = below = None  # the last state, and that at the pressure ``low``
     while high > 1.03 * low:
         try:
@@ -147,11 +158,11 @@ def pressure_that_moves(
         if exponent is not None and abs(moved / wanted - 1) < NEAR:
             return enough, power, state
         last = pressure, moved
-        pressure = float(np.clip(enough, 0.3 * pressure, 2.5 * pressure))
+        pressure = float(np.clip(enough, 0.3 * pressure, stride * pressure))
         if not low < pressure < high:
             pressure = (low + high) / 2
         start = (pressure / last[0]) ** power * state
-    return low, 1.0, below
+    return low, power, below
 
 
 def load_range(problem: FullProblem, position: Array) -> Array:
@@ -169,14 +180,16 @@ def load_range(problem: FullProblem, position: Array) -> Array:
     wanted = problem.scene.load.max_indentation * thickness
     pressure = wanted / np.linalg.norm((linear @ normal).reshape(-1, 3), axis=1).max()
     path = LoadPath(model, -unit @ normal)
-    # no load steps in the full model: where a jump fails, the pressure between is asked for
-    near = pressure_that_moves(path.solve, wanted, pressure)
 
     def full(pressure: float, start: Array | None) -> Array:
+        # no load steps: where a jump fails, the pressure between is asked for
         force = -pressure * nodal[:, None] * normal
         return model.solve(force, start=start, smallest_step=1.0).displacement
 
-    limit, _, moved = pressure_that_moves(full, wanted, *near)
+    limit, power, moved = pressure_that_moves(path.solve, wanted, pressure)
+    if moved is None or np.linalg.norm(moved, axis=1).max() < (1 - NEAR) * wanted:
+        near = limit or pressure, power, moved
+        limit, _, moved = pressure_that_moves(full, wanted, *near, stride=1.5)
     depth = _tip_depth(problem, position, limit * nodal.sum())
     depth -= 0.0 if moved is None else float(nodal @ moved @ normal) / nodal.sum()
     depth = min(max(depth, SHALLOWEST), DEEPEST * problem.scene.endoscope.radius)

@@ -282,11 +282,10 @@ def against_full(
 def reference_task(model: ReducedModel, query: Sequence[Step]) -> tuple[Any, ...]:
     """Task of a query's full solutions.
 
-    Under the tip a single one is sought near the reduced answer: a free edge can rest on either
-    side of it.
+    A single one is sought near the reduced answer: that is quicker, and under the tip a free edge
+    can rest on either side of it.
     """
-    (*_, last) = query
-    if len(query) > 1 or isinstance(last, Load):
+    if len(query) > 1:
         return FullProblem.reference, query
     (answer,) = play(model, query)
     return FullProblem.reference, query, model.displacement(answer)

@@ -197,6 +197,17 @@ def test_newton_ends_quadratically(slab, monkeypatch):
     assert (orders > 1.7).all()
 
 
+def test_a_kept_tangent_leads_to_the_same_equilibrium(slab, monkeypatch):
+    load, factorised = pressed(slab.mesh, 1.0), []
+    near, exact = slab.solve(0.999 * load), slab.solve(load)
+    slab.solve(0.998 * load)
+    factorise = Potential.factorise
+    monkeypatch.setattr(Potential, "factorise", lambda *at: factorised.append(at) or factorise(*at))
+    kept = slab.solve(load, start=near.displacement, keep=True)
+    assert not factorised
+    np.testing.assert_allclose(kept.displacement, exact.displacement, atol=1e-7)
+
+
 def test_solution_is_in_equilibrium_whatever_the_way_to_it(slab, monkeypatch):
     load = pressed(slab.mesh, 6.0)
     solution = slab.solve(load)

@@ -80,12 +80,12 @@ def test_the_path_is_near_the_full_model(problem):
 @pytest.mark.parametrize("name", ["problem", "visco_problem"])
 def test_the_limit_moves_the_tissue_by_the_indentation_in_the_end(request, name):
     problem = request.getfixturevalue(name)
-    x = problem.surface.vertices[len(problem.surface.vertices) // 2]
-    nodal, normal = problem.unit_load(x)
-    limit = load_range(problem, x)[0]
-    u = problem.model.relaxed.solve(-limit * nodal[:, None] * normal).displacement
     wanted = problem.scene.load.max_indentation * problem.scene.geometry.size[2]
-    assert np.linalg.norm(u, axis=1).max() == pytest.approx(wanted, rel=0.01)
+    for x in problem.surface.vertices[:: len(problem.surface.vertices) // 4]:
+        nodal, normal = problem.unit_load(x)
+        limit = load_range(problem, x)[0]
+        u = problem.model.relaxed.solve(-limit * nodal[:, None] * normal).displacement
+        assert np.linalg.norm(u, axis=1).max() == pytest.approx(wanted, rel=0.02)
 
 
 class Plate:
