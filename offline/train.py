@@ -34,11 +34,19 @@ from palpate.offline.fem.mesh import mesh_quality
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.info import duration
 from palpate.offline.reduce.footprint_models import compile_query, train_patch
-from palpate.offline.reduce.join import join
+from palpate.offline.reduce.join import bases_of, join
 from palpate.offline.reduce.layout import Layout
 from palpate.offline.reduce.load_range import SEARCHES, ask, bearable_shares, load_range, untested
 from palpate.offline.reduce.ritz import region
 from palpate.offline.reduce.sampling import fewer, spacing_count, spread_points, triangle_areas
+from palpate.offline.reduce.window import (
+    SPACING,
+    BodyModes,
+    body_modes,
+    in_window,
+    stored_modes,
+    window_elements,
+)
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.workers import Checkpoint, Tasks, content_key, open_scene, run, worker_pool
 from palpate.offline.scenes import default_artifact, find_scene
@@ -53,7 +61,7 @@ from palpate.offline.validate.compare import (
 )
 from palpate.offline.validate.queries import KINDS, Kind
 from palpate.shared import artifact
-from palpate.shared.arrays import Array
+from palpate.shared.arrays import Array, Numbers
 from palpate.shared.local_models import Estimators, LocalModels
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.model import ReducedModel
@@ -215,9 +223,14 @@ class Pipeline:
     def _local_models(self, layout: Layout) -> LocalModels:
         """Bases of the regions and local models."""
         used = [layout.footprints_of(r) for r in range(layout.region.max() + 1)]
-        tasks: Tasks = {
-            f"region-{r}": (region, [layout.footprints[i] for i in own], layout.size.region_modes)
-            for r, own in enumerate(used)
+        footprints = [[layout.footprints[i] for i in own] for own in used]
+        tasks: Tasks = {f"window-{r}": (window_elements, own) for r, own in enumerate(footprints)}
+        elements = self._stage("windows", tasks)
+        body = self._body_modes(elements)
+        windows = self.checkpoint.store("windows", (body, elements))
+        tasks = {
+            f"region-{r}": (in_window, windows, r, region, own, layout.size.region_modes)
+            for r, own in enumerate(footprints)
         }
         regions = self._stage("Ritz vectors", tasks)
         # a small region may have fewer vectors to give than asked for
@@ -226,9 +239,20 @@ class Pipeline:
         for k, r in enumerate(layout.region):
             learnt = np.searchsorted(used[r], layout.learns_from[k])
             own = replace(regions[r], ritz=regions[r].ritz[learnt])
-            tasks[f"patch-{k}"] = train_patch, own, layout.patch(k)
+            tasks[f"patch-{k}"] = in_window, windows, int(r), train_patch, own, layout.patch(k)
         parts = self._stage("local models", tasks)
-        return join(self.problem.model, regions, layout.region, parts)
+        bases = bases_of(regions, body.values, body.steps)
+        return join(self.problem.model, bases, layout.region, parts)
+
+    def _body_modes(self, windows: list[Numbers]) -> BodyModes:
+        """Modes of the body outside windows of some elements; none if that is nowhere."""
+        if min(map(len, windows)) == len(self.problem.mesh.elements):
+            return stored_modes(self.problem, np.zeros((len(self.problem.model.free), 0)))
+        spacing = SPACING * self.scene.endoscope.radius
+        rng = stream(self.scene.seed, Stage.BODY_MODES)
+        places = spread_points(self.surface, spacing_count(self.surface, spacing), rng)
+        (found,) = self._stage("modes of the body", {"body": (body_modes, places)})
+        return BodyModes(*found)
 
     def _lowered(self, models: LocalModels, limits: Array) -> Array:
         """Load range that ends before the tissue gives way, or slips off the tip."""
@@ -289,7 +313,8 @@ class Pipeline:
             "area_mm2": round(float(triangle_areas(self.surface).sum()), 1),
             "dofs": self.problem.mesh.nodes.size,
             "patches": len(layout.centres),
-            "regions": len(models.basis),
+            "regions": len(models.steps),
+            "body_modes": len(models.body),
             "ritz_footprints": len(layout.footprints),
             "modes": models.modes.shape[2],
             "cubature_points_median": float(np.median(points)),

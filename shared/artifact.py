@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from palpate.shared.errors import PalpateError
 
 FORMAT = "palpate-artifact"
-FORMAT_VERSION = 8
+FORMAT_VERSION = 9
 
 SEAL_BYTES = 512
 """The smallest user block that HDF5 offers."""
@@ -123,7 +123,8 @@ def write_artifact(
             file.attrs["scene"] = scene
             file.attrs["documents"] = json.dumps(documents, sort_keys=True)
             for key, dataset in datasets.items():
-                filters = {"compression": 4, "shuffle": True} if dataset.compress else {}
+                worthwhile = dataset.compress and dataset.values.size > 0
+                filters = {"compression": 4, "shuffle": True} if worthwhile else {}
                 stored = file.create_dataset(key, data=dataset.values, **filters)
                 stored.attrs["units"] = dataset.units
                 stored.attrs["description"] = dataset.description

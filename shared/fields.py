@@ -46,10 +46,16 @@ class FieldRecovery:
         return total
 
     def _field(self, coefficients: Mapping[int, Field]) -> Field:
-        field = np.zeros(self._models.basis.shape[2], np.float32)
+        models, field = self._models, np.zeros((len(self._body.nodes), 3), np.float32)
+        far = np.zeros(len(models.body_steps), np.float32)
         for number, part in coefficients.items():
-            expand(self._models.basis[number], self._models.steps[number] * part, field)
-        return field.reshape(-1, 3)
+            nodes, basis = models.window(number)
+            near = np.zeros(basis.shape[1], np.float32)
+            expand(basis, models.steps[number] * part, near)
+            field[nodes] += near.reshape(-1, 3)
+            far += part @ models.far[number]
+        expand(models.body, models.body_steps * far, field.reshape(-1))
+        return field
 
     def displacement(self, answer: Answer) -> Field:
         """Nodal displacement (n, 3) mm."""

@@ -1,7 +1,8 @@
 """What training finds out about a scene: body, local models, error estimates.
 
 A ``Stored`` field is a dataset of the artifact, with its unit and a description that gives its
-shape: n nodes, p local models of r modes in a basis of M modes of their region.
+shape: n nodes, p local models of r modes in a basis of M modes of their region, N nodes of the
+windows of all regions, G modes of the whole body.
 """
 
 from collections.abc import Mapping
@@ -90,10 +91,21 @@ class ViscousModels:
 
 @dataclass(frozen=True)
 class LocalModels:
-    """Local models, and the modes of the regions that they are made of."""
+    """Local models, and the modes of the regions that they are made of.
 
+    Modes of a region are ``far`` combinations of the modes of the body everywhere, and more in its
+    window.
+    """
+
+    body: Annotated[
+        NDArray[np.int16], "body_modes", "body_steps", "modes of the body (G, 3 n)", "compress"
+    ]
+    body_steps: Annotated[Field, "body_steps", "mm", "value of one step of a mode (G,)"]
+    far: Annotated[Field, "basis_far", "1", "body modes in regions' (regions, M, G)", "half"]
+    node_from: Annotated[Ints, "window_from", "1", "first node of each window (regions + 1,)"]
+    nodes: Annotated[Numbers, "window_nodes", "1", "nodes of all windows (N,)"]
     basis: Annotated[
-        NDArray[np.int16], "basis", "basis_steps", "orthonormal modes (regions, M, 3 n)", "compress"
+        NDArray[Any], "basis", "basis_steps", "more modes there, by region (M 3 N,)", "compress"
     ]
     steps: Annotated[Field, "basis_steps", "mm", "value of one step of a mode (regions, M)"]
     region: Annotated[Numbers, "patch_region", "1", "region of each local model (p,)"]
@@ -133,6 +145,12 @@ class LocalModels:
                 ViscousModels(**values_of(ViscousModels, arrays)) if scene.tissue.prony else None
             ),
         )
+
+    def window(self, region: int) -> tuple[Numbers, NDArray[Any]]:
+        """Nodes (k,) of the window of a region, and what its modes (M, 3 k) have more there."""
+        own, row = slice(*self.node_from[region : region + 2]), 3 * self.steps.shape[1]
+        basis = self.basis[row * own.start : row * own.stop]
+        return self.nodes[own], basis.reshape(self.steps.shape[1], -1)
 
     @cached_property
     def modes(self) -> Field:

@@ -6,6 +6,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate.shared.arrays import Field, Ints, Numbers
 from palpate.shared.local_models import Body, LocalModels
@@ -53,12 +54,16 @@ def _modes_at(
     body: Body, models: LocalModels, modes: Field
 ) -> Iterator[tuple[int, Callable[[Any], Field]]]:
     """Every local model with what gives its modes (k, 3, m) at nodes (k,), region by region."""
-    bases = models.basis.reshape(*models.steps.shape, len(body.nodes), 3)
+    place = np.zeros(len(body.nodes), int)
     for region, steps in enumerate(models.steps):
+        nodes, near = models.window(region)
+        place[nodes] = np.arange(len(nodes))
+        far = models.body.reshape(-1, len(body.nodes), 3)[:, nodes]
         # one row of memory to a node, so that gathering nodes reads rows
-        basis = np.ascontiguousarray(np.moveaxis(bases[region], 0, -1)).astype(np.float32)
+        basis = _by_node(near.reshape(len(steps), len(nodes), 3)) * steps
+        basis += _by_node(far) @ (models.body_steps[:, None] * models.far[region].T)
         for k in np.flatnonzero(models.region == region):
-            yield int(k), partial(_rows, basis, steps[:, None] * modes[k])
+            yield int(k), partial(_rows, basis, place, modes[k])
 
 
 def _by_model(found: Mapping[int, tuple[Any, ...]]) -> Any:
@@ -107,9 +112,14 @@ def _place_points(
     return np.asarray(tiles.reshape(G.shape[-1], -1))
 
 
-def _rows(basis: Field, C: Field, nodes: Numbers) -> Field:
-    """Rows (k, 3, m) of modes ``basis @ C`` at some nodes; basis (n, 3, M), C (M, m)."""
-    return (basis[nodes].reshape(-1, len(C)) @ C).reshape(len(nodes), 3, -1)
+def _by_node(modes: NDArray[Any]) -> Field:
+    """Modes (n, 3, M) in floating point, from (M, n, 3)."""
+    return np.ascontiguousarray(np.moveaxis(modes, 0, -1)).astype(np.float32)
+
+
+def _rows(basis: Field, place: Ints, C: Field, nodes: Numbers) -> Field:
+    """Rows (k, 3, m) of modes ``basis @ C`` at nodes in their ``place``; basis (n, 3, M)."""
+    return (basis[place[nodes]].reshape(-1, len(C)) @ C).reshape(len(nodes), 3, -1)
 
 
 def _offsets(parts: Sequence[Any]) -> Ints:

@@ -9,15 +9,14 @@ pay for trials of large models.
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from palpate.offline.fem.norms import relative, statistics
 from palpate.offline.fem.problem import FullProblem
-from palpate.offline.reduce.footprint_models import LocalTrainer, RandomLoads, train_patch
-from palpate.offline.reduce.join import nodal_modes
+from palpate.offline.reduce.footprint_models import LocalTrainer, RandomLoads, trained_patch
 from palpate.offline.reduce.layout import Patch
 from palpate.offline.reduce.ritz import region
 from palpate.offline.run.streams import Stage, stream
@@ -67,9 +66,8 @@ class TrialResult(NamedTuple):
 def try_patch(problem: FullProblem, patch: Patch) -> TrialResult:
     """Train a local model by itself and judge it on loads it has not seen."""
     basis = region(problem, patch.footprints, patch.size.region_modes)
-    trained = train_patch(problem, basis, patch)
-    models = replace(trained, basis=basis.basis[None], steps=basis.steps[None])
-    trainer, nodal = LocalTrainer(problem, models), nodal_modes(models, models.modes[0])
+    models = trained_patch(problem, basis, patch)
+    trainer, nodal = LocalTrainer(problem, models), models.modes[0].T @ models.window(0)[1]
     loads = RandomLoads(problem.scene, patch, stream(patch.seed, Stage.TRIAL_LOADS))
     kept, errors = problem.beyond_clamped_layer, list[tuple[float, float]]()
     seconds = list[float]()

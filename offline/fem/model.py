@@ -189,6 +189,11 @@ class FullModel:
             term.add_stiffness(displacement, data, False)
 
     @cached_property
+    def body(self) -> Array:
+        """Modes (free dofs, 0) that reach beyond the mesh: see ``reduce.window``."""
+        return np.zeros((len(self.free), 0))
+
+    @cached_property
     def rest_stiffness(self) -> csr_matrix:
         """Stiffness (mN/mm) of the free dofs at rest."""
         return self.stiffness(np.zeros(3 * len(self.mesh.nodes)))

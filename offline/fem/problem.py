@@ -14,7 +14,7 @@ from palpate.offline.fem.mesh import accessible_surface, build_mesh
 from palpate.offline.fem.model import Equilibrium, FullModel, NoEquilibrium
 from palpate.offline.fem.sphere import sphere_of, sphere_surface
 from palpate.offline.fem.terms import Past, TipLoad
-from palpate.shared.arrays import Array, Field, Flags
+from palpate.shared.arrays import Array, Field, Flags, Numbers
 from palpate.shared.artifact import Artifact, values_of
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.local_models import Body, Mesh
@@ -86,6 +86,8 @@ class FullProblem:
         self.mesh = build_mesh(scene) if mesh is None else mesh
         self.model = FullModel(self.mesh, scene.tissue)
         self.surface: Surface = accessible_surface(self.mesh)
+        self.nodes = np.arange(len(self.mesh.nodes), dtype=np.int32)  # of the whole body
+        self.elements = np.arange(len(self.mesh.elements), dtype=np.int32)
         self._nodal = np.zeros(len(self.mesh.nodes))
 
     @classmethod
@@ -103,6 +105,12 @@ class FullProblem:
     def beyond_clamped_layer(self) -> Flags:
         """Nodes (n,) at which stress is compared; see ``Body``."""
         return self.body.beyond_clamped_layer(self.mesh.nodes)
+
+    def points_in_body(self, points: Numbers) -> Numbers:
+        """Numbers in the whole body of quadrature points."""
+        per_element = self.model.weights.shape[1]
+        element, q = np.divmod(points, per_element)
+        return (self.elements[element] * per_element + q).astype(np.int32)
 
     # --- loads ---------------------------------------------------------------------------------
 

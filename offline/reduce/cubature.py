@@ -16,6 +16,7 @@ from scipy.linalg import qr_delete, qr_insert, solve, solve_triangular
 
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.shared.arrays import Array, Field, Ints
+from palpate.shared.errors import PalpateError
 from palpate.shared.mechanics.tissue import Law
 from palpate.shared.reduced.features import RESIDUAL_FEATURES, residual_features
 from palpate.shared.reduced.points import LANES, Points, add_past_stress, nonlinear_stress
@@ -225,19 +226,19 @@ def fit_residual(
     problem: FullProblem,
     frame: Array,
     centre: Array,
-    nodal: Field,
+    modes: Array,
     known: Sequence[tuple[Load, Array, float, Array]],
 ) -> Array:
     """Fit the log of the relative residual (RESIDUAL_FEATURES,) left in the full model by answers.
 
     ``known`` are loads, their directions (3,), their shares of the largest, and the answers (r,) in
-    modes ``nodal`` (r, 3 n) mm; see ``reduced.features.residual_features`` for frame and centre.
+    ``modes`` (free dofs, r) mm; see ``reduced.features.residual_features`` for frame and centre.
     """
     rows = np.empty((len(known), RESIDUAL_FEATURES))
     for row, (load, direction, share, _) in zip(rows, known, strict=True):
         residual_features(frame, centre, load.position, direction, share, row)
-    displacements = np.array([q for *_, q in known]) @ nodal.astype(float)
-    residuals = residuals_left(problem, displacements, [load for load, *_ in known])
+    states = modes @ np.transpose([q for *_, q in known])
+    residuals = residuals_left(problem, states, [load for load, *_ in known])
     kept = (residuals > 0) & np.isfinite(residuals)
     logs = np.log(residuals[kept])
     fitted = damped_fit(rows[kept], (logs - logs.mean())[:, None], RESIDUAL_DAMPING)[:, 0]
@@ -245,19 +246,20 @@ def fit_residual(
     return fitted
 
 
-def residuals_left(problem: FullProblem, displacements: Array, loads: Sequence[Load]) -> Array:
-    """What displacements (k, 3 n) mm leave of loads in the full model, relative to them, (k,).
+def residuals_left(problem: FullProblem, states: Array, loads: Sequence[Load]) -> Array:
+    """What states (free dofs, k) mm leave of loads in the full model, relative to them, (k,).
 
     Both are measured as displacements in the energy of the rest state; infinite where the
     displacement inverts an element.
     """
-    model, free = problem.model, problem.model.free
-    left, sound = np.zeros_like(displacements), np.ones(len(loads), dtype=bool)
-    for i, (u, load) in enumerate(zip(displacements, loads, strict=True)):
-        _, smallest = model.internal(u, left[i])
-        left[i] -= problem.load_vector(load).ravel()
-        sound[i] = smallest > 0.0
-    left, moved = left[:, free].T, displacements[:, free].T
+    model = problem.model
+    left, sound = np.zeros_like(states), np.ones(len(loads), dtype=bool)
+    for i, load in enumerate(loads):
+        try:
+            left[:, i] = model.internal_free(states[:, i])
+        except PalpateError:
+            sound[i] = False
+        left[: len(model.free), i] -= problem.load_vector(load).ravel()[model.free]
     energies = np.sum(left * model.solve_linear(left), axis=0)
-    own = np.sum(moved * (model.rest_stiffness @ moved), axis=0)
+    own = np.sum(states * (model.rest_stiffness @ states), axis=0)
     return np.where(sound, np.sqrt(energies / own), np.inf)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.reduce import cubature
-from palpate.offline.reduce.join import deviatoric_of, half, nodal_modes, with_points
+from palpate.offline.reduce.join import deviatoric_of, half, with_points
 from palpate.offline.reduce.layout import Patch
 from palpate.offline.reduce.ritz import RITZ_VECTORS, Footprint, Region, local_modes, whole_numbers
 from palpate.offline.reduce.sampling import cone, fewer, tangents
@@ -162,26 +162,30 @@ def compile_query(problem: FullProblem) -> None:
     surface = problem.surface
     x, normal = surface.vertices[0], surface.normals[0]
     stored, factors = np.zeros((LANES, LANES), np.int16), np.zeros((LANES, LANES), np.float32)
-    basis = np.zeros((LANES, problem.mesh.nodes.size), np.int16)
-    models = _untrained(
-        problem, Region(basis, factors[0], factors, factors[None]), Footprint(x, normal, 1.0), 1.0,
-        stored, factors,
-    )  # fmt: skip
+    basis = np.zeros((len(problem.model.free), LANES))
+    models = _untrained(problem, basis, Footprint(x, normal, 1.0), 1.0, stored, factors)
     LocalTrainer(problem, models).solve(Load(x, normal, 0.0))
 
 
 def train_patch(problem: FullProblem, region: Region, patch: Patch) -> LocalModels:
-    """Train one local model.
+    """Train one local model; its tables lack the basis of the region, which is large."""
+    models = trained_patch(problem, region, patch)
+    points = problem.points_in_body(models.points)
+    return replace(models, basis=models.basis[:0], points=points)
 
-    ``region`` has the Ritz vectors of the patch's footprints. The tables are of one local model and
-    no pairs, and lack the basis of the region, which is large.
+
+def trained_patch(problem: FullProblem, region: Region, patch: Patch) -> LocalModels:
+    """Train one local model, whose tables are of the problem's nodes and have no pairs.
+
+    ``region`` has the Ritz vectors of the patch's footprints, and its basis is of these nodes.
     """
     rng, scene, model = np.random.default_rng(patch.seed), problem.scene, problem.model
     loads, weights = RandomLoads(scene, patch, rng), model.weights.ravel()
     leading = local_modes(_expected(scene, region, patch, rng), patch.size.modes)
     whole, mix = whole_numbers(region.orthonormal @ leading, region.orthonormal)
     # stored in these and in half precision, so trained in it
-    models = _untrained(problem, region, patch.at, patch.extent, whole, mix)
+    states = region.states(model)
+    models = _untrained(problem, states, patch.at, patch.extent, whole, mix)
     galerkin = LocalTrainer(problem, models)
     most = patch.size.cubature_points
     forces = _training_forces(galerkin, loads)[: len(weights)]
@@ -193,15 +197,14 @@ def train_patch(problem: FullProblem, region: Region, patch: Patch) -> LocalMode
     trained = LocalTrainer(problem, models)
     samples = trained.answers(loads.any, GUESS_LOADS)
     directions, change = _fit_tangent(trained, samples[:TANGENT_LOADS])
-    residual = _fit_residual(problem, models, trained, loads)
+    modes = states @ models.modes[0]
+    residual = _fit_residual(problem, models, modes, trained, loads)
     viscous = None
     if model.prony:
-        soft = deviatoric_of(model, models, models.modes[0])
+        soft = deviatoric_of(model, modes)
         viscous = ViscousModels(soft, np.zeros((0, 2), np.int32), soft[:0])
     return replace(
         models,
-        basis=models.basis[:, :0],
-        steps=models.steps[:, :0],
         guess=half(_fit_guess(samples)),
         directions=half(directions),
         change=half(change),
@@ -212,17 +215,28 @@ def train_patch(problem: FullProblem, region: Region, patch: Patch) -> LocalMode
 
 def _untrained(
     problem: FullProblem,
-    region: Region,
+    states: Array,
     at: Footprint,
     extent: float,
     whole: NDArray[np.int16],
     mix: Field,
 ) -> LocalModels:
-    """One local model that knows its modes alone, with every quadrature point."""
+    """One local model that knows its modes alone, with every quadrature point.
+
+    The first rows of ``states`` are the modes of its region, (free dofs, M) mm.
+    """
     modes, weights = len(mix), problem.model.weights.ravel()
+    nodes, free = np.arange(len(problem.mesh.nodes), dtype=np.int32), problem.model.free
+    basis = np.zeros((states.shape[1], 3 * len(nodes)), np.float32)
+    basis[:, free] = states[: len(free)].T
     return LocalModels(
-        basis=region.basis[None],
-        steps=region.steps[None],
+        body=np.zeros((0, basis.shape[1]), np.int16),
+        body_steps=np.zeros(0, np.float32),
+        far=np.zeros((1, len(basis), 0), np.float32),
+        node_from=np.array([0, len(nodes)]),
+        nodes=nodes,
+        basis=basis.ravel(),
+        steps=np.ones((1, len(basis)), np.float32),
         region=np.zeros(1, np.int32),
         centres=at.point[None],
         frames=np.array([[at.normal, *tangents(at.normal)]]),
@@ -298,7 +312,11 @@ def _fit_tangent(reduced: LocalTrainer, samples: Sequence[Sample]) -> tuple[Arra
 
 
 def _fit_residual(
-    problem: FullProblem, models: LocalModels, trained: LocalTrainer, loads: RandomLoads
+    problem: FullProblem,
+    models: LocalModels,
+    modes: Array,
+    trained: LocalTrainer,
+    loads: RandomLoads,
 ) -> Array:
     """See ``cubature.fit_residual``."""
     known = []
@@ -308,5 +326,4 @@ def _fit_residual(
         sample = trained.solve(load)
         if sample is not None:
             known.append((load, load.direction, share, sample.q))
-    nodal = nodal_modes(models, models.modes[0])
-    return cubature.fit_residual(problem, models.frames[0], models.centres[0], nodal, known)
+    return cubature.fit_residual(problem, models.frames[0], models.centres[0], modes, known)

@@ -33,14 +33,29 @@ def half(values: Array) -> Field:
     return values[None].astype(np.float16, order="C").astype(np.float32)
 
 
+def bases_of(regions: Sequence[Region], body: NDArray[np.int16], steps: Field) -> dict[str, Any]:
+    """Tables of the bases of regions, with modes of the body (G, 3 n) in steps (G,)."""
+    far = np.zeros((len(regions), len(regions[0].steps), len(steps)), np.float32)
+    for row, region in zip(far, regions, strict=True):
+        row[:, : region.far.shape[1]] = region.far  # none where the window is the whole body
+    return {
+        "body": body,
+        "body_steps": steps,
+        "far": far,
+        "node_from": np.cumsum([0, *(len(region.nodes) for region in regions)]),
+        "nodes": np.concatenate([region.nodes for region in regions]),
+        "basis": np.concatenate([region.basis.ravel() for region in regions]),
+        "steps": np.stack([region.steps for region in regions]),
+    }
+
+
 def join(
-    model: FullModel, bases: Sequence[Region], region: Numbers, parts: list[LocalModels]
+    model: FullModel, bases: dict[str, Any], region: Numbers, parts: list[LocalModels]
 ) -> LocalModels:
     """Tables of all local models, which lie in given regions, from those of each."""
     models = _joined(
         parts,
-        basis=np.stack([basis.basis for basis in bases]),
-        steps=np.stack([basis.steps for basis in bases]),
+        **bases,
         region=region,
         extent=parts[0].extent,
         blend=parts[0].blend,
@@ -85,18 +100,15 @@ def overlaps(model: FullModel, models: LocalModels, modes: Field, pairs: Numbers
     return found.astype(np.float32)
 
 
-def deviatoric_of(model: FullModel, models: LocalModels, modes: NDArray[np.floating[Any]]) -> Field:
-    """Part of the rest stiffness (1, m, m) that relaxes, in modes (M, m) of the first region."""
-    u = _basis(model, models, 0) @ modes
-    return (u.T @ (model.deviatoric_stiffness @ u)).astype(np.float32)[None]
-
-
-def nodal_modes(models: LocalModels, modes: Field) -> Field:
-    """Modes (r, 3 n) mm at the nodes, of modes (M, r) in the first region."""
-    return (models.steps[0][:, None] * modes).T @ models.basis[0].astype(np.float32)
+def deviatoric_of(model: FullModel, modes: Array) -> Field:
+    """Part of the rest stiffness (1, m, m) that relaxes, in modes (free dofs, m)."""
+    return (modes.T @ (model.deviatoric_stiffness @ modes)).astype(np.float32)[None]
 
 
 def _basis(model: FullModel, models: LocalModels, region: int) -> Array:
     """Modes (free dofs, M) mm of a region."""
-    rows = models.basis[region][:, model.free] * models.steps[region][:, None]
-    return np.ascontiguousarray(rows.T, dtype=float)
+    nodes, near = models.window(region)
+    rows = (models.far[region] * models.body_steps) @ models.body.astype(float)
+    by_node = rows.reshape(len(rows), -1, 3)
+    by_node[:, nodes] += near.reshape(len(rows), -1, 3) * models.steps[region][:, None, None]
+    return np.ascontiguousarray(rows[:, model.free].T)

@@ -47,7 +47,9 @@ class Layout:
         self.centres = _centred_points(surface, count, rng)  # (p, 3) mm
         count = spacing_count(surface, scene.training.region_spacing)
         region = cKDTree(_centred_points(surface, count, rng)).query(self.centres)[1]
-        self.region = np.unique(region, return_inverse=True)[1].astype(np.int32)  # (p,)
+        region = np.unique(region, return_inverse=True)[1].astype(np.int32)
+        order = np.argsort(region, kind="stable")
+        self.centres, self.region = self.centres[order], region[order]  # (p,), ascending
         count = spacing_count(surface, RITZ_SPACING * size.patch_spacing)
         ritz = spread_points(surface, count, rng)
         self.footprints = [Footprint.of(surface, x, limits) for x in ritz]

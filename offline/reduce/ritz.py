@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from palpate.offline.fem.model import FullModel
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.sampling import tangents
-from palpate.shared.arrays import Array, Field
+from palpate.shared.arrays import Array, Field, Numbers
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.scene import SceneError
 
@@ -119,13 +119,13 @@ def _form(t: Array, degree: int) -> Array:
 
 def _even_part(model: FullModel, a: Array, step: float) -> Array:
     """``R''[a, a]`` by central differences along ``s a``."""
-    h = step / np.abs(a).max()
+    h = step / np.abs(model.filled(a)).max()
     return (model.internal_free(h * a) + model.internal_free(-h * a)) / h**2
 
 
 def _odd_part(model: FullModel, a: Array, b: Array, step: float) -> Array:
     """``R'''[a, a, a] + 3 R''[a, b]``: third derivative along ``s a + s^2 b / 2``."""
-    h = step / np.abs(a).max()
+    h = step / np.abs(model.filled(a)).max()
     curve = h * h / 2 * b
     odd = (model.internal_free(h * a + curve) - model.internal_free(curve - h * a)) / 2
     return 6 * (odd - h * (model.rest_stiffness @ a)) / h**3
@@ -188,16 +188,24 @@ def local_modes(coefficients: Array, size: int) -> Array:
 class Region:
     """Basis of a region, and what local models learn from."""
 
-    basis: NDArray[np.int16]  # (M, 3 n) in steps
+    nodes: Numbers  # (n,) of its window, of the whole body
+    basis: NDArray[np.int16]  # (M, 3 n) in steps, less what the modes of the body do there
     steps: Field  # (M,) mm
+    far: Field  # (M, G), what the modes of the body do everywhere
     orthonormal: Field  # (M, M) columns, in the basis: orthonormal in energy at rest
     ritz: Field  # (k, M, 19 or more) in those, of the relaxed tissue last
 
     def truncate(self, modes: int) -> Self:
         """The leading modes; ``orthonormal`` is triangular, so its leading block stays right."""
-        basis, steps, ritz = self.basis[:modes], self.steps[:modes], self.ritz[:, :modes]
-        block = self.orthonormal[:modes, :modes]
-        return replace(self, basis=basis, steps=steps, orthonormal=block, ritz=ritz)
+        basis, steps, far = self.basis[:modes], self.steps[:modes], self.far[:modes]
+        block, ritz = self.orthonormal[:modes, :modes], self.ritz[:, :modes]
+        return replace(self, basis=basis, steps=steps, far=far, orthonormal=block, ritz=ritz)
+
+    def states(self, model: FullModel) -> Array:
+        """Its modes (free dofs + G, M) as states of its model."""
+        far = self.far.T.astype(float)
+        near = (self.basis[:, model.free] * self.steps[:, None]).T
+        return np.vstack([near + model.body @ far, far])
 
 
 def region(problem: FullProblem, footprints: list[Footprint], modes: int) -> Region:
@@ -207,23 +215,31 @@ def region(problem: FullProblem, footprints: list[Footprint], modes: int) -> Reg
     first = np.arange(vectors.shape[2]) % RITZ_VECTORS < 3
     apart = -(-len(footprints) // POINTS_IN_BASIS)
     linear, rest = vectors[:, :, first], vectors[:, ::apart, ~first]
-    wanted = [part.reshape(len(model.free), -1) for part in (linear, rest)]
+    wanted = [part.reshape(len(vectors), -1) for part in (linear, rest)]
     basis, _ = energy_pod(model, np.hstack(wanted), modes)
-    vectors = vectors.reshape(len(model.free), -1)
+    vectors = vectors.reshape(len(vectors), -1)
     amplitude = np.sqrt(np.mean(((model.rest_stiffness @ basis).T @ vectors) ** 2, axis=1))
-    largest = np.abs(basis).max(axis=0)
+    far = basis[len(model.free) :]
+    near = basis[: len(model.free)] - model.body @ far
+    largest = np.abs(near).max(axis=0)
     steps = np.clip(RESOLUTION / amplitude, largest / np.iinfo(np.int16).max, largest / 100)
-    stored = np.round(basis / steps).astype(np.int16)
+    stored = np.zeros((len(steps), 3 * len(problem.mesh.nodes)), np.int16)
+    stored[:, model.free] = np.round(near / steps).T
+    own = Region(
+        nodes=problem.nodes,
+        basis=stored,
+        steps=steps.astype(np.float32),
+        far=far.T.astype(np.float16, order="C").astype(np.float32),
+        orthonormal=np.empty((0, 0), np.float32),
+        ritz=np.empty((0, 0, 0), np.float32),
+    )
     # rounding costs the modes their orthonormality: give it back by a change of coordinates
-    rounded = stored * steps.astype(np.float32)
+    rounded = own.states(model)
     stiff = model.rest_stiffness @ rounded
     L = np.linalg.cholesky(rounded.T @ stiff)
-    full = np.zeros((len(steps), 3 * len(problem.mesh.nodes)), np.int16)
-    full[:, model.free] = stored.T
     ritz = np.linalg.solve(L, stiff.T @ vectors).reshape(len(steps), len(footprints), -1)
-    return Region(
-        basis=full,
-        steps=steps.astype(np.float32),
+    return replace(
+        own,
         orthonormal=np.linalg.inv(L).T.astype(np.float32),
         ritz=np.moveaxis(ritz, 1, 0).astype(np.float32),
     )

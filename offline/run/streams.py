@@ -23,6 +23,7 @@ class Stage(IntEnum):
     GIVING_WAY = 11
     MESH_CHOICE = 12
     TRIAL_LOADS = 13
+    BODY_MODES = 14
     UNSEEN = 100
     SNAPSHOTS = 101
     HARD_CASES = 102

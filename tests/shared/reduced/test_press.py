@@ -19,10 +19,14 @@ def first_alone(models, points, weights):
     names = (
         "centres", "frames", "pressures", "whole", "mix", "defect", "guess", "directions", "change"
     )  # fmt: skip
+    nodes, basis = models.window(models.region[0])
     return replace(
         models,
         **{name: getattr(models, name)[:1] for name in names},
-        basis=models.basis[models.region[:1]],
+        node_from=np.array([0, len(nodes)]),
+        nodes=nodes,
+        basis=basis.ravel(),
+        far=models.far[models.region[:1]],
         steps=models.steps[models.region[:1]],
         region=np.zeros(1, np.int32),
         point_from=np.array([0, len(points)]),
