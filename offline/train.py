@@ -1,7 +1,7 @@
 """The training pipeline: from a scene to its artifact.
 
-1. The largest pressure at points all over the accessible surface (full model).
-2. Regions: nonlinear Ritz vectors of many footprints and a common basis for them.
+1. The largest pressure at points all over the accessible surface.
+2. Regions: windows, nonlinear Ritz vectors of many footprints and a common basis for them.
 3. Patches: modes, cubature and first guess of every local model.
 4. The reduced model, pressed everywhere, lowers the range where the tissue gives way.
 5. Full solutions of random queries, each half of which validates the error estimate of the other.
