@@ -25,6 +25,10 @@ from palpate.shared.arrays import Array, Numbers
 from palpate.shared.errors import PalpateError
 
 
+LARGE = 30_000
+"""Unknowns from which on nested dissection always wins."""
+
+
 class NotPositiveDefinite(PalpateError):
     """Some direction has no stiffness or a negative one."""
 
@@ -37,7 +41,7 @@ class Pardiso:
 
     It works on one core, for one thread at a time, and lets other threads run meanwhile.  Minimum
     degree leaves less fill in small systems, nested dissection in large ones (5 889 unknowns: 17
-    against 23 ms; 39 480: 1660 against 570 ms), so both are tried.
+    against 23 ms; 39 480: 1660 against 570 ms), so both are tried on all but ``LARGE`` ones.
 
     Parameters
     ----------
@@ -51,7 +55,8 @@ class Pardiso:
         self._upper = np.flatnonzero(pattern.indices >= rows)  # all that PARDISO reads
         starts = np.searchsorted(rows[self._upper], np.arange(n + 1)).astype(np.int32)
         columns = pattern.indices[self._upper].astype(np.int32)
-        jobs = [_PardisoJob(starts, columns, ordering) for ordering in _PardisoJob.ORDERINGS]
+        orderings = _PardisoJob.ORDERINGS if n < LARGE else _PardisoJob.ORDERINGS[1:]
+        jobs = [_PardisoJob(starts, columns, ordering) for ordering in orderings]
         for job in jobs:
             job(_PardisoJob.ANALYSE)
         self._job, *others = sorted(jobs, key=lambda job: job.fill)
