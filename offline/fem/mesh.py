@@ -57,9 +57,8 @@ def build_mesh(scene: Scene, ticks: Ticks | None = None) -> Mesh:
     geometry = scene.geometry
     if ticks is None:
         ticks = ticks_of(geometry)
-    reference = HEX20_NODES if geometry.element == "hex20" else HEX_CORNERS
     a, b, c = cells = cells_of(ticks)
-    places, elements, faces, sides = _lattice(cells, reference)
+    places, elements, faces, sides = _lattice(cells, _reference(geometry))
     grid = shape_of(scene).grid(*divided(ticks, (2 * a, 2 * b, 2 * c)))
     nodes = grid.reshape(-1, 3)[np.ravel_multi_index(places.T, grid.shape[:3])]
     _refuse_inverted(nodes, elements)
@@ -154,6 +153,11 @@ def _refuse_inverted(nodes: Array, elements: Numbers) -> None:
         )
 
 
+def _reference(geometry: Extrusion | Block) -> Array:
+    """Nodes (8 or 20, 3) of an element on [-1, 1]^3."""
+    return HEX20_NODES if geometry.element == "hex20" else HEX_CORNERS
+
+
 def _lattice(divisions: Cells, reference: Array) -> tuple[Ints, Numbers, Numbers, Ints]:
     """Hexahedra of a lattice whose nodes on [-1, 1]^3 are ``reference`` (8 or 20, 3).
 
@@ -186,6 +190,11 @@ def _face_nodes(corners: tuple[int, ...], nodes_per_element: int) -> list[int]:
     edges = [{corners[i], corners[(i + 1) % 4]} for i in range(4)]
     lookup = [set(edge) for edge in HEX_EDGES]
     return [*corners, *(8 + lookup.index(edge) for edge in edges)]
+
+
+def node_places(scene: Scene, cells: Cells) -> Ints:
+    """Places (n, 3) of a mesh's nodes in the grid of corners of elements and half-way places."""
+    return _lattice(cells, _reference(scene.geometry))[0]
 
 
 def mesh_quality(mesh: Mesh) -> dict[str, float]:

@@ -44,9 +44,9 @@ class Layout:
         rng, blend = stream(scene.seed, Stage.LAYOUT), scene.training.blend
         self._scene, self._surface, self._limits, self.size = scene, surface, limits, size
         count = spacing_count(surface, size.patch_spacing)
-        self.centres = _centred_points(surface, count, rng)  # (p, 3) mm
+        self.centres = centred_points(surface, count, rng)  # (p, 3) mm
         count = spacing_count(surface, scene.training.region_spacing)
-        region = cKDTree(_centred_points(surface, count, rng)).query(self.centres)[1]
+        region = cKDTree(centred_points(surface, count, rng)).query(self.centres)[1]
         region = np.unique(region, return_inverse=True)[1].astype(np.int32)
         order = np.argsort(region, kind="stable")
         self.centres, self.region = self.centres[order], region[order]  # (p,), ascending
@@ -88,7 +88,7 @@ class Layout:
         return np.unique(np.concatenate([self.learns_from[k] for k in own]))
 
 
-def _centred_points(surface: Surface, count: int, rng: np.random.Generator) -> Array:
+def centred_points(surface: Surface, count: int, rng: np.random.Generator) -> Array:
     """Points (count, 3) mm by Lloyd's relaxation of evenly spread ones: none is left on the rim."""
     points = spread_points(surface, count, rng)
     sample = random_points(surface, LLOYD_SAMPLE * count, rng)
