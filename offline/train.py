@@ -5,6 +5,7 @@
 3. Patches: modes, cubature and first guess of every local model.
 4. The reduced model, pressed everywhere, lowers the range where the tissue gives way.
 5. Full solutions of random queries, each half of which validates the error estimate of the other.
+6. Full solutions on finer meshes, for the mesh's part of that estimate.
 
 Every finished task is on disk before it counts; see ``run.workers``.
 """
@@ -50,6 +51,7 @@ from palpate.offline.reduce.window import (
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.workers import Checkpoint, Tasks, content_key, open_scene, run, worker_pool
 from palpate.offline.scenes import default_artifact, find_scene
+from palpate.offline.validate import mesh_part
 from palpate.offline.validate.compare import (
     Row,
     calibrate,
@@ -79,7 +81,7 @@ TRIAL_PATCHES = 8
 PLACES = 64
 """Where the reduced model is asked in one task."""
 
-TIP_SAMPLES = 300
+TIP_SAMPLES = 200
 """Full solutions under the tip that validate and calibrate."""
 
 MOST_HISTORIES = 48
@@ -186,6 +188,7 @@ class Pipeline:
             if not kind.lacks(self.scene):
                 estimators[kind.name], tables[kind] = self._validate(kind, model)
                 documents[kind.document] = summarise(kind, tables[kind])
+        estimators["mesh"], training["mesh_errors"] = self._mesh_part(model)
         training |= {"seconds": self.seconds, "layout": self._describe(layout, models)}
         self.provenance["wall_seconds"] = round(time.perf_counter() - self.started, 1)
         where = "at vertices: limit along the normal, compliance, depth of the tip"
@@ -296,6 +299,12 @@ class Pipeline:
         ]
         fit = partial(calibrate, share=kind.coverage, damping=kind.damping)
         return calibrate_by_halves([row.known for row in rows], fit), rows
+
+    def _mesh_part(self, model: ReducedModel) -> tuple[Array, dict[str, Any]]:
+        """Fit the mesh's part of the error estimate."""
+        loads = mesh_part.places(model, stream(self.scene.seed, Stage.MESH_PART))
+        tasks = {f"mesh-{i}": (mesh_part.mesh_errors, own) for i, own in enumerate(loads)}
+        return mesh_part.fit(loads, self._stage("errors of the mesh", tasks))
 
     # --- pieces --------------------------------------------------------------------------------
 

@@ -13,9 +13,9 @@ from palpate.shared.reduced.transfer import Local, Past
 class Answer(NamedTuple):
     """Answer to one load or one position of the tip, at once or at the end of a time step.
 
-    By itself it says that nothing is known.  Errors are relative to the full model on the same mesh
-    and calibrated to cover 95 % of cases; infinite beyond the range or without equilibrium.  Over a
-    history they are the largest until now, relative to the largest until now.
+    By itself it says that nothing is known.  Errors are relative, those of mesh and reduction
+    together, and calibrated to cover 95 % of cases; infinite beyond the range or without
+    equilibrium.  Over a history they are the largest until now, relative to the largest until now.
     """
 
     contact_point: Array = np.zeros(3)  # mm, on the surface; of a tip, where its force acts on it
@@ -29,6 +29,7 @@ class Answer(NamedTuple):
     error_displacement: float = math.inf  # estimated
     error_von_mises: float = math.inf  # estimated
     error_force: float = math.inf  # estimated; that of a load is given
+    error_reduction: Array = np.full(3, math.inf)  # of these, beside the same mesh's full model
     min_jacobian: float = 1.0  # smallest det F among the cubature points
     pressure_limit: float = 0.0  # kPa, largest trained, in the direction of the load or the normal
     depth_limit: float = 0.0  # mm, largest trained of the tip; 0 in a scene without one

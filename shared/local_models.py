@@ -169,6 +169,9 @@ class Estimators:
     touches: Annotated[Array | None, "tip_error_coefficients", "1", _FITTED] = None
     histories: Annotated[Array | None, "history_error_coefficients", "1", _FITTED] = None
     courses: Annotated[Array | None, "tip_history_error_coefficients", "1", _FITTED] = None
+    mesh: Annotated[
+        Array | None, "mesh_error_coefficients", "1", "same for the mesh; features: 1, load / limit"
+    ] = None
 
     def coefficients(self, tip: bool, in_time: bool) -> Array:
         """Of answers to loads or under the tip, at once or in time; 0 if not calibrated."""

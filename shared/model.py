@@ -250,7 +250,9 @@ class ReducedModel:
             )
         parts = tuple([(k, w, own.warm.q[slot].copy()) for slot, k, w in answering])
         converged = found.status.item() == newton.CONVERGED
-        errors = _UNKNOWN if outside or not converged else found.errors
+        unknown = bool(outside) or not converged
+        reduction = _UNKNOWN if unknown else found.errors.copy()
+        total = self._total(reduction, pressure / found.limit.item())
         return Answer(
             contact_point=found.foot.copy(),
             normal=found.upward.copy(),
@@ -260,9 +262,10 @@ class ReducedModel:
             iterations=int(found.iterations.item()),
             in_range=not outside,
             out_of_range=outside,
-            error_displacement=errors.item(0),
-            error_von_mises=errors.item(1),
+            error_displacement=total[0],
+            error_von_mises=total[1],
             error_force=0.0,
+            error_reduction=reduction,
             min_jacobian=found.min_jacobian.item(),
             pressure_limit=found.limit.item(),
             depth_limit=found.limits.item(TIP_DEPTH),
@@ -350,11 +353,13 @@ class ReducedModel:
             outside += ("position",)
         if depth > limit * (1 + 1e-9):
             outside += ("depth",)
-        errors = found.errors
+        reduction, total = found.errors.copy(), [0.0] * 3
         if outside or not converged:
-            errors = _UNKNOWN
+            reduction = _UNKNOWN
         elif not touched and past is None:
-            errors = _NONE
+            reduction = _NONE
+        if reduction is not _NONE:
+            total = self._total(reduction, depth / limit)
         return Answer(
             contact_point=found.point.copy(),
             normal=found.normal.copy(),
@@ -364,9 +369,10 @@ class ReducedModel:
             iterations=int(found.iterations.item()),
             in_range=not outside,
             out_of_range=outside,
-            error_displacement=errors.item(0),
-            error_von_mises=errors.item(1),
-            error_force=errors.item(2),
+            error_displacement=total[0],
+            error_von_mises=total[1],
+            error_force=total[2],
+            error_reduction=reduction,
             min_jacobian=found.min_jacobian.item(),
             pressure_limit=found.limits.item(0),
             depth_limit=limit,
@@ -385,6 +391,17 @@ class ReducedModel:
             active=active,
             solve_seconds=time.perf_counter() - started,
         )
+
+    def _total(self, reduction: Array, share: float) -> list[float]:
+        """Estimated errors of reduction and mesh together, at a share of the limit."""
+        errors: list[float] = reduction.tolist()
+        if self.estimators.mesh is None:
+            return errors
+        share = min(max(share, 0.0), 1.0)
+        mesh = self.estimators.mesh.tolist()
+        return [
+            math.hypot(e, math.exp(a + b * share)) for e, (a, b) in zip(errors, mesh, strict=True)
+        ]
 
     def _memory(self, tip: bool, warm: Warm | None, past: Past | None, dt: float) -> Workspace:
         """Memory to answer with: the caller's, or the model's own, which knows no last answer."""

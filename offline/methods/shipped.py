@@ -52,8 +52,8 @@ class Shipped(Method):
         tolerance = self._atlas.scene.tolerance
         doubted = not (
             found.in_range
-            and found.error_displacement <= tolerance.displacement
-            and found.error_von_mises <= tolerance.von_mises
+            and found.error_reduction[0] <= tolerance.displacement
+            and found.error_reduction[1] <= tolerance.von_mises
         )
         return Answer(found, doubted=doubted)
 

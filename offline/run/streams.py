@@ -24,6 +24,7 @@ class Stage(IntEnum):
     MESH_CHOICE = 12
     TRIAL_LOADS = 13
     BODY_MODES = 14
+    MESH_PART = 15
     UNSEEN = 100
     SNAPSHOTS = 101
     HARD_CASES = 102

@@ -119,7 +119,7 @@ def compare(
             converged=answer.converged,
             # a pressed footprint has one equilibrium within the range of loads
             comparable=answer.converged and (kind is LOADS or own[0] <= OTHER_EQUILIBRIUM),
-            estimated=np.array([getattr(answer, f"error_{name}") for name in kind.quantities]),
+            estimated=answer.error_reduction[: len(kind.quantities)],
         )
         for own, answer in zip(errors, answers, strict=True)
     ]

@@ -167,9 +167,9 @@ class Trust(BaseModel):
     )
     out_of_range: list[str] = Field(description="The contact's fields that are not.")
     error_estimate: dict[FieldName, float | None] = Field(
-        description="Relative L2 errors against the full model that 95 % of answers stay within, "
-        "as fractions. Null outside the trained range. In a history: the largest error so far "
-        "relative to the largest norm so far of the field."
+        description="Relative L2 errors of mesh and reduction together that 95 % of answers stay "
+        "within, as fractions. Null outside the trained range. In a history: the largest error "
+        "so far relative to the largest norm so far of the field."
     )
     min_jacobian: float = Field(
         description="Smallest volume ratio at the model's points; 1 at rest, 0 is collapse."

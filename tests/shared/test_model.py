@@ -35,8 +35,12 @@ def test_an_answer_within_the_range_says_so(atlas, contact):
     assert solution.distance == pytest.approx(0, abs=1e-9)
     np.testing.assert_allclose(solution.direction, -solution.normal)
     assert 0 < solution.min_jacobian < 1
-    assert 0 < solution.error_displacement < 0.1
-    assert 0 < solution.error_von_mises < 0.2
+    reduction, most = solution.error_reduction, (0.1, 0.2)
+    for own, total, bound in zip(
+        reduction, (solution.error_displacement, solution.error_von_mises), most, strict=False
+    ):
+        assert 0 < own < bound
+        assert own < total < 0.5  # with the mesh's part, which is large on so coarse a mesh
     assert solution.contact_displacement @ solution.normal < 0
 
 

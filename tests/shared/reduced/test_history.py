@@ -146,7 +146,7 @@ HOP += [(LIFTED, 2.5, 0.01), (LIFTED, 2.5, 0.3)]
 def test_from_model_to_model_the_past_is_not_lost_and_a_dent_stays_behind(tool, problem, course):
     answers, full, found = errors(tool, problem, course)
     assert len({answer.past.main for answer in answers}) > 1
-    assert np.all(found <= [0.03, 0.05, 0.03][: found.shape[1]])
+    assert np.all(found <= [0.035, 0.05, 0.03][: found.shape[1]])
     sizes = np.linalg.norm(full.u, axis=(1, 2))
     assert sizes[-1] > 0.1 * sizes.max()
 
@@ -254,8 +254,10 @@ def test_the_error_stays_unknown_once_a_history_has_left_the_range(tool):
         answer = tool(share, past=past, dt=0.1)
         past = answer.past
         assert answer.out_of_range == ((tool.limit_name,) if share > 1.0 else ())
-        for error in (answer.error_displacement, answer.error_von_mises):
+        for error in answer.error_reduction[:2]:
             assert 0.0 < error < 0.3 if known else error == np.inf
+        for error in (answer.error_displacement, answer.error_von_mises):
+            assert np.isfinite(error) == known
 
 
 def test_a_load_out_of_range_in_other_ways_leaves_the_error_unknown_too(atlas):
