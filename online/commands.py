@@ -39,7 +39,7 @@ def serve(**settings: Any) -> None:
 
 @click.command(epilog=_LOADTEST_EXAMPLES)
 @click.argument("url")
-@click.argument("scene", default="turbinate-tip")
+@click.argument("scene", default="turbinate")
 @options(Plan)
 @click.option(
     "--out",

@@ -24,7 +24,6 @@ from scipy.sparse.linalg import SuperLU, splu
 from palpate.shared.arrays import Array, Numbers
 from palpate.shared.errors import PalpateError
 
-
 LARGE = 30_000
 """Unknowns from which on nested dissection always wins."""
 

@@ -43,7 +43,7 @@ class Discretisation(NamedTuple):
 
     def body(self) -> FullProblem:
         """The turbinate in this mesh."""
-        scene = find_scene("turbinate")
+        scene = find_scene("turbinate-paper")
         geometry = scene.geometry.model_copy(update=self._asdict())
         return FullProblem(scene.model_copy(update={"geometry": geometry}))
 

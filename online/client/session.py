@@ -171,7 +171,7 @@ class Session:
 
     Examples
     --------
-    >>> with Session("http://127.0.0.1:8000", "turbinate-tip") as session:      # doctest: +SKIP
+    >>> with Session("http://127.0.0.1:8000", "turbinate") as session:      # doctest: +SKIP
     ...     reply = session.step((11.9, 20.0, 11.0))
     ...     print(reply.force, reply.tangent)
     """

@@ -14,7 +14,7 @@ RADIUS = 2.0  # mm
 
 @pytest.fixture(scope="module")
 def turbinate():
-    mesh = build_mesh(find_scene("turbinate"))
+    mesh = build_mesh(find_scene("turbinate-paper"))
     return mesh, accessible_surface(mesh)
 
 

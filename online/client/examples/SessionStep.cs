@@ -1,7 +1,7 @@
 // One step of a session for .NET 8 or newer (and Unity from 2021 on): where the tip is, what it
 // feels. In a console project:
 //
-//   dotnet run -- ws://127.0.0.1:8000/scenes/turbinate-tip/session 11.9 20 11
+//   dotnet run -- ws://127.0.0.1:8000/scenes/turbinate/session 11.9 20 11
 //
 // The structs are the frames of version 2, little-endian like every machine that .NET runs on.
 // Units: mm, mN, kPa, s. What the members mean is said in online/PROTOCOL.md and in the greeting

@@ -1,7 +1,7 @@
 // One step of a session: where the tip is, what it feels.
 //
 //   c++ -std=c++17 -O2 -o session_step session_step.cpp
-//   ./session_step 127.0.0.1 8000 turbinate-tip 11.9 20 11
+//   ./session_step 127.0.0.1 8000 turbinate 11.9 20 11
 #include <chrono>
 #include <cstdio>
 #include <cstdlib>

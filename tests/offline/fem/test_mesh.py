@@ -52,7 +52,7 @@ def variant(name, *changes):
 @cache
 def turbinate_hex8():
     divisions = ("[13, 2, 13]", "[23, 3, 20]")
-    return build_mesh(variant("turbinate", ('"hex20"', '"hex8"'), divisions))
+    return build_mesh(variant("turbinate-paper", ('"hex20"', '"hex8"'), divisions))
 
 
 def test_elements_are_not_inverted_every_node_is_used_and_the_surface_is_not_held(mesh):
@@ -88,18 +88,20 @@ def test_turbinate_has_the_promised_size_and_the_volume_of_the_section():
     assert turbinate_hex8().nodes.size == pytest.approx(6048, rel=0.03)
     # less what the turned corners take
     expected = 40.0 * abs(polygon_area(read_outline(OUTLINE))) * (1 - 3.5e-3)
-    for name, dofs, tolerance in (("turbinate-paper", 6048, 4e-3), ("turbinate-fine", 4e4, 1e-3)):
+    for name, dofs, tolerance in (("turbinate-paper", 6048, 4e-3), ("turbinate", 22143, 1e-3)):
         mesh = shipped_mesh(name)
         assert mesh.nodes.size == pytest.approx(dofs, rel=0.03)
         assert mesh_quality(mesh)["volume_mm3"] == pytest.approx(expected, rel=tolerance)
 
 
 def test_elements_are_well_shaped_and_of_even_size_along_the_outer_side():
-    quality = mesh_quality(shipped_mesh("turbinate"))
+    quality = mesh_quality(shipped_mesh("turbinate-paper"))
     assert quality["scaled_jacobian_min"] > 0.3
     assert quality["scaled_jacobian_median"] > 0.85
     assert quality["aspect_ratio_max"] < 10
     assert quality["jacobian_ratio_min"] > 0.04
+    # with rows at the lip its elements are slender, but less distorted
+    assert mesh_quality(shipped_mesh("turbinate"))["jacobian_ratio_min"] > 0.15
     perfect = dict.fromkeys(quality, 1.0) | {"volume_mm3": 1000.0}
     assert mesh_quality(shipped_mesh("cube")) == pytest.approx(perfect)
     mesh = turbinate_hex8()
@@ -122,7 +124,7 @@ def test_turbinate_is_touched_medially_and_below_end_to_end_and_clamped_on_the_l
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     assert np.abs(normals[:, 1]).max() < 1e-12
     assert normals[:, 0].max() > 0.99  # medial
-    assert normals[:, 2].min() < -0.99  # inferior
+    assert normals[:, 2].min() < -0.98  # inferior
     assert normals[:, 0].min() < -0.6  # lateral-inferior, towards the hook
     x, y, z = mesh.nodes[mesh.clamped].T
     assert x.max() < 4.4
@@ -134,12 +136,12 @@ def test_turbinate_is_touched_medially_and_below_end_to_end_and_clamped_on_the_l
 @pytest.mark.parametrize("divisions", [(7, 2), (10, 2), (13, 3), (20, 4), (40, 3)])
 def test_no_element_of_the_turbinate_is_inverted_however_coarse_or_fine(divisions, grading):
     changes = ("[13, 2, 13]", str([*divisions, 2])), ("grading = 1.7", f"grading = {grading}")
-    quality = mesh_quality(build_mesh(variant("turbinate", *changes)))
+    quality = mesh_quality(build_mesh(variant("turbinate-paper", *changes)))
     assert quality["jacobian_ratio_min"] > 0.005
 
 
 @pytest.mark.parametrize("element", ["hex8", "hex20"])
-@pytest.mark.parametrize("name", ["turbinate", "quick"])
+@pytest.mark.parametrize("name", ["turbinate-paper", "quick"])
 def test_a_mesh_may_have_other_ticks_than_those_of_the_divisions(name, element):
     scene = variant(name, ('"hex20"', f'"{element}"'))
     own, built = ticks_of(scene.geometry), build_mesh(scene)
@@ -156,8 +158,8 @@ def test_a_mesh_may_have_other_ticks_than_those_of_the_divisions(name, element):
 
 @pytest.mark.parametrize("rows", [1, 3, 6])
 def test_a_refined_lip_has_short_rows_and_thin_layers_at_its_edges_only(rows):
-    scene = variant("turbinate", ("lip_rows = 0", f"lip_rows = {rows}"), ("[13, 2", "[16, 3"))
-    mesh, plain = build_mesh(scene), build_mesh(variant("turbinate", ("[13, 2", "[16, 3")))
+    scene = variant("turbinate-paper", ("lip_rows = 0", f"lip_rows = {rows}"), ("[13, 2", "[16, 3"))
+    mesh, plain = build_mesh(scene), build_mesh(variant("turbinate-paper", ("[13, 2", "[16, 3")))
     assert len(mesh.elements) == (16 + rows) * 3 * 13
     assert mesh_quality(mesh)["jacobian_ratio_min"] > 2 * mesh_quality(plain)["jacobian_ratio_min"]
     along, _, layers = ticks_of(scene.geometry)
@@ -174,7 +176,7 @@ def test_what_hangs_from_a_refined_lip_moves_as_it_does_on_far_finer_meshes():
     moved = []
     for rows in (0, 2):
         changes = ("lip_rows = 0", f"lip_rows = {rows}"), ("[13, 2, 13]", "[13, 3, 16]")
-        body = FullProblem(variant("turbinate", *changes))
+        body = FullProblem(variant("turbinate-paper", *changes))
         nodal, normal = body.unit_load(x)
         load = (nodal[:, None] * normal).reshape(-1)[body.model.free]
         moved.append(load @ body.model.solve_linear(load) / nodal.sum())
@@ -185,7 +187,7 @@ def test_what_hangs_from_a_refined_lip_moves_as_it_does_on_far_finer_meshes():
 def test_a_mesh_with_an_inverted_element_is_refused_and_says_where():
     folded = ("[13, 2, 13]", "[3, 1, 2]")
     with pytest.raises(SceneError, match=r"2 of 6 elements are inverted, .* \([\d., ]+\) mm"):
-        build_mesh(variant("turbinate", folded))
+        build_mesh(variant("turbinate-paper", folded))
 
 
 def test_volume_ratios_are_looked_for_at_nodes_and_between_points():
@@ -240,9 +242,14 @@ def test_local_thickness():
         ("quick", '"bottom"', '"bottom"\nx = [20, 30]', "support: no face"),
         ("quick", '"top"', '"top"\ny = [-2, -1]', "surface: no face"),
         ("quick", '"bottom"', '"top"', "surface: the support holds all of it"),
-        ("turbinate", "turbinate_section", "nothing", "section: .* cannot be read"),
-        ("turbinate", "[1.2, 2.9]", "[3.2, 7.0]", "corners: must lie on the outline"),
-        ("turbinate", "[[4.3, 17.7], [1.2, 2.9]", "[[1.2, 2.9], [4.3, 17.7]", "corners: .* clockw"),
+        ("turbinate-paper", "turbinate_section", "nothing", "section: .* cannot be read"),
+        ("turbinate-paper", "[1.2, 2.9]", "[3.2, 7.0]", "corners: must lie on the outline"),
+        (
+            "turbinate-paper",
+            "[[4.3, 17.7], [1.2, 2.9]",
+            "[[1.2, 2.9], [4.3, 17.7]",
+            "corners: .* clockw",
+        ),
     ],
 )
 def test_impossible_meshes_are_refused(name, old, new, message):
@@ -252,7 +259,7 @@ def test_impossible_meshes_are_refused(name, old, new, message):
 
 def test_a_scene_is_found_by_name_or_path_and_meshed_with_its_folder_alone():
     assert find_scene("quick") == find_scene(FOLDER / "quick.toml")
-    with pytest.raises(SceneError, match="turbinate-fine"):
+    with pytest.raises(SceneError, match="turbinate-visco"):
         find_scene("turbine")
     with pytest.raises(SceneError, match="folder"):
         build_mesh(parse_scene(find_scene("turbinate").text))

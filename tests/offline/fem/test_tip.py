@@ -48,9 +48,9 @@ def test_a_ball_on_a_layer_is_that_of_hertz_whatever_the_mesh():
     ("name", "place", "off"),
     [
         ("quick", (4.0, 7.0, 8.0), 0.002),
-        ("turbinate", (10.18, 20.0, 11.0), 0.01),
+        ("turbinate-paper", (10.18, 20.0, 11.0), 0.01),
         # triangles, on which places lie, cut the round edge by a micrometre
-        ("turbinate", (6.3, 20.0, 0.1), 0.06),
+        ("turbinate-paper", (6.3, 20.0, 0.1), 0.06),
     ],
 )
 def test_the_tangent_is_the_derivative_of_the_force(name, place, off):

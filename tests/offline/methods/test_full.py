@@ -20,7 +20,7 @@ def test_other_meshes_give_linear_fields_at_the_nodes_of_the_scene(problem, fact
 
 @pytest.mark.parametrize("lip_rows", [0, 2])
 def test_a_mesh_twice_as_fine_has_the_nodes_of_a_section_s_mesh(lip_rows):
-    scene = find_scene("turbinate")
+    scene = find_scene("turbinate-paper")
     changed = {"divisions": (7, 3, 2), "lip_rows": lip_rows}
     geometry = scene.geometry.model_copy(update=changed)
     body = FullProblem(scene.model_copy(update={"geometry": geometry}))

@@ -22,7 +22,7 @@ DOWN = np.array([0.0, 0.0, -1.0])
 TILTED = np.array([0.0, 0.6, -0.8])
 
 
-@pytest.fixture(scope="module", params=["quick", "turbinate"])
+@pytest.fixture(scope="module", params=["quick", "turbinate-paper"])
 def body(request):
     return FullProblem(find_scene(request.param))
 
@@ -163,7 +163,7 @@ def test_the_full_model_is_approached(problem):
 
 
 def test_fitting_makes_up_for_stiff_tetrahedra():
-    problem = FullProblem(find_scene("turbinate"))
+    problem = FullProblem(find_scene("turbinate-paper"))
     point = problem.surface.vertices[len(problem.surface.vertices) // 2]
     load = Load(point, -problem.unit_load(point)[1], 0.05)
     expected = problem.solve(load).displacement

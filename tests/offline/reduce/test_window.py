@@ -9,7 +9,7 @@ from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.reduce.cubature import residuals_left
 from palpate.offline.reduce.join import bases_of
 from palpate.offline.reduce.ritz import Footprint, region, ritz_vectors
-from palpate.offline.reduce.window import WindowProblem, body_modes, window_elements
+from palpate.offline.reduce.window import SPACING, WindowProblem, body_modes, window_elements
 from palpate.shared.fields import FieldRecovery
 from palpate.shared.local_models import LocalModels
 from palpate.shared.scene import parse_scene
@@ -45,7 +45,8 @@ def pressed(whole):
 
 @pytest.fixture(scope="module")
 def body(whole):
-    x, y = np.meshgrid(np.arange(1.0, 60.0, 2.0), [1.0, 3.0, 5.0, 7.0])
+    """Return modes as training makes them: of footprints two radii apart."""
+    x, y = np.meshgrid(np.arange(1.5, 60.0, SPACING * 1.5), [1.0, 4.0, 7.0])
     return body_modes(whole, np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 6.0)]))
 
 
@@ -77,7 +78,8 @@ def test_ritz_vectors_of_a_window_are_those_of_the_body(whole, part, body, press
         known = vectors(whole, exact, pressed[0])
         u = everywhere(whole, part, body, vectors(part, found, pressed[0]))
         largest = np.linalg.norm(known[:, :3], axis=0).max()
-        assert np.linalg.norm(u - known, axis=0).max() <= 2.5e-3 * largest
+        # of an error of 1 % that an answer may have, less than half
+        assert np.linalg.norm(u - known, axis=0).max() <= 4e-3 * largest
 
 
 def test_energy_and_products_of_states_are_those_of_the_body(whole, part, body, pressed, rng):
