@@ -32,8 +32,9 @@ LEVELS = 0.3, 1.0
 """Shares of the limit at which footprints press there."""
 
 GIVEN_WAY = 0.3
-"""Error of displacement beyond which the finer mesh has given way where the scene's own has not:
-that is no error of a size, and the limit there is too high.  Training says how many there are."""
+"""Error of displacement, of all or under the footprint, beyond which the finer mesh has given way
+where the scene's own has not: that is no error of a size, and the limit there is too high.
+Training says how many there are."""
 
 COVERED, DAMPING = 0.96, 0.3
 """Of the fit, see ``compare.calibrate``."""
@@ -89,7 +90,12 @@ def fit(loads: list[list[Load]], found: list[list[Array]]) -> tuple[Array, dict[
     }
     rows = [row for own in found for row in own]
     known = [
-        KnownAnswer(row[1:], np.array([1.0, shares[row[0]]]), True, comparable=row[1] < GIVEN_WAY)
+        KnownAnswer(
+            row[1:],
+            np.array([1.0, shares[row[0]]]),
+            True,
+            comparable=max(row[1], row[3]) < GIVEN_WAY,
+        )
         for row in rows
     ]
     table = np.array([answer.errors for answer in known if answer.comparable])
