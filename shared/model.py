@@ -353,12 +353,10 @@ class ReducedModel:
             outside += ("position",)
         if depth > limit * (1 + 1e-9):
             outside += ("depth",)
-        reduction, total = found.errors.copy(), [0.0] * 3
-        if outside or not converged:
-            reduction = _UNKNOWN
-        elif not touched and past is None:
-            reduction = _NONE
-        if reduction is not _NONE:
+        if not outside and converged and not touched and past is None:
+            reduction, total = _NONE, [0.0] * 3
+        else:
+            reduction = _UNKNOWN if outside or not converged else found.errors.copy()
             total = self._total(reduction, depth / limit)
         return Answer(
             contact_point=found.point.copy(),

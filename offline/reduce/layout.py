@@ -101,6 +101,15 @@ def centred_points(surface: Surface, count: int, rng: np.random.Generator) -> Ar
     return points
 
 
+def centred_points_and_rim(
+    surface: Surface, count: int, rim: int, rng: np.random.Generator
+) -> Array:
+    """As ``centred_points``, but one in ``rim``, the first among them, is on the rim."""
+    points = centred_points(surface, count, rng)
+    points[::rim] = surface.vertices[rng.choice(surface.rim(), len(points[::rim]))]
+    return points
+
+
 def _within(radius: float, at: Array, points: Array) -> list[Ints]:
     """Indices of ``points`` within ``radius`` of each row of ``at``, ascending."""
     found = cKDTree(points).query_ball_point(at, radius, return_sorted=True)

@@ -14,10 +14,10 @@ import numpy as np
 
 from palpate.offline.fem.graded import FIT_FOR_THE_TIP, Graded, parameters_of
 from palpate.offline.fem.mesh import ticks_of
-from palpate.offline.fem.model import NoEquilibrium
+from palpate.offline.fem.model import Equilibrium, NoEquilibrium
 from palpate.offline.fem.norms import relative, statistics
 from palpate.offline.fem.problem import FullProblem, Load, TipPosition
-from palpate.offline.reduce.layout import centred_points
+from palpate.offline.reduce.layout import centred_points_and_rim
 from palpate.offline.run.tables import write_csv
 from palpate.offline.studies.references import in_parallel, kept_results
 from palpate.offline.validate.compare import opened
@@ -25,6 +25,7 @@ from palpate.offline.validate.queries import Place, held_out
 from palpate.shared.arrays import Array, Flags
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.model import ReducedModel
+from palpate.shared.near_field import Contact
 from palpate.shared.scene import Scene, parse_scene
 
 RIM = 4
@@ -61,9 +62,7 @@ def truth(artifact: Path, scene: Scene, places: int, seed: int) -> dict[str, Any
         and of the tip; ``covered``, the share of total errors within the estimates.
     """
     atlas, _ = opened(artifact)
-    rng = held_out(atlas, seed)
-    points, rim = centred_points(atlas.surface, places, rng), atlas.surface.rim()
-    points[::RIM] = atlas.surface.vertices[rng.choice(rim, len(points[::RIM]))]
+    points = centred_points_and_rim(atlas.surface, places, RIM, held_out(atlas, seed))
     tasks = {"place": [(at_place, artifact, scene.folder, x) for x in points]}
     checkpoint = kept_results(artifact, scene, "truth", (places, seed))
     found = in_parallel(artifact, checkpoint, "references", tasks)["place"]
@@ -126,21 +125,22 @@ def _exact(reference: Graded, at: Array, step: Load | TipPosition) -> Seen:
     """What the reference says, at parameters (n, 3)."""
     problem = reference.problem
     if isinstance(step, Load):
-        found = problem.solve(step)
-        contact = problem.footprint(step)
+        seen = _own(problem, step)
     else:
-        found = problem.model.solve(problem.sphere_at(step.position))
-        contact = None
-    u = found.displacement
-    stress = problem.von_mises(u, contact=contact)
-    peaks = problem.stress_field.peaks(u, None, contact)
-    return Seen(reference.at(at, u), reference.at(at, stress), peaks, found.force)
+        seen = _seen(problem, problem.model.solve(problem.sphere_at(step.position)), None)
+    u, stress = (reference.at(at, field) for field in (seen.displacement, seen.von_mises))
+    return seen._replace(displacement=u, von_mises=stress)
 
 
 def _own(problem: FullProblem, step: Load | TipPosition) -> Seen:
     """What the full model on the scene's own mesh says."""
     found = problem.solve(step)
-    u, contact = found.displacement, problem.footprint(step, found)
+    return _seen(problem, found, problem.footprint(step, found))
+
+
+def _seen(problem: FullProblem, found: Equilibrium, contact: Contact | None) -> Seen:
+    """What a full model says in an equilibrium, with the near field of a contact if it has one."""
+    u = found.displacement
     stress = problem.von_mises(u, contact=contact)
     return Seen(u, stress, problem.stress_field.peaks(u, None, contact), found.force)
 

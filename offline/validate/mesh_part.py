@@ -13,7 +13,7 @@ from palpate.offline.fem.mesh import ticks_of
 from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.norms import relative, statistics
 from palpate.offline.fem.problem import FullProblem, Load
-from palpate.offline.reduce.layout import centred_points
+from palpate.offline.reduce.layout import centred_points_and_rim
 from palpate.offline.reduce.sampling import spacing_count
 from palpate.offline.validate.compare import KnownAnswer, calibrate
 from palpate.offline.validate.queries import Place
@@ -46,8 +46,7 @@ def places(model: ReducedModel, rng: np.random.Generator) -> list[list[Load]]:
     """Loads along the normal at places all over the surface."""
     surface = model.surface
     count = max(LEAST, spacing_count(surface, APART * model.scene.endoscope.radius))
-    points = centred_points(surface, count, rng)
-    points[::RIM] = surface.vertices[rng.choice(surface.rim(), len(points[::RIM]))]
+    points = centred_points_and_rim(surface, count, RIM, rng)
     found = [Place.at(model, point) for point in points]
     return [[place.press(-place.normal, level) for level in LEVELS] for place in found]
 
