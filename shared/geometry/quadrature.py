@@ -5,12 +5,12 @@ import numpy as np
 from palpate.shared.arrays import Array, Numbers
 from palpate.shared.errors import PalpateError
 from palpate.shared.geometry.elements import (
-    HEX_CORNERS,
     gauss,
     hexahedron,
     quadrilateral,
     shape,
 )
+from palpate.shared.geometry.recovery import lattice
 from palpate.shared.mechanics.footprint import SurfaceQuadrature
 from palpate.shared.mechanics.stress import StressRecovery
 from palpate.shared.mechanics.tissue import Law
@@ -80,16 +80,16 @@ def stress_recovery(
 ) -> StressRecovery:
     """Recovery of nodal stresses from 2x2x2 points per element of one tissue; law (e,)."""
     gradients, _ = volume_quadrature(nodes, elements, 2)
-    at, _ = gauss(2, 3)
-    to_points, _ = shape(HEX_CORNERS, at)
-    to_corners: Array = np.linalg.inv(to_points).astype(float)
-    at_corners = np.einsum("cq,eqni->enic", to_corners, gradients)
-    count = np.bincount(elements.ravel(), minlength=len(nodes))
+    carried = lattice(nodes, elements)
     return StressRecovery(
         connectivity=np.ascontiguousarray(elements, dtype=np.int32),
-        gradients=np.ascontiguousarray(at_corners, dtype=precision),
-        to_points=np.ascontiguousarray(to_points.T),
-        to_corners=np.ascontiguousarray(to_corners.T),
+        gradients=np.ascontiguousarray(np.moveaxis(gradients, 1, 3), dtype=precision),
+        to_corners=np.ascontiguousarray(carried.to_corners, dtype=precision),
+        boundary=carried.boundary,
+        partners=carried.partners,
+        signs=carried.signs.astype(precision),
+        midsides=carried.midsides,
+        lines=carried.lines,
+        shares=carried.shares.astype(precision),
         law=law.at(np.zeros(len(nodes), int)),
-        elements_at=np.maximum(count, 1).astype(precision),
     )

@@ -1,9 +1,9 @@
 """Von Mises stress at the nodes, recovered from the displacement.
 
-Its gradients are taken at the Gauss points, where they converge fastest, carried to the nodes of
-each element by the trilinear field through its 2x2x2 points, and averaged over the elements that
-share a node.  The law makes a stress of what comes out.  Under a contact the gradients recovered
-are those that a near field leaves of the displacement; see ``shared.near_field``.
+Its gradients are taken at the Gauss points, where they converge fastest, and carried to the nodes by
+quadratic fields through those around each (``geometry.recovery``).  The law makes a stress of what
+comes out.  Under a contact the gradients recovered are those that a near field leaves of the
+displacement; see ``shared.near_field``.
 """
 
 from typing import NamedTuple
@@ -13,13 +13,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from palpate.shared.arrays import Array, Ints, Numbers
-from palpate.shared.geometry.elements import HEX_EDGES
 from palpate.shared.mechanics import laws, viscosity
 from palpate.shared.mechanics.tensors import (
     FAST,
     add_identity,
     add_to_packed,
-    constant,
     load,
     load_packed,
     packed,
@@ -30,19 +28,23 @@ from palpate.shared.mechanics.tensors import (
 )
 from palpate.shared.mechanics.tissue import Law
 
-EDGES = np.array(HEX_EDGES)
-"""Corners (12, 2) either side of the midside nodes, a constant for the compiler."""
-
 
 class StressRecovery(NamedTuple):
-    """What recovery needs of a mesh: 2x2x2 points per element, point index last."""
+    """What recovery needs of a mesh: 2x2x2 points per element, point index last.
+
+    See ``geometry.recovery.Lattice`` for what carries values to the nodes.
+    """
 
     connectivity: Numbers  # (e, n)
-    gradients: NDArray[np.floating]  # (e, n, 3, 8) 1/mm: carried from the points to the corners
-    to_points: Array  # (8, 8) values at points from those at corners, last index of the points
-    to_corners: Array  # (8, 8) and its inverse
+    gradients: NDArray[np.floating]  # (e, n, 3, 8) 1/mm, at the points
+    to_corners: NDArray[np.floating]  # (e, 8, 8)
+    boundary: Ints  # (k,)
+    partners: Ints  # (k,)
+    signs: NDArray[np.floating]  # (k,)
+    midsides: Ints  # (m,)
+    lines: Ints  # (m, 4)
+    shares: NDArray[np.floating]  # (m, 4)
     law: Law  # (nodes,)
-    elements_at: NDArray[np.floating]  # (nodes,) number of elements that share a node
 
 
 class NearField(NamedTuple):
@@ -63,29 +65,26 @@ def nodal_von_mises(mesh, u, B, near, out):
     """
     count, own = len(out), _without(u, near)
     sums, H = np.zeros(9 * count, mesh.gradients.dtype), np.empty(72, mesh.gradients.dtype)
-    flat = mesh.gradients.reshape(len(mesh.connectivity), -1)
+    corners, flat = np.empty_like(H), mesh.gradients.reshape(len(mesh.connectivity), -1)
     for e in range(len(mesh.connectivity)):
         _gradients(mesh.connectivity[e], flat[e], own, H)
-        _add_to_nodes(mesh, e, H, sums)
+        _add_to_corners(mesh, e, H, corners, sums)
+    _complete(mesh, sums)
     for k in range(len(near.points)):
         node = near.points[k]
         for i in range(9):
-            added = near.gradient[k, i // 3, i % 3] * mesh.elements_at[node]
-            sums[i * count + node] += added
+            sums[i * count + node] += near.gradient[k, i // 3, i % 3]
     if B is None:
         for n in range(count):
-            F = add_identity(scale(1.0 / mesh.elements_at[n], load(sums, n, count)), 1.0)
-            out[n] = laws.von_mises(mesh.law.at(n), F)
+            out[n] = laws.von_mises(mesh.law.at(n), add_identity(load(sums, n, count), 1.0))
     else:
-        past, corners = np.zeros(6 * count), np.empty(48)
+        past, own_corners = np.zeros(6 * count), np.empty(48)
         for e in range(len(mesh.connectivity)):
-            _carry(mesh.to_corners, B[e].reshape(-1), corners)
-            _add_to_nodes(mesh, e, corners, past)
+            _add_to_corners(mesh, e, B[e].reshape(-1), own_corners, past)
+        _complete(mesh, past)
         for n in range(count):
-            share = 1.0 / mesh.elements_at[n]
-            F = add_identity(scale(share, load(sums, n, count)), 1.0)
-            mean = scale(share, unpacked(load_packed(past, n, count)))
-            out[n] = viscosity.von_mises(mesh.law.at(n), F, mean)
+            F = add_identity(load(sums, n, count), 1.0)
+            out[n] = viscosity.von_mises(mesh.law.at(n), F, unpacked(load_packed(past, n, count)))
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
@@ -100,10 +99,9 @@ def point_von_mises(mesh, u, B, near, exact, out):
         for i in range(9):
             added[e, 8 * i + q] = exact.gradient[k, i // 3, i % 3]
     flat = mesh.gradients.reshape(len(mesh.connectivity), -1)
-    corners, H = np.empty(72, flat.dtype), np.empty(72)
+    H = np.empty(72, flat.dtype)
     for e in range(len(mesh.connectivity)):
-        _gradients(mesh.connectivity[e], flat[e], own, corners)
-        _carry(mesh.to_points, corners, H)
+        _gradients(mesh.connectivity[e], flat[e], own, H)
         law, found = mesh.law.at(mesh.connectivity[e, 0]), out[8 * e : 8 * e + 8]
         for k in range(72):
             H[k] += added[e, k]
@@ -135,10 +133,9 @@ def remember(mesh, u, share, B):
     linear part of a small displacement that stands for all shares; point index last.
     """
     flat = mesh.gradients.reshape(len(mesh.connectivity), -1)
-    H, corners = np.empty(72), np.empty(72)
+    H = np.empty(72)
     for e in range(len(mesh.connectivity)):
-        _gradients(mesh.connectivity[e], flat[e], u, corners)
-        _carry(mesh.to_points, corners, H)
+        _gradients(mesh.connectivity[e], flat[e], u, H)
         b = B[e].reshape(-1)
         for q in range(8):
             G = load(H, q, 8)
@@ -150,7 +147,7 @@ def remember(mesh, u, share, B):
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
 def _gradients(connectivity, flat, u, H):
-    """Displacement gradients (72,) at the corners of an element."""
+    """Displacement gradients (72,) at the points of an element."""
     H[:] = 0.0
     for a in range(len(connectivity)):
         node = connectivity[a]
@@ -163,26 +160,34 @@ def _gradients(connectivity, flat, u, H):
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def _carry(matrix, values, out):
-    """Carry components (8 k,) from corners to points of an element, or back."""
-    out[:] = 0.0
+def _add_to_corners(mesh, e, values, corners, sums):
+    """Add an element's share of components (8 k,) at its points to sums (k nodes,) at its corners.
+
+    ``corners`` (8 k,) is scratch.
+    """
+    nodes, matrix, components = mesh.connectivity[e], mesh.to_corners[e], len(values) // 8
+    count = len(sums) // components
+    corners[:] = 0.0
     for k in range(0, len(values), 8):
-        for c in range(8):
-            for q in range(8):
-                out[k + q] += matrix[c, q] * values[k + c]
-
-
-@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def _add_to_nodes(mesh, e, corners, sums):
-    """Add components (8 k,) at the corners of an element, and half-way, to sums (k nodes,)."""
-    nodes, count = mesh.connectivity[e], len(mesh.elements_at)
-    half, midsides = constant(0.5, corners[0]), len(nodes) == 20
-    for k in range(len(corners) // 8):
+        for q in range(8):
+            for c in range(8):
+                corners[k + c] += matrix[q, c] * values[k + q]
+    for k in range(components):
         # unsigned numbers need no check whether they count from the end
         for c in range(8):
             sums[np.uint64(k * count + nodes[c])] += corners[8 * k + c]
-        if midsides:
-            for m in range(12):
-                one, other = np.uint64(8 * k + EDGES[m, 0]), np.uint64(8 * k + EDGES[m, 1])
-                both = corners[one] + corners[other]
-                sums[np.uint64(k * count + nodes[8 + m])] += half * both
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def _complete(mesh, sums):
+    """Complete sums (k nodes,) on the boundary and at midsides."""
+    count = len(mesh.law.mu)
+    for first in range(0, len(sums), count):
+        own = sums[first : first + count]
+        for k in range(len(mesh.boundary)):
+            own[np.uint64(mesh.boundary[k])] += mesh.signs[k] * own[np.uint64(mesh.partners[k])]
+        for m in range(len(mesh.midsides)):
+            value = mesh.shares[m, 0] * own[np.uint64(mesh.lines[m, 0])]
+            for j in range(1, 4):
+                value += mesh.shares[m, j] * own[np.uint64(mesh.lines[m, j])]
+            own[np.uint64(mesh.midsides[m])] = value
