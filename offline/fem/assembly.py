@@ -8,10 +8,15 @@ from numba import njit
 
 from palpate.shared.mechanics import laws, tissue, viscosity
 from palpate.shared.mechanics.tensors import (
+    FAST,
+    add_identity,
     cofactor,
+    combine,
     det,
     isochoric,
+    load,
     load_packed,
+    store,
     store_packed,
     unpacked,
 )
@@ -59,6 +64,49 @@ def elastic_residual(conn, grad, weight, law, u, r):
             energy += weight[e, q] * law.at(e).energy(J, part)
             _add_point_force(conn[e], grad[e, q], weight[e, q], P, r)
     return energy, smallest
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
+def paired_residuals(conn, grad, weight, law, u, combined, sign, r):
+    """Add internal forces of superposed displacements, two by two, to ``r`` (3 nodes, k) mN.
+
+    Displacements u (3 nodes, m) mm are superposed by combined (m, 2 k); the force of the j-th and
+    ``sign`` times that of the (k + j)-th make column j.  Gradients are taken once, and all goes on
+    side by side.  Nothing may be inverted.
+    """
+    m, k = u.shape[1], r.shape[1]
+    H, F, P = np.empty((9, m)), np.empty((9, 2 * k)), np.empty((9, k))
+    tensors, pairs = F.reshape(-1), P.reshape(-1)
+    for e in range(len(conn)):
+        point = law.at(e)
+        for q in range(weight.shape[1]):
+            H[:] = 0.0
+            for a in range(conn.shape[1]):
+                x, y, z = grad[e, q, a, 0], grad[e, q, a, 1], grad[e, q, a, 2]
+                for i in range(3):
+                    row = u[3 * conn[e, a] + i]
+                    for j in range(m):
+                        H[3 * i, j] += row[j] * x
+                        H[3 * i + 1, j] += row[j] * y
+                        H[3 * i + 2, j] += row[j] * z
+            for i in range(9):
+                for j in range(2 * k):
+                    F[i, j] = 0.0
+                for n in range(m):
+                    for j in range(2 * k):
+                        F[i, j] += H[i, n] * combined[n, j]
+            for j in range(2 * k):
+                _, _, S = point.first_piola(add_identity(load(tensors, j, 2 * k), 1.0))
+                store(S, tensors, j, 2 * k)
+            for j in range(k):
+                one, other = load(tensors, j, 2 * k), load(tensors, k + j, 2 * k)
+                store(combine(weight[e, q], one, sign * weight[e, q], other), pairs, j, k)
+            for a in range(conn.shape[1]):
+                x, y, z = grad[e, q, a, 0], grad[e, q, a, 1], grad[e, q, a, 2]
+                for i in range(3):
+                    row = r[3 * conn[e, a] + i]
+                    for j in range(k):
+                        row[j] += P[3 * i, j] * x + P[3 * i + 1, j] * y + P[3 * i + 2, j] * z
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})

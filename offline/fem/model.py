@@ -166,6 +166,24 @@ class FullModel:
             raise PalpateError("displacement: it inverts an element")
         return force[self.free]
 
+    def paired_forces(self, states: Array, one: Array, other: Array, sign: float) -> Array:
+        """Internal forces (k, free dofs) mN of small displacements, ``f(one) + sign f(other)``.
+
+        ``one`` and ``other`` (k, m) say how states (m, free dofs) mm are superposed.
+        """
+        u = np.zeros((3 * len(self.mesh.nodes), len(states)))
+        u[self.free] = states.T
+        combined = np.concatenate([one, other]).T
+        forces = np.zeros((len(u), len(one)))
+        assembly.paired_residuals(*self._elements, u, np.ascontiguousarray(combined), sign, forces)
+        if self.terms:
+            added = np.zeros((combined.shape[1], len(u)))
+            for displacement, force in zip(combined.T @ u.T, added, strict=True):
+                for term in self.terms:
+                    term.add_force(displacement, force)
+            forces += (added[: len(one)] + sign * added[len(one) :]).T
+        return forces[self.free].T
+
     def filled(self, u: Array) -> Array:
         """Displacement (3 nodes,) mm from that of the free dofs."""
         displacement = np.zeros(3 * len(self.mesh.nodes))

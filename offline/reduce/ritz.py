@@ -17,6 +17,7 @@ The vectors of all footprints of a region are compressed to one basis.
 """
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -42,6 +43,9 @@ TANGENTIAL = 0.6
 
 POINTS_IN_BASIS = 50
 """Footprints all of whose Ritz vectors make up a basis; of further ones only the linear do."""
+
+ABREAST = 8
+"""Footprints whose linear responses are found together: more gain no more."""
 
 RESOLUTION = 2e-6
 """Displacement (mm) that a step of a stored mode amounts to where the mode is at work: a mode of
@@ -86,17 +90,29 @@ def ritz_vectors(model: FullModel, loads: Array) -> Array:
     They are of first, second (over 2!) and third order (over 3!): 3 + 6 + 10 of three directions.
     ``loads`` (free dofs, d) mN, a column per direction, are scaled to the loads expected.
     """
-    first = model.solve_linear(loads)
-    second_at, third_at = (_lattice(order, loads.shape[1]) for order in (2, 3))
-    second = model.solve_linear(
-        np.stack([-_even_part(model, a, SECOND_STEP) for a in second_at @ first.T], axis=1)
-    )
-    # the second-order vector of any direction follows from those: a quadratic form
-    paths = zip(third_at @ first.T, _form(third_at, 2) @ second.T, strict=True)
-    third = model.solve_linear(
-        np.stack([-_odd_part(model, a, b, THIRD_STEP) for a, b in paths], axis=1)
-    )
-    return np.hstack([first, second / 2, third / 6])
+    return path_derivatives(model, loads.T[None])[0][0].T
+
+
+def path_derivatives(model: FullModel, loads: Array) -> tuple[Array, Array]:
+    """Ritz vectors (f, k, n) mm of f footprints, and the forces (f, k, n) mN that they answer to.
+
+    Each linear response takes the factor of the stiffness through the processor, so all are asked
+    for together.  ``loads`` are (f, d, free dofs) mN; see ``ritz_vectors``.
+    """
+    beyond = model.body.shape[1]
+    loads = np.pad(loads, ((0, 0), (0, 0), (0, beyond)))
+    first = _responses(model, loads)
+    even = np.array([_even_parts(model, one) for one in first])
+    second = _responses(model, even)
+    odd = np.array([_odd_parts(model, *one) for one in zip(loads, first, second, strict=True)])
+    third = _responses(model, odd)
+    vectors = np.concatenate([first, second / 2, third / 6], axis=1)
+    return vectors, np.concatenate([loads, even / 2, odd / 6], axis=1)
+
+
+def _responses(model: FullModel, forces: Array) -> Array:
+    """Linear responses (f, k, n) mm to forces (f, k, n) mN."""
+    return model.solve_linear(forces.reshape(-1, forces.shape[2]).T).T.reshape(forces.shape)
 
 
 def _lattice(order: int, variables: int) -> Array:
@@ -117,18 +133,31 @@ def _form(t: Array, degree: int) -> Array:
     return np.asarray(np.linalg.solve(at.T, _monomials(t, degree).T).T, float)
 
 
-def _even_part(model: FullModel, a: Array, step: float) -> Array:
-    """``R''[a, a]`` by central differences along ``s a``."""
-    h = step / np.abs(model.filled(a)).max()
-    return (model.internal_free(h * a) + model.internal_free(-h * a)) / h**2
+def _even_parts(model: FullModel, first: Array) -> Array:
+    """``-R''[a, a]`` (k, n) by central differences along ``s a``, ``a`` on the lattice."""
+    along = _lattice(2, len(first))
+    h = SECOND_STEP / _largest(model, along @ first)
+    steps = h[:, None] * along
+    return model.paired_forces(first, steps, -steps, 1.0) / -(h**2)[:, None]
 
 
-def _odd_part(model: FullModel, a: Array, b: Array, step: float) -> Array:
-    """``R'''[a, a, a] + 3 R''[a, b]``: third derivative along ``s a + s^2 b / 2``."""
-    h = step / np.abs(model.filled(a)).max()
-    curve = h * h / 2 * b
-    odd = (model.internal_free(h * a + curve) - model.internal_free(curve - h * a)) / 2
-    return 6 * (odd - h * (model.rest_stiffness @ a)) / h**3
+def _odd_parts(model: FullModel, loads: Array, first: Array, second: Array) -> Array:
+    """``-R'''[a, a, a] - 3 R''[a, b]`` (k, n): third derivatives along ``s a + s^2 b / 2``.
+
+    The second-order vector ``b`` of any ``a`` is a quadratic form, given on its lattice.
+    """
+    along = _lattice(3, len(first))
+    h = THIRD_STEP / _largest(model, along @ first)
+    steps, curves = h[:, None] * along, (h**2 / 2)[:, None] * _form(along, 2)
+    odd = model.paired_forces(
+        np.vstack([first, second]), np.hstack([steps, curves]), np.hstack([-steps, curves]), -1.0
+    )
+    return 6 * (steps @ loads - odd / 2) / (h**3)[:, None]
+
+
+def _largest(model: FullModel, states: Array) -> Array:
+    """Largest displacements (k,) mm of states (k, n)."""
+    return np.abs(states[:, : len(model.free)]).max(axis=1)
 
 
 def energy_pod(model: FullModel, vectors: Array, size: int) -> tuple[Array, Array]:
@@ -137,15 +166,23 @@ def energy_pod(model: FullModel, vectors: Array, size: int) -> tuple[Array, Arra
     Returns modes (free dofs, <= size), ``modes.T @ K @ modes = I``, fewer if the vectors have no
     more to give, and eigenvalues (k,) of the Gram matrix, descending.
     """
-    gram = vectors.T @ (model.rest_stiffness @ vectors)
-    energies, Q = np.linalg.eigh(gram)
+    modes, energies = _leading(vectors.T, (model.rest_stiffness @ vectors).T, size)
+    # once more against round-off: the Gram matrix squares the condition number
+    gram = modes @ (model.rest_stiffness @ modes.T)
+    L = np.linalg.cholesky(gram)
+    return np.asarray(np.linalg.solve(L, modes).T), energies
+
+
+def _leading(vectors: Array, forces: Array, size: int) -> tuple[Array, Array]:
+    """Modes (<= size, n) and energies (k,) of ``energy_pod``, of vectors (k, n).
+
+    ``forces`` (k, n) do as much work on any vector as the rest stiffness times these vectors.
+    """
+    energies, Q = np.linalg.eigh(vectors @ forces.T)
     energies, Q = energies[::-1], Q[:, ::-1]
     kept = min(size, int((energies > 1e-12 * energies[0]).sum()))
-    modes = vectors @ (Q[:, :kept] / np.sqrt(energies[:kept]))
-    # once more against round-off: the Gram matrix squares the condition number
-    gram = modes.T @ (model.rest_stiffness @ modes)
-    L = np.linalg.cholesky(gram)
-    return np.linalg.solve(L, modes.T).T, energies
+    modes: Array = (Q[:, :kept] / np.sqrt(energies[:kept])).T @ vectors
+    return modes, np.asarray(energies)
 
 
 def whole_numbers(modes: Array, orthonormal: Field) -> tuple[NDArray[np.int16], Field]:
@@ -211,33 +248,33 @@ class Region:
 def region(problem: FullProblem, footprints: list[Footprint], modes: int) -> Region:
     """Basis of a region and the Ritz vectors of footprints in it."""
     model = problem.model
-    vectors = np.stack([_ritz(problem, footprint) for footprint in footprints], axis=1)
-    first = np.arange(vectors.shape[2]) % RITZ_VECTORS < 3
+    vectors, forces = _ritz(problem, footprints)
+    first = np.arange(vectors.shape[1]) % RITZ_VECTORS < 3
     apart = -(-len(footprints) // POINTS_IN_BASIS)
-    linear, rest = vectors[:, :, first], vectors[:, ::apart, ~first]
-    wanted = [part.reshape(len(vectors), -1) for part in (linear, rest)]
-    basis, _ = energy_pod(model, np.hstack(wanted), modes)
-    vectors = vectors.reshape(len(vectors), -1)
-    amplitude = np.sqrt(np.mean(((model.rest_stiffness @ basis).T @ vectors) ** 2, axis=1))
-    far = basis[len(model.free) :]
-    near = basis[: len(model.free)] - model.body @ far
-    largest = np.abs(near).max(axis=0)
+    learnt, their = (
+        np.concatenate([*rows[:, first], *rows[::apart, ~first]]) for rows in (vectors, forces)
+    )
+    basis, energies = _leading(learnt, their, modes)
+    amplitude = np.sqrt(energies[: len(basis)] / len(energies))
+    far = basis[:, len(model.free) :]
+    near = basis[:, : len(model.free)] - far @ model.body.T
+    largest = np.abs(near).max(axis=1)
     steps = np.clip(RESOLUTION / amplitude, largest / np.iinfo(np.int16).max, largest / 100)
     stored = np.zeros((len(steps), 3 * len(problem.mesh.nodes)), np.int16)
-    stored[:, model.free] = np.round(near / steps).T
+    stored[:, model.free] = np.round(near / steps[:, None])
     own = Region(
         nodes=problem.nodes,
         basis=stored,
         steps=steps.astype(np.float32),
-        far=far.T.astype(np.float16, order="C").astype(np.float32),
+        far=far.astype(np.float16, order="C").astype(np.float32),
         orthonormal=np.empty((0, 0), np.float32),
         ritz=np.empty((0, 0, 0), np.float32),
     )
     # rounding costs the modes their orthonormality: give it back by a change of coordinates
     rounded = own.states(model)
-    stiff = model.rest_stiffness @ rounded
-    L = np.linalg.cholesky(rounded.T @ stiff)
-    ritz = np.linalg.solve(L, stiff.T @ vectors).reshape(len(steps), len(footprints), -1)
+    L = np.linalg.cholesky(rounded.T @ (model.rest_stiffness @ rounded))
+    ritz = np.linalg.solve(L, rounded.T @ forces.reshape(-1, len(rounded)).T)
+    ritz = ritz.reshape(len(steps), len(footprints), -1)
     return replace(
         own,
         orthonormal=np.linalg.inv(L).T.astype(np.float32),
@@ -245,9 +282,24 @@ def region(problem: FullProblem, footprints: list[Footprint], modes: int) -> Reg
     )
 
 
-def _ritz(problem: FullProblem, footprint: Footprint) -> Array:
-    """Nonlinear Ritz vectors, and those of the relaxed tissue if time changes it."""
-    nodal, _ = problem.unit_load(footprint.point)
-    loads = (nodal[:, None, None] * footprint.loads.T).reshape(-1, 3)[problem.model.free]
-    models = [problem.model, problem.model.relaxed] if problem.model.prony else [problem.model]
-    return np.hstack([ritz_vectors(model, loads) for model in models])
+def _ritz(problem: FullProblem, footprints: Sequence[Footprint]) -> tuple[Array, Array]:
+    """``path_derivatives`` of footprints, and those of the relaxed tissue if time changes it.
+
+    Their forces are those of the tissue at once.
+    """
+    model = problem.model
+    models = [model, model.relaxed] if model.prony else [model]
+    states = len(model.free) + model.body.shape[1]
+    vectors, forces = np.empty((2, len(footprints), RITZ_VECTORS * len(models), states))
+    for start in range(0, len(footprints), ABREAST):
+        some = slice(start, start + ABREAST)
+        nodal = np.array([problem.unit_load(pressed.point)[0] for pressed in footprints[some]])
+        rows = np.array([pressed.loads for pressed in footprints[some]])
+        loads = np.einsum("fn,fdi->fdni", nodal, rows).reshape(*rows.shape[:2], -1)[..., model.free]
+        for i, one in enumerate(models):
+            own = some, slice(RITZ_VECTORS * i, RITZ_VECTORS * (i + 1))
+            vectors[own], forces[own] = path_derivatives(one, loads)
+            if one is not model:
+                flat = vectors[own].reshape(-1, states)
+                forces[own] = (model.rest_stiffness @ flat.T).T.reshape(forces[own].shape)
+    return vectors, forces

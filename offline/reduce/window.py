@@ -156,6 +156,12 @@ class WindowModel(FullModel):
         n = len(self.free)
         return np.concatenate([super().internal_free(u[:n]), self._far @ u[n:]])
 
+    def paired_forces(self, states: Array, one: Array, other: Array, sign: float) -> Array:
+        """See ``FullModel``; of states, linear outside the window."""
+        n = len(self.free)
+        near = super().paired_forces(states[:, :n], one, other, sign)
+        return np.hstack([near, (one + sign * other) @ states[:, n:] @ self._far])
+
     def filled(self, u: Array) -> Array:
         """Displacement in the window (3 nodes,) mm of a state."""
         return super().filled(u[: len(self.free)])

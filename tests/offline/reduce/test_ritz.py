@@ -8,6 +8,7 @@ from palpate.offline.reduce.ritz import (
     Footprint,
     energy_pod,
     local_modes,
+    path_derivatives,
     ritz_vectors,
     whole_numbers,
 )
@@ -42,6 +43,18 @@ def test_ritz_vectors_give_the_derivatives_of_the_equilibrium_along_any_load(pro
     parts = footprint.series(found, load[None])
     for part, known, allowed in zip(parts, exact[1:4], (1e-9, 3e-3, 1e-2), strict=True):
         assert np.linalg.norm(part[0] - known) <= allowed * np.linalg.norm(known)
+
+
+def test_forces_of_ritz_vectors_are_their_stiffness_times_them(problem, pressed):
+    nodal, footprint, found = pressed
+    free = problem.model.free
+    loads = np.einsum("n,di->dni", nodal, footprint.loads).reshape(3, -1)[:, free]
+    vectors, forces = path_derivatives(problem.model, np.array([loads, 2 * loads]))
+    np.testing.assert_allclose(vectors[0].T, found, atol=1e-12 * np.abs(found).max())
+    orders = np.repeat([1, 2, 3], [3, 6, 10])[:, None]
+    np.testing.assert_allclose(vectors[1], 2.0**orders * vectors[0], atol=1e-4)
+    stiff = problem.model.rest_stiffness @ vectors[1].T
+    np.testing.assert_allclose(forces[1].T, stiff, atol=1e-9 * np.abs(stiff).max())
 
 
 def test_modes_are_orthonormal_in_the_energy_and_span_the_vectors(problem, pressed):

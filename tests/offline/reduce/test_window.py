@@ -92,6 +92,19 @@ def test_energy_and_products_of_states_are_those_of_the_body(whole, part, body, 
     )  # fmt: skip
 
 
+def test_paired_forces_are_internal_forces_two_by_two(part, pressed, rng):
+    for model in (part.model, part.model.relaxed):
+        states = vectors(part, model, pressed[0])[:, :4].T
+        one, other = 0.1 * rng.standard_normal((2, 3, 4))
+        for sign in (1.0, -1.0):
+            found = model.paired_forces(states, one, other, sign)
+            exact = [
+                model.internal_free(a @ states) + sign * model.internal_free(b @ states)
+                for a, b in zip(one, other, strict=True)
+            ]
+            np.testing.assert_allclose(found, exact, atol=1e-12 * np.abs(exact).max())
+
+
 def test_residuals_are_those_of_the_body(whole, part, body, pressed):
     load = Load(pressed[0].point, np.array([0.0, 0.0, -1.0]), 1.5)
     states = vectors(part, part.model, pressed[0])[:, :1] * [0.8, 1.2]
