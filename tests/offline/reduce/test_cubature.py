@@ -6,6 +6,7 @@ import pytest
 from palpate.offline.reduce.cubature import (
     STATES,
     compress,
+    drawn,
     linear_forces,
     nonlinear_forces,
     nonnegative,
@@ -46,6 +47,20 @@ def test_compression_keeps_what_matters(rng):
     for x in rng.standard_normal((10, POINTS)):
         exact = np.linalg.norm(contributions.T @ x)
         assert np.linalg.norm(A @ x) == pytest.approx(exact, rel=1e-3)
+
+
+def test_points_are_drawn_by_what_they_do_and_the_others_stay_in_the_sum(rng):
+    contributions = rng.standard_normal((POINTS, 40)) * rng.uniform(0.0, 1.0, POINTS)[:, None] ** 3
+    contributions[7] = 0.0
+    points, rows = drawn(contributions, 60, rng)
+    assert len(np.unique(points)) == len(points) == 60
+    np.testing.assert_array_equal(rows[:-1], contributions[points])
+    np.testing.assert_allclose(rows.sum(axis=0), contributions.sum(axis=0), atol=1e-10)
+    norms = np.linalg.norm(contributions, axis=1)
+    assert norms[points].mean() > 1.5 * norms.mean()
+    everything, rows = drawn(contributions, POINTS, rng)
+    np.testing.assert_array_equal(everything, np.delete(np.arange(POINTS), 7))
+    np.testing.assert_allclose(rows[-1], 0.0, atol=1e-10)
 
 
 def test_forces_of_all_points_are_the_sum_of_each_ones(rng):
