@@ -34,7 +34,7 @@ from palpate.shared.reduced.workspace import Workspace
 from palpate.shared.scene import Scene
 from palpate.shared.tables import press_models
 
-LOADS = 20
+LOADS = 16
 """Training loads of the cubature; each gives an equilibrium and a state off equilibrium."""
 
 EXTREME = 0.5
@@ -70,7 +70,7 @@ EQUATIONS = 300
 This, ``LOADS`` and ``RESIDUAL_LOADS`` are for the usual tolerance; see ``reduce.sampling.fewer``.
 """
 
-CANDIDATES = 10
+CANDIDATES = 6
 """Points that are drawn for each of those of the cubature to choose from."""
 
 NO_LIMIT = 1e9
