@@ -292,8 +292,8 @@ def truth(scene: str, artifact: Path | None, places: int, seed: int) -> Report:
 
     At PLACES places, one in four on the rim, loads and the rigid tip are solved on meshes graded
     towards each place. Errors are told apart by what makes them, mesh or reduction. The table goes
-    to NAME/report/truth.csv beside the artifact. Takes half an hour; a stopped run continues where
-    it was.
+    to NAME/report/truth.csv beside the artifact. Takes 20 minutes; a stopped run continues where it
+    was.
     """
     from palpate.offline.scenes import default_artifact, find_scene
     from palpate.offline.studies.truth import truth

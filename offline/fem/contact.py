@@ -6,6 +6,7 @@ afford; see ``mechanics.tip`` for the tip that is served.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
@@ -36,8 +37,7 @@ class SphereContact:
     def __init__(self, model: FullModel, surface: SphereSurface, sphere: Sphere) -> None:
         self.sphere = sphere
         self.surface = surface
-        self.size = model.tissue.young * sphere.radius**2
-        """The force is not known beforehand; this one dents the tissue by about the radius."""
+        self.young = model.tissue.young
         self._all = np.arange(len(surface.faces), dtype=np.int32)
         self.slots = model.face_slots(surface.faces)
         self.touching: Touching = room_for(surface, len(surface.faces))
@@ -64,8 +64,10 @@ class SphereLoad:
 
     @property
     def size(self) -> float:
-        """See ``DeadLoad``."""
-        return self.contact.size
+        """See ``DeadLoad``: about the force, which is not known beforehand."""
+        radius = self.contact.sphere.radius
+        depth = max(float(np.linalg.norm(self.approach)), 1e-6 * radius)
+        return self.contact.young * math.sqrt(radius * depth) * depth
 
     def at(self, fraction: float) -> SphereLoad:
         """See ``DeadLoad``."""

@@ -240,6 +240,7 @@ class FullModel:
         start: Array | None = None,
         smallest_step: float = SMALLEST_STEP,
         keep: bool = False,
+        tolerance: float = TOLERANCE,
     ) -> Equilibrium:
         """Equilibrium under a load, in one jump if that converges, else in load steps.
 
@@ -258,6 +259,8 @@ class FullModel:
         keep : bool
             Whether the equilibrium solved for last is near: its factorised tangent serves to begin
             with, and for the tangent of the reaction, which then is about right.
+        tolerance : float
+            See ``TOLERANCE``.
 
         Raises
         ------
@@ -275,7 +278,7 @@ class FullModel:
         volume = float(self.weights.sum())
         young = self.tissue.young
         floor, noise = ROUND_OFF * young * volume ** (2 / 3), NOISE * young * volume
-        target = max(TOLERANCE * max(term.size for term in (load, *tissue)), floor)
+        target = max(tolerance * max(term.size for term in (load, *tissue)), floor)
         u, converged = np.zeros((2, len(self.free)))
         if start is not None:
             u[:] = start.reshape(-1)[self.free]
