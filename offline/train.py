@@ -189,6 +189,8 @@ class Pipeline:
                 estimators[kind.name], tables[kind] = self._validate(kind, model)
                 documents[kind.document] = summarise(kind, tables[kind])
         estimators["mesh"], training["mesh_errors"] = self._mesh_part(model)
+        if model.has_tip:
+            estimators["mesh_tip"], training["mesh_errors_tip"] = self._mesh_part(model, tip=True)
         training |= {"seconds": self.seconds, "layout": self._describe(layout, models)}
         self.provenance["wall_seconds"] = round(time.perf_counter() - self.started, 1)
         where = "at vertices: limit along the normal, compliance, depth of the tip"
@@ -300,11 +302,12 @@ class Pipeline:
         fit = partial(calibrate, share=kind.coverage, damping=kind.damping)
         return calibrate_by_halves([row.known for row in rows], fit), rows
 
-    def _mesh_part(self, model: ReducedModel) -> tuple[Array, dict[str, Any]]:
-        """Fit the mesh's part of the error estimate."""
-        loads = mesh_part.places(model, stream(self.scene.seed, Stage.MESH_PART))
-        tasks = {f"mesh-{i}": (mesh_part.mesh_errors, own) for i, own in enumerate(loads)}
-        return mesh_part.fit(loads, self._stage("errors of the mesh", tasks))
+    def _mesh_part(self, model: ReducedModel, tip: bool = False) -> tuple[Array, dict[str, Any]]:
+        """Fit the mesh's part of the error estimate of loads or of the tip."""
+        places = mesh_part.places(model, stream(self.scene.seed, Stage.MESH_PART), tip)
+        name, title = ("mesh-tip", " under the tip") if tip else ("mesh", "")
+        tasks = {f"{name}-{i}": (mesh_part.mesh_errors, own) for i, own in enumerate(places)}
+        return mesh_part.fit(self._stage(f"errors of the mesh{title}", tasks), tip)
 
     # --- pieces --------------------------------------------------------------------------------
 

@@ -172,6 +172,9 @@ class Estimators:
     mesh: Annotated[
         Array | None, "mesh_error_coefficients", "1", "same for the mesh; features: 1, load / limit"
     ] = None
+    mesh_tip: Annotated[
+        Array | None, "tip_mesh_error_coefficients", "1", "same under the tip; 1, depth / limit"
+    ] = None
 
     def coefficients(self, tip: bool, in_time: bool) -> Array:
         """Of answers to loads or under the tip, at once or in time; 0 if not calibrated."""

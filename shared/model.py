@@ -252,7 +252,7 @@ class ReducedModel:
         converged = found.status.item() == newton.CONVERGED
         unknown = bool(outside) or not converged
         reduction = _UNKNOWN if unknown else found.errors.copy()
-        total = self._total(reduction, pressure / found.limit.item())
+        total = _total(reduction, self.estimators.mesh, pressure / found.limit.item())
         return Answer(
             contact_point=found.foot.copy(),
             normal=found.upward.copy(),
@@ -357,7 +357,7 @@ class ReducedModel:
             reduction, total = _NONE, [0.0] * 3
         else:
             reduction = _UNKNOWN if outside or not converged else found.errors.copy()
-            total = self._total(reduction, depth / limit)
+            total = _total(reduction, self.estimators.mesh_tip, depth / limit)
         return Answer(
             contact_point=found.point.copy(),
             normal=found.normal.copy(),
@@ -389,17 +389,6 @@ class ReducedModel:
             active=active,
             solve_seconds=time.perf_counter() - started,
         )
-
-    def _total(self, reduction: Array, share: float) -> list[float]:
-        """Estimated errors of reduction and mesh together, at a share of the limit."""
-        errors: list[float] = reduction.tolist()
-        if self.estimators.mesh is None:
-            return errors
-        share = min(max(share, 0.0), 1.0)
-        mesh = self.estimators.mesh.tolist()
-        return [
-            math.hypot(e, math.exp(a + b * share)) for e, (a, b) in zip(errors, mesh, strict=True)
-        ]
 
     def _memory(self, tip: bool, warm: Warm | None, past: Past | None, dt: float) -> Workspace:
         """Memory to answer with: the caller's, or the model's own, which knows no last answer."""
@@ -434,6 +423,18 @@ class ReducedModel:
         ``displacement`` is that of all nodes.  See ``StressField.peaks``.
         """
         return self.fields.peaks(answer, displacement)
+
+
+def _total(reduction: Array, mesh: Array | None, share: float) -> list[float]:
+    """Estimated errors of reduction and mesh together, at a share of the limit."""
+    errors: list[float] = reduction.tolist()
+    if mesh is None:
+        return errors
+    share = min(max(share, 0.0), 1.0)
+    return [
+        math.hypot(e, math.exp(a + b * share))
+        for e, (a, b) in zip(errors, mesh.tolist(), strict=True)
+    ]
 
 
 def _footprint(found: Outcome, radius: float) -> Contact:

@@ -32,9 +32,13 @@ class Grading(NamedTuple):
     support: float = 0.12  # at the edges of a clamped lip
 
 
-FIT_FOR_THE_TIP = Grading()
-"""Some 70 000 degrees of freedom on the turbinate; half as large edges move its compliance by .1 %,
-and a tip of a twentieth of its radius touches five faces across."""
+FIT_FOR_FOOTPRINTS = Grading(finest=0.2, even=0.8, growth=0.7, support=0.1)
+"""Some 60 000 to 84 000 degrees of freedom on the turbinate."""
+
+FIT_FOR_THE_TIP = Grading(finest=0.1, even=0.2, growth=1.2, support=0.15)
+"""Some 31 000 to 45 000 degrees of freedom on the turbinate.  A tip as deep as a twentieth of its
+radius touches four faces across; beside 47 000 with edges of .06 its force there is .2 % less, the
+fields at the nodes of a scene's own mesh differ by .4 (displacement) and 8 % (von Mises)."""
 
 
 class Graded:

@@ -8,19 +8,18 @@ the full model on the scene's own mesh errs by, the reduction's what the answer 
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from palpate.offline.fem.graded import FIT_FOR_THE_TIP, Graded, parameters_of
-from palpate.offline.fem.mesh import ticks_of
-from palpate.offline.fem.model import NoEquilibrium
+from palpate.offline.fem.graded import FIT_FOR_FOOTPRINTS, FIT_FOR_THE_TIP
 from palpate.offline.fem.norms import relative, statistics
 from palpate.offline.fem.problem import FullProblem, Load, TipPosition
 from palpate.offline.reduce.layout import centred_points_and_rim
 from palpate.offline.run.tables import write_csv
 from palpate.offline.studies.references import in_parallel, kept_results
 from palpate.offline.validate.compare import opened
+from palpate.offline.validate.mesh_part import Levels, Seen, compared
 from palpate.offline.validate.queries import LOADS, TIP, Place, held_out
 from palpate.shared.arrays import Array, Flags
 from palpate.shared.mechanics.footprint import TIP_DEPTH
@@ -39,19 +38,7 @@ DEPTHS = 0.05, 0.1, 0.2, 0.4, 0.6
 NEAR = 1.5
 """Distance from the contact, in radii, within which stress is also compared by itself."""
 
-CLOSE = 1e-4
-"""Residual of the integrated sphere, relative to its force, which then errs by as little."""
-
 Row = dict[str, Any]
-
-
-class Seen(NamedTuple):
-    """What one model says of a load or a position of the tip."""
-
-    displacement: Array  # (n, 3) mm, at the nodes of the scene's own mesh
-    von_mises: Array  # (n,) kPa
-    peaks: tuple[float, float]  # kPa, see ``StressField.peaks``
-    force: Array  # (3,) mN
 
 
 def truth(artifact: Path, scene: Scene, places: int, seed: int) -> dict[str, Any]:
@@ -79,36 +66,29 @@ def truth(artifact: Path, scene: Scene, places: int, seed: int) -> dict[str, Any
 
 
 KINDS = {"load": LOADS, "tip": TIP}
+GRADINGS = {"load": FIT_FOR_FOOTPRINTS, "tip": FIT_FOR_THE_TIP}
 
 
 def at_place(problem: FullProblem, artifact: Path, folder: Path | None, x: Array) -> list[Row]:
     """Errors at a point (3,) mm of the surface; a task for ``run.workers``."""
     atlas = _opened(artifact)
     scene = parse_scene(problem.scene.text, folder)
-    reference = Graded(scene, x, FIT_FOR_THE_TIP)
-    at = parameters_of(scene, ticks_of(scene.geometry))
-    fine, coarse = Pressed(reference.problem, integrated=True), Pressed(problem)
     away = np.linalg.norm(problem.mesh.nodes - x, axis=1)
     kept, rows = problem.beyond_clamped_layer, []
     near = kept & (away < NEAR * atlas.body.tip.radius)
-    for kind, level, step in _steps(atlas, x):
-        try:
-            exact, own = fine.harder(kind, level, step), coarse.harder(kind, level, step)
-        except NoEquilibrium:
-            continue
-        u, stress = (reference.at(at, field) for field in (exact.displacement, exact.von_mises))
-        exact = exact._replace(displacement=u, von_mises=stress)
-        answer, reduced = _reduced(atlas, step)
-        row: Row = {"kind": kind, **dict(zip("xyz", x.tolist(), strict=True)), "level": level}
-        for name, one, other in (
-            ("total", reduced, exact), ("mesh", own, exact), ("reduction", reduced, own)
-        ):  # fmt: skip
-            row |= {f"{name}_{key}": value for key, value in _errors(one, other, kept, near)}
-        row |= {
-            f"estimated_{key}": getattr(answer, f"error_{key}")
-            for key in ("displacement", "von_mises", "force")
-        }
-        rows.append(row)
+    for kind, levels in _levels(atlas, x):
+        for level, step, own, exact in compared(problem, scene, levels, GRADINGS[kind]):
+            answer, reduced = _reduced(atlas, step)
+            row: Row = {"kind": kind, **dict(zip("xyz", x.tolist(), strict=True)), "level": level}
+            for name, one, other in (
+                ("total", reduced, exact), ("mesh", own, exact), ("reduction", reduced, own)
+            ):  # fmt: skip
+                row |= {f"{name}_{key}": value for key, value in _errors(one, other, kept, near)}
+            row |= {
+                f"estimated_{key}": getattr(answer, f"error_{key}")
+                for key in ("displacement", "von_mises", "force")
+            }
+            rows.append(row)
     return rows
 
 
@@ -117,39 +97,14 @@ def _opened(artifact: Path) -> ReducedModel:
     return ReducedModel.load(artifact)
 
 
-def _steps(atlas: ReducedModel, x: Array) -> Iterator[tuple[str, float, Load | TipPosition]]:
-    """What presses at a point: kind, growing level (share of the limit, or mm) and step."""
+def _levels(atlas: ReducedModel, x: Array) -> Iterator[tuple[str, Levels]]:
+    """What presses at a point, by kind: growing levels (share of the limit, or mm) and steps."""
     place = Place.at(atlas, x)
-    for level in LEVELS:
-        yield "load", level, place.press(-place.normal, level)
-    if atlas.has_tip:
-        for depth in np.array(DEPTHS) * place.radius:
-            if depth <= place.limits[TIP_DEPTH]:
-                share = float(depth / place.limits[TIP_DEPTH])
-                yield "tip", float(depth), place.touch(share)
-
-
-class Pressed:
-    """A full model pressed harder and harder; the tip is integrated over its faces if wanted."""
-
-    def __init__(self, problem: FullProblem, integrated: bool = False) -> None:
-        self._problem, self._integrated = problem, integrated
-        self._last: dict[str, tuple[float, Array]] = {}
-
-    def harder(self, kind: str, level: float, step: Load | TipPosition) -> Seen:
-        """What it says at a level, sought from what the last one's of that kind grows to."""
-        problem, before = self._problem, self._last.get(kind)
-        start = None if before is None else level / before[0] * before[1]
-        if self._integrated and isinstance(step, TipPosition):
-            load, contact = problem.sphere_at(step.position), None
-            found = problem.model.solve(load, start=start, tolerance=CLOSE)
-        else:
-            found = problem.solve(step, start=start)
-            contact = problem.footprint(step, found)
-        u = found.displacement
-        self._last[kind] = level, u
-        stress, peaks = problem.von_mises(u, contact=contact), problem.stress_field.peaks
-        return Seen(u, stress, peaks(u, None, contact), found.force)
+    yield "load", [(level, place.press(-place.normal, level)) for level in LEVELS]
+    limit = float(place.limits[TIP_DEPTH])
+    depths = [depth * place.radius for depth in DEPTHS if depth * place.radius <= limit]
+    if depths:
+        yield "tip", [(depth, place.touch(depth / limit)) for depth in depths]
 
 
 def _reduced(atlas: ReducedModel, step: Load | TipPosition) -> tuple[Any, Seen]:
@@ -159,8 +114,9 @@ def _reduced(atlas: ReducedModel, step: Load | TipPosition) -> tuple[Any, Seen]:
     else:
         answer = atlas.touch(step.position)
     u = atlas.displacement(answer)
-    peaks = atlas.peaks(answer, u)
-    return answer, Seen(u.astype(float), atlas.von_mises(answer).astype(float), peaks, answer.force)
+    stress, peaks = atlas.von_mises(answer, displacement=u), atlas.peaks(answer, u)
+    felt = answer.contact_displacement if isinstance(step, Load) else answer.force
+    return answer, Seen(u.astype(float), stress.astype(float), peaks, felt)
 
 
 def _errors(one: Seen, other: Seen, kept: Flags, near: Flags) -> Iterator[tuple[str, float]]:
@@ -170,7 +126,7 @@ def _errors(one: Seen, other: Seen, kept: Flags, near: Flags) -> Iterator[tuple[
     yield "von_mises_near", relative(one.von_mises[near], other.von_mises[near])
     yield "peak", abs(one.peaks[0] / other.peaks[0] - 1)
     yield "p99", abs(one.peaks[1] / other.peaks[1] - 1)
-    yield "force", relative(one.force, other.force)
+    yield "force", relative(one.felt, other.felt)  # of a footprint: what it moves
 
 
 def _summary(rows: Sequence[Row], estimated: Sequence[str]) -> dict[str, Any]:

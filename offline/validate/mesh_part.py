@@ -1,10 +1,12 @@
 """What the mesh errs by: full solutions beside others on meshes graded towards the contact.
 
 The errors found make the mesh's part of every answer's error estimate, as those of random queries
-make the reduction's.
+make the reduction's.  Those under the tip are found beside the sphere integrated over the faces of
+such meshes, since an answer's fields lack its dent.
 """
 
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,92 +14,151 @@ from palpate.offline.fem.graded import Graded, Grading, parameters_of
 from palpate.offline.fem.mesh import ticks_of
 from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.norms import relative, statistics
-from palpate.offline.fem.problem import FullProblem, Load
+from palpate.offline.fem.problem import FullProblem, Load, TipPosition
 from palpate.offline.reduce.layout import centred_points_and_rim
 from palpate.offline.reduce.sampling import spacing_count
 from palpate.offline.validate.compare import KnownAnswer, calibrate
 from palpate.offline.validate.queries import Place
 from palpate.shared.arrays import Array
 from palpate.shared.model import ReducedModel
+from palpate.shared.scene import Scene
 
 GRADING = Grading(finest=0.25, even=0.6, growth=0.9, support=0.15)
 """Of references: under a footprint, which is smooth, their own error is a fifth of that of meshes
 that serve."""
 
-APART, LEAST, RIM = 4.0, 6, 6
-"""Distance of the places looked at, in radii, and their least number; one in so many is on the rim
-of the surface."""
+TIP_GRADING = Grading(finest=0.15, even=0.2, growth=1.2, support=0.2)
+"""The same under a tip, whose contact is a fifth of its radius across at a depth of a fiftieth."""
 
-LEVELS = 0.3, 1.0
-"""Shares of the limit at which footprints press there."""
+APART, LEAST, RIM = 4.0, 6, 6
+"""Distance of the places looked at, in radii, and their least number, which are those of the tip;
+one in so many is on the rim of the surface."""
+
+LEVELS, DEPTHS = (0.3, 1.0), (0.15, 0.8)
+"""Shares of the limit at which footprints and tips press there."""
+
+CLOSE = 1e-4
+"""Residual of the integrated sphere, relative to its force, which then errs by as little."""
 
 GIVEN_WAY = 0.3
-"""Error of displacement, of all or under the footprint, beyond which the finer mesh has given way
-where the scene's own has not: that is no error of a size, and the limit there is too high.
-Training says how many there are."""
+"""Error of displacement, of all or under the footprint, or of the tip's force, beyond which the
+finer mesh has given way where the scene's own has not: that is no error of a size, and the limit
+there is too high.  Training says how many there are."""
 
 COVERED, DAMPING = 0.96, 0.3
 """Of the fit, see ``compare.calibrate``."""
 
 NAMES = "displacement", "von_mises", "force"
+"""What errors are estimated of; those of ``StressField.peaks`` are only told."""
+
+Levels = Sequence[tuple[float, Load | TipPosition]]
+"""What presses at one place, harder and harder: share of the limit, or mm, and step."""
 
 
-def places(model: ReducedModel, rng: np.random.Generator) -> list[list[Load]]:
-    """Loads along the normal at places all over the surface."""
-    surface = model.surface
-    count = max(LEAST, spacing_count(surface, APART * model.scene.endoscope.radius))
-    points = centred_points_and_rim(surface, count, RIM, rng)
-    found = [Place.at(model, point) for point in points]
-    return [[place.press(-place.normal, level) for level in LEVELS] for place in found]
+class Seen(NamedTuple):
+    """What one model says of a load along the normal or a position of the tip."""
+
+    displacement: Array  # (n, 3) mm, at nodes
+    von_mises: Array  # (n,) kPa
+    peaks: tuple[float, float]  # kPa, see ``StressField.peaks``
+    felt: Array  # (3,) mN force of a tip, or mm that a footprint moves
 
 
-def mesh_errors(problem: FullProblem, loads: list[Load]) -> list[Array]:
-    """Errors (NAMES,) of a scene's mesh under loads at one place; a task for ``run.workers``.
+class Pressed:
+    """A full model pressed harder and harder; the tip is integrated over its faces if wanted."""
 
-    Relative L2 norms at its nodes, of stress outside the clamped layer; and the relative error of
-    the mean displacement under the footprint, beyond which a tip's force at a depth does not err.
+    def __init__(self, problem: FullProblem, integrated: bool = False) -> None:
+        self._problem, self._integrated = problem, integrated
+        self._last: tuple[float, Array] | None = None
+
+    def harder(self, level: float, step: Load | TipPosition) -> Seen:
+        """What it says at a level, sought from what the last level's displacement grows to."""
+        problem, before = self._problem, self._last
+        start = None if before is None else level / before[0] * before[1]
+        contact, felt = None, None
+        if isinstance(step, Load):  # where it is on every mesh, however far its surface goes
+            nodal = problem.unit_load_at(step.position, -step.direction)
+            forces = step.pressure * nodal[:, None] * step.direction
+            found = problem.model.solve(forces, start=start)
+            contact, felt = problem.footprint(step), nodal @ found.displacement / nodal.sum()
+        elif self._integrated:
+            load = problem.sphere_at(step.position)
+            found = problem.model.solve(load, start=start, tolerance=CLOSE)
+        else:
+            found = problem.solve(step, start=start)
+            contact = problem.footprint(step, found)
+        u = found.displacement
+        self._last = level, u
+        stress, peaks = problem.von_mises(u, contact=contact), problem.stress_field.peaks
+        return Seen(u, stress, peaks(u, None, contact), found.force if felt is None else felt)
+
+
+def compared(
+    problem: FullProblem, scene: Scene, levels: Levels, how: Grading
+) -> Iterator[tuple[float, Load | TipPosition, Seen, Seen]]:
+    """What the full model says, and one on a mesh graded towards the place, at the former's nodes.
+
+    The tip presses the latter as a sphere integrated over its faces.  Levels without equilibrium
+    are left out.
     """
-    scene, kept = problem.scene, problem.beyond_clamped_layer
-    fine = Graded(scene, loads[0].position, GRADING)
-    at, found = parameters_of(scene, ticks_of(scene.geometry)), []
-    for load in loads:
-        where = load.position, -load.direction, load.pressure * load.direction
+    fine = Graded(scene, levels[0][1].position, how)
+    at = parameters_of(scene, ticks_of(scene.geometry))
+    own, exact = Pressed(problem), Pressed(fine.problem, integrated=True)
+    for level, step in levels:
         try:
-            (u, under), (exact, mean) = (x.press_at(*where) for x in (problem, fine.problem))
+            found, there = own.harder(level, step), exact.harder(level, step)
         except NoEquilibrium:
             continue
-        stress, other = (
-            x.von_mises(v, contact=x.footprint(load))
-            for x, v in ((problem, u), (fine.problem, exact))
-        )
+        u, stress = (fine.at(at, field) for field in (there.displacement, there.von_mises))
+        yield level, step, found, there._replace(displacement=u, von_mises=stress)
+
+
+def places(model: ReducedModel, rng: np.random.Generator, tip: bool = False) -> list[Levels]:
+    """Footprints pressed along the normal at places all over the surface, or tips at a few."""
+    surface = model.surface
+    apart = spacing_count(surface, APART * model.scene.endoscope.radius)
+    points = centred_points_and_rim(surface, LEAST if tip else max(LEAST, apart), RIM, rng)
+    found = [Place.at(model, point) for point in points]
+    if tip:
+        return [[(level, place.touch(level)) for level in DEPTHS] for place in found]
+    return [[(level, place.press(-place.normal, level)) for level in LEVELS] for place in found]
+
+
+def mesh_errors(problem: FullProblem, levels: Levels) -> list[Array]:
+    """Levels and errors of a scene's mesh at one place; a task for ``run.workers``.
+
+    Relative L2 norms at its nodes, of stress outside the clamped layer; the relative error of a
+    tip's force, or of the mean displacement under a footprint; those of the largest stress and its
+    99th percentile.
+    """
+    kept, found = problem.beyond_clamped_layer, []
+    how = TIP_GRADING if isinstance(levels[0][1], TipPosition) else GRADING
+    for level, _, own, exact in compared(problem, problem.scene, levels, how):
         errors = (
-            relative(u, fine.at(at, exact)),
-            relative(stress[kept], fine.at(at, other)[kept]),
-            abs(float(np.linalg.norm(under) / np.linalg.norm(mean)) - 1.0),
+            relative(own.displacement, exact.displacement),
+            relative(own.von_mises[kept], exact.von_mises[kept]),
+            abs(float(np.linalg.norm(own.felt) / np.linalg.norm(exact.felt)) - 1.0),
+            *np.abs(np.divide(own.peaks, exact.peaks) - 1.0),
         )
-        found.append(np.array([load.pressure, *errors]))
+        found.append(np.array([level, *errors]))
     return found
 
 
-def fit(loads: list[list[Load]], found: list[list[Array]]) -> tuple[Array, dict[str, Any]]:
+def fit(found: Sequence[list[Array]], tip: bool = False) -> tuple[Array, dict[str, Any]]:
     """Coefficients (NAMES, 2) of the log of the mesh's errors in 1 and the share of the limit.
 
     And what an artifact tells of these errors.
     """
-    shares = {
-        load.pressure: level for own in loads for load, level in zip(own, LEVELS, strict=True)
-    }
-    rows = [row for own in found for row in own]
+    rows = np.array([row for own in found for row in own])
+    moved = rows[:, 3] if tip else np.maximum(rows[:, 1], rows[:, 3])
     known = [
-        KnownAnswer(
-            row[1:],
-            np.array([1.0, shares[row[0]]]),
-            True,
-            comparable=max(row[1], row[3]) < GIVEN_WAY,
-        )
-        for row in rows
+        KnownAnswer(row[1:4], np.array([1.0, row[0]]), True, comparable=far < GIVEN_WAY)
+        for row, far in zip(rows, moved, strict=True)
     ]
-    table = np.array([answer.errors for answer in known if answer.comparable])
-    told = {name: statistics(errors) for name, errors in zip(NAMES, table.T, strict=True)}
-    counts = {"loads": len(rows), "given_way": len(rows) - len(table)}
+    table = rows[moved < GIVEN_WAY, 1:].T
+    told = {
+        name: statistics(errors)
+        for name, errors in zip((*NAMES, "peak", "p99"), table, strict=True)
+    }
+    counts = {"answers": len(rows), "given_way": len(rows) - table.shape[1]}
     return calibrate(known, COVERED, DAMPING), counts | told

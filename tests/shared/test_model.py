@@ -172,3 +172,12 @@ def test_elastic_tissue_has_no_time(atlas):
     for ask, query in ((atlas.press, (None, 0.0)), (atlas.touch, ([5.0, 5.0, 12.0],))):
         with pytest.raises(QueryError, match="is elastic"):
             ask(*query, past=REST, dt=0.1)
+
+
+def test_under_the_tip_an_estimate_holds_the_dent_that_the_fields_lack(atlas):
+    middle = atlas.nodes.max(axis=0) * [0.5, 0.5, 1.0]
+    found = atlas.touch(middle + np.array([0.0, 0.0, 0.85 * atlas.scene.endoscope.radius]))
+    pressed = atlas.press(middle, 0.3)
+    assert found.error_displacement > 1.5 * pressed.error_displacement
+    assert found.error_von_mises > 1.5 * pressed.error_von_mises
+    assert found.error_reduction[2] < found.error_force < 0.3

@@ -5,10 +5,11 @@ import pytest
 
 from palpate.offline.fem.graded import Graded, Grading, parameters_of
 from palpate.offline.fem.mesh import ticks_of
-from palpate.offline.fem.problem import FullProblem, Load
+from palpate.offline.fem.problem import FullProblem, Load, TipPosition
 from palpate.offline.fem.shapes import shape_of
 from palpate.offline.scenes import find_scene
-from palpate.offline.validate.mesh_part import GIVEN_WAY, LEVELS, fit, mesh_errors
+from palpate.offline.validate import mesh_part
+from palpate.offline.validate.mesh_part import GIVEN_WAY, LEVELS, Pressed, fit, mesh_errors
 
 PLACE, DOWN = np.array([5.6, 4.7, 8.0]), np.array([0.0, 0.0, -1.0])
 COARSE = Grading(finest=0.5, even=0.5, growth=0.9)
@@ -57,27 +58,64 @@ def test_elements_are_small_at_the_contact_and_grow_away_from_it():
 
 
 def test_errors_fall_with_the_mesh_and_a_finer_reference_says_the_same():
-    loads = [Load(PLACE, DOWN, pressure) for pressure in (0.5, 1.5)]
+    levels = [(share, Load(PLACE, DOWN, 1.5 * share)) for share in (0.3, 1.0)]
     coarse, fine = (
-        np.array(mesh_errors(FullProblem(block(*divisions)), loads))[:, 1:]
+        np.array(mesh_errors(FullProblem(block(*divisions)), levels))
         for divisions in ((3, 3, 2), (8, 8, 6))
     )
-    assert (fine < 0.5 * coarse).all()
+    assert fine[:, 0].tolist() == [0.3, 1.0]
+    assert (fine[:, 1:4] < 0.5 * coarse[:, 1:4]).all()
+    # largest stress and 99th percentile, whose errors change sign on the way
+    assert (fine[:, 4:] < 0.1).all()
+    assert (fine[:, 5] < 0.6 * coarse[:, 5]).all()
+
+
+def test_under_the_tip_errors_hold_the_dent_that_fields_lack(monkeypatch):
+    monkeypatch.setattr(mesh_part, "TIP_GRADING", Grading(finest=0.25, even=0.3, growth=0.9))
+    problem = FullProblem(block(8, 8, 6))
+    levels = [(depth, TipPosition(PLACE - (2.0 - depth) * DOWN)) for depth in (0.2, 0.4)]
+    rows = np.array(mesh_errors(problem, levels))
+    pushed = np.linalg.norm(problem.solve(levels[1][1]).force)
+    footprint = [(1.0, Load(PLACE, DOWN, pushed / problem.unit_load(PLACE)[0].sum()))]
+    (load,) = mesh_errors(problem, footprint)
+    assert (rows[:, 1] > 5 * load[1]).all()
+    assert (rows[:, 2] > 3 * load[2]).all()
+    assert (rows[:, 3] < 0.05).all()
+
+
+def test_a_sphere_pressed_deeper_and_deeper_is_where_one_pressed_at_once_is():
+    """From the last state, grown, it is found to the tolerance."""
+    problem = FullProblem(find_scene("quick"))
+    pressed = Pressed(problem, integrated=True)
+    for depth in (0.2, 0.4):
+        step = TipPosition(PLACE - (2.0 - depth) * DOWN)
+        found = pressed.harder(depth, step)
+    exact = problem.model.solve(problem.sphere_at(step.position))
+    np.testing.assert_allclose(found.felt, exact.force, atol=1e-3 * exact.force[2])
+    np.testing.assert_allclose(found.displacement, exact.displacement, atol=2e-4)
 
 
 def test_an_estimate_covers_and_leaves_out_what_has_given_way():
-    loads = [[Load(PLACE, DOWN, 10.0 * k + level) for level in LEVELS] for k in range(12)]
     rng = np.random.default_rng(3)
     found = [
-        [np.array([load.pressure, *(0.02 * np.exp(level + 0.2 * rng.standard_normal(3)))])
-         for load, level in zip(own, LEVELS, strict=True)]
-        for own in loads
+        [np.array([level, *(0.02 * np.exp(level + 0.2 * rng.standard_normal(5)))])
+         for level in LEVELS]
+        for _ in range(12)
     ]  # fmt: skip
     found[4][1][1:] = 2 * GIVEN_WAY
-    coefficients, told = fit(loads, found)
+    coefficients, told = fit(found)
     assert told["given_way"] == 1
-    assert told["loads"] == 24
+    assert told["answers"] == 24
+    assert told["p99"]["max"] == max(row[5] for own in found for row in own if row[5] < GIVEN_WAY)
     for own in found[:4] + found[5:]:
-        for row, level in zip(own, LEVELS, strict=True):
-            assert (row[1:] <= 1.05 * np.exp(coefficients @ [1.0, level])).all()
+        for row in own:
+            assert (row[1:4] <= 1.05 * np.exp(coefficients @ [1.0, row[0]])).all()
     assert (np.exp(coefficients @ [1.0, 0.3]) < 2.5 * 0.02 * np.exp(0.3)).all()
+
+
+def test_under_the_tip_only_its_force_tells_what_has_given_way():
+    lacks_dent = [np.array([level, 0.5, 0.6, 0.01, 0.1, 0.1]) for level in (0.15, 0.8)]
+    slipped = [np.array([level, 0.5, 0.6, 2 * GIVEN_WAY, 0.1, 0.1]) for level in (0.15, 0.8)]
+    coefficients, told = fit([lacks_dent] * 5 + [slipped], tip=True)
+    assert told["given_way"] == 2
+    np.testing.assert_allclose(np.exp(coefficients[:, 0]), [0.5, 0.6, 0.01], rtol=1e-6)
