@@ -33,7 +33,7 @@ the next, and in one of a single layer of elements, where values are carried lin
 SIDES = (HEX_CORNERS > 0).astype(int)
 _NUMBER = np.array([4, 2, 1])
 OPPOSITE = np.array(
-    [[np.flatnonzero((SIDES == s ^ np.eye(3, dtype=int)[d]).all(axis=1))[0] for d in range(3)]
+    [[np.flatnonzero((s ^ np.eye(3, dtype=int)[d] == SIDES).all(axis=1))[0] for d in range(3)]
      for s in SIDES]
 )  # fmt: skip
 """Corners (8, 3) that lie opposite along each axis."""

@@ -21,7 +21,6 @@ from palpate.shared.mechanics.tensors import (
     load,
     load_packed,
     packed,
-    scale,
     trace,
     twice_deviator,
     unpacked,
