@@ -10,7 +10,7 @@ from palpate.shared.geometry.elements import (
     quadrilateral,
     shape,
 )
-from palpate.shared.geometry.recovery import lattice
+from palpate.shared.geometry.recovery import patches
 from palpate.shared.mechanics.footprint import SurfaceQuadrature
 from palpate.shared.mechanics.stress import StressRecovery
 from palpate.shared.mechanics.tissue import Law
@@ -80,16 +80,15 @@ def stress_recovery(
 ) -> StressRecovery:
     """Recovery of nodal stresses from 2x2x2 points per element of one tissue; law (e,)."""
     gradients, _ = volume_quadrature(nodes, elements, 2)
-    carried = lattice(nodes, elements)
+    found = patches(nodes, elements)
     return StressRecovery(
         connectivity=np.ascontiguousarray(elements, dtype=np.int32),
         gradients=np.ascontiguousarray(np.moveaxis(gradients, 1, 3), dtype=precision),
-        to_corners=np.ascontiguousarray(carried.to_corners, dtype=precision),
-        boundary=carried.boundary,
-        partners=carried.partners,
-        signs=carried.signs.astype(precision),
-        midsides=carried.midsides,
-        lines=carried.lines,
-        shares=carried.shares.astype(precision),
+        corners=found.corners,
+        around=found.elements,
+        weights=np.ascontiguousarray(found.weights, dtype=precision),
+        midsides=found.midsides,
+        lines=found.lines,
+        shares=found.shares.astype(precision),
         law=law.at(np.zeros(len(nodes), int)),
     )

@@ -1,15 +1,14 @@
 """How gradients at 2x2x2 points of hexahedra are carried to the nodes of a lattice of them.
 
-Along a line through elements, a field is known at two points of each.  At a corner between two
-elements the quadratic through the four nearest points in the least-squares sense is the mean of
-what each element says by itself, the nearer of its points weighted by ``1 + NEARER``, the other by
-``-NEARER``; elements of unequal size count in inverse proportion to it.  At a corner on the
-boundary the quadratic goes on: along an element it changes by its mean slope.  In three dimensions
-these are products.  At midsides a cubic runs through the four nearest corners of the line.
+Along a line through elements, a field is known at two points of each.  At a corner its value is
+that of the quadratic through the four points of the two elements nearest to it, in the
+least-squares sense: between two elements both, at the boundary the last two.  In three dimensions
+these are products, over the points of eight elements.  At midsides a cubic runs through the four
+nearest corners of the line.
 
-So nodal values are right to third order of the size of elements, where values carried linearly are
-right to second, at the boundary most of all (cf. Zienkiewicz & Zhu, The superconvergent patch
-recovery, Int. J. Numer. Meth. Engng 33, 1992, whose patches have the same points).
+So nodal values are right to third order of the size of elements, where values carried linearly in
+each element are right to second, at the boundary most of all.  The points are those of the patches
+of Zienkiewicz & Zhu, The superconvergent patch recovery, Int. J. Numer. Meth. Engng 33 (1992).
 """
 
 import itertools
@@ -20,55 +19,54 @@ import numpy as np
 from palpate.shared.arrays import Array, Flags, Ints, Numbers
 from palpate.shared.geometry.elements import HEX_CORNERS, HEX_EDGES
 
-_NEAR, _FAR = (1 - 3**-0.5) / 2, (1 + 3**-0.5) / 2
-NEARER = _NEAR**2 / (_FAR**2 - _NEAR**2)
-LINEAR = _NEAR / (_FAR - _NEAR)
-SLOPE = 1 / (_FAR - _NEAR)
-INSIDE, BOUNDARY, ALONE = 0, 1, 2
-OF_NEARER = np.array([1 + NEARER, SLOPE, 1 + LINEAR])
-OF_FARTHER = np.array([-NEARER, -SLOPE, -LINEAR])
-"""Weights of an element's points in a corner inside, in what one on the boundary differs by from
-the next, and in one of a single layer of elements, where values are carried linearly."""
+NEAR, FAR = (1 - 3**-0.5) / 2, (1 + 3**-0.5) / 2
+"""Of an element's points from one of its ends, over its length."""
 
 SIDES = (HEX_CORNERS > 0).astype(int)
-_NUMBER = np.array([4, 2, 1])
 OPPOSITE = np.array(
     [[np.flatnonzero((s ^ np.eye(3, dtype=int)[d] == SIDES).all(axis=1))[0] for d in range(3)]
      for s in SIDES]
 )  # fmt: skip
 """Corners (8, 3) that lie opposite along each axis."""
 
+POINT_SIDES = np.array(list(itertools.product((0, 1), repeat=3)))
+"""Sides (8, 3) on which the points of ``elements.gauss(2, 3)`` lie."""
 
-class Lattice(NamedTuple):
+
+class Patches(NamedTuple):
     """What carries values at the points of hexahedra to the nodes."""
 
-    to_corners: Array  # (e, 8, 8) shares of an element's points, first index, in its corners
-    boundary: Ints  # (k,) nodes to whose values those of others are added, in this order
-    partners: Ints  # (k,) these others
-    signs: Array  # (k,)
+    corners: Ints  # (k,) nodes that are corners of elements
+    elements: Ints  # (k, 8) around each
+    weights: Array  # (k, 8, 8) of their points
     midsides: Ints  # (m,) nodes whose values are made of corners'
     lines: Ints  # (m, 4) those
     shares: Array  # (m, 4)
 
 
-def lattice(nodes: Array, elements: Numbers) -> Lattice:
+def patches(nodes: Array, elements: Numbers) -> Patches:
     """How values are carried in elements (e, 8 or 20) that all have the axes of one lattice."""
-    corners, next_to = elements[:, :8], neighbours(elements[:, :8])
-    away = np.linalg.norm(nodes[corners[:, OPPOSITE]] - nodes[corners][:, :, None], axis=3)
-    ends = next_to < 0  # (e, 3, 2)
-    at = np.stack([ends[:, d, SIDES[:, d]] for d in range(3)], axis=2)  # (e, 8, 3)
-    alone = ends.all(axis=2)[:, None]
-    kind = np.where(at & alone, ALONE, np.where(at, BOUNDARY, INSIDE))
-    counts = 1.0 / away.prod(axis=2)
-    counts /= np.bincount(corners.ravel(), counts.ravel(), len(nodes))[corners]
-    # of corner c and point q along each axis
-    nearer = SIDES[:, None] == SIDES[None][:, _gauss_order()]
-    weights = np.where(nearer, OF_NEARER[kind][:, :, None], OF_FARTHER[kind][:, :, None])
-    to_corners = counts[..., None] * weights.prod(axis=3)
-    midsides, lines, shares = _midsides(away, elements, next_to)
-    return Lattice(
-        np.swapaxes(to_corners, 1, 2), *_partners(corners, kind), midsides, lines, shares
-    )
+    next_to = neighbours(elements[:, :8])
+    at = nodes[elements[:, :8]]
+    lengths = np.linalg.norm(at[:, OPPOSITE] - at[:, :, None], axis=3)  # (e, 8, 3)
+    corners, first = np.unique(elements[:, :8], return_index=True)
+    own, corner = np.divmod(first, 8)
+    around, weights = own[:, None], np.ones((len(own), 1, 1))
+    for d in range(3):
+        side = SIDES[corner, d]
+        beyond, inward = next_to[own, d, side], next_to[own, d, 1 - side]
+        inside, alone = beyond >= 0, (beyond < 0) & (inward < 0)
+        towards = np.where(inside, side, 1 - side)
+        further = next_to[around, d, towards[:, None]]
+        end = np.where(inside, OPPOSITE[corner, d], corner)
+        other = lengths[np.where(inside, beyond, inward), end, d] / lengths[own, corner, d]
+        one = _along(other, inside, alone)  # (k, 2 elements, nearer and farther point)
+        near_side = np.stack([side, np.where(inside, 1 - side, side)], axis=1)
+        nearer = near_side[:, :, None] == POINT_SIDES[:, d]
+        share = np.where(nearer, one[:, :, :1], one[:, :, 1:])  # (k, 2, 8)
+        around = np.concatenate([around, np.where(alone[:, None], around, further)], axis=1)
+        weights = np.concatenate([weights * share[:, :1], weights * share[:, 1:]], axis=1)
+    return Patches(corners, around, weights, *_midsides(lengths, elements, next_to))
 
 
 def neighbours(corners: Numbers) -> Ints:
@@ -83,30 +81,22 @@ def neighbours(corners: Numbers) -> Ints:
     return np.stack([found[1 - end, number[:, end]].T for end in (0, 1)], axis=2)
 
 
-def _gauss_order() -> Ints:
-    """Corners nearest to the points of ``elements.gauss(2, 3)``."""
-    return np.argsort(SIDES @ _NUMBER)
+def _along(other: Array, inside: Flags, alone: Flags) -> Array:
+    """Weights (k, 2, 2) along a line of an element's points and of the other's in a corner's value.
+
+    ``other`` is the other's length over that of the one which the corner ends; it lies beyond the
+    corner where that is inside, else next to the one.
+    """
+    sign, start = np.where(inside, -1.0, 1.0), np.where(inside, 0.0, 1.0)
+    ends = np.ones_like(other)
+    at = [NEAR * ends, FAR * ends, start + sign * NEAR * other, start + sign * FAR * other]
+    powers = np.stack(at, axis=1)[..., None] ** np.arange(3)
+    weights = np.linalg.pinv(powers)[:, 0]
+    weights[alone] = FAR / (FAR - NEAR), -NEAR / (FAR - NEAR), 0.0, 0.0
+    return np.asarray(weights.reshape(-1, 2, 2))
 
 
-def _partners(corners: Numbers, kind: Ints) -> tuple[Ints, Ints, Array]:
-    """Nodes of the boundary, those added to them, and signs: from faces to edges to corners."""
-    bounded, found = kind == BOUNDARY, []
-    for axes in itertools.product((False, True), repeat=3):
-        size = sum(axes)
-        if size == 0:
-            continue
-        opposite = np.arange(8)
-        for d in np.flatnonzero(axes):
-            opposite = OPPOSITE[opposite, d]
-        e, c = np.nonzero(bounded[:, :, np.array(axes)].all(axis=2))
-        order = bounded[e, c].sum(axis=1)
-        sign = np.full(len(e), (-1) ** (size + 1))
-        found.append(np.column_stack([order, corners[e, c], corners[e, opposite[c]], sign]))
-    rows = np.unique(np.concatenate(found), axis=0)  # ascending in the number of axes
-    return rows[:, 1], rows[:, 2], rows[:, 3].astype(float)
-
-
-def _midsides(away: Array, elements: Numbers, next_to: Ints) -> tuple[Ints, Ints, Array]:
+def _midsides(lengths: Array, elements: Numbers, next_to: Ints) -> tuple[Ints, Ints, Array]:
     """Midside nodes, the four corners on the line of each, and their shares."""
     if elements.shape[1] == 8:
         return np.empty(0, int), np.empty((0, 4), int), np.empty((0, 4))
@@ -122,11 +112,11 @@ def _midsides(away: Array, elements: Numbers, next_to: Ints) -> tuple[Ints, Ints
             four[:, 1 + place] = elements[:, corner]
             # the next element has the corner at its other end
             four[:, 3 * place] = elements[beyond, corner]
-            further = away[beyond, corner, d] / away[:, corner, d]
+            further = lengths[beyond, corner, d] / lengths[:, corner, d]
             at[:, 1 + place], at[:, 3 * place] = sign, sign + 2.0 * sign * further
         lines.append(four)
         shares.append(_lagrange(at, known))
-    midsides, first = np.unique(elements[:, 8:].T.ravel(), return_index=True)
+    midsides, first = np.unique(elements[:, 8:].T, return_index=True)
     return midsides, np.concatenate(lines)[first], np.concatenate(shares)[first]
 
 

@@ -1,8 +1,8 @@
 """Von Mises stress at the nodes, recovered from the displacement.
 
-Its gradients are taken at the Gauss points, where they converge fastest, and carried to the nodes by
-quadratic fields through those around each (``geometry.recovery``).  The law makes a stress of what
-comes out.  Under a contact the gradients recovered are those that a near field leaves of the
+Its gradients are taken at the Gauss points, where they converge fastest, and carried to the nodes
+by quadratic fields through those around each (``geometry.recovery``).  The law makes a stress of
+what comes out.  Under a contact the gradients recovered are those that a near field leaves of the
 displacement; see ``shared.near_field``.
 """
 
@@ -31,15 +31,14 @@ from palpate.shared.mechanics.tissue import Law
 class StressRecovery(NamedTuple):
     """What recovery needs of a mesh: 2x2x2 points per element, point index last.
 
-    See ``geometry.recovery.Lattice`` for what carries values to the nodes.
+    See ``geometry.recovery.Patches`` for what carries values to the nodes.
     """
 
     connectivity: Numbers  # (e, n)
     gradients: NDArray[np.floating]  # (e, n, 3, 8) 1/mm, at the points
-    to_corners: NDArray[np.floating]  # (e, 8, 8)
-    boundary: Ints  # (k,)
-    partners: Ints  # (k,)
-    signs: NDArray[np.floating]  # (k,)
+    corners: Ints  # (k,)
+    around: Ints  # (k, 8) elements
+    weights: NDArray[np.floating]  # (k, 8, 8)
     midsides: Ints  # (m,)
     lines: Ints  # (m, 4)
     shares: NDArray[np.floating]  # (m, 4)
@@ -63,26 +62,22 @@ def nodal_von_mises(mesh, u, B, near, out):
     shares.
     """
     count, own = len(out), _without(u, near)
-    sums, H = np.zeros(9 * count, mesh.gradients.dtype), np.empty(72, mesh.gradients.dtype)
-    corners, flat = np.empty_like(H), mesh.gradients.reshape(len(mesh.connectivity), -1)
-    for e in range(len(mesh.connectivity)):
-        _gradients(mesh.connectivity[e], flat[e], own, H)
-        _add_to_corners(mesh, e, H, corners, sums)
-    _complete(mesh, sums)
+    flat = mesh.gradients.reshape(len(mesh.connectivity), -1)
+    H = np.empty((len(flat), 72), flat.dtype)
+    for e in range(len(flat)):
+        _gradients(mesh.connectivity[e], flat[e], own, H[e])
+    nodal = _carried(mesh, H)
     for k in range(len(near.points)):
         node = near.points[k]
         for i in range(9):
-            sums[i * count + node] += near.gradient[k, i // 3, i % 3]
+            nodal[i * count + node] += near.gradient[k, i // 3, i % 3]
     if B is None:
         for n in range(count):
-            out[n] = laws.von_mises(mesh.law.at(n), add_identity(load(sums, n, count), 1.0))
+            out[n] = laws.von_mises(mesh.law.at(n), add_identity(load(nodal, n, count), 1.0))
     else:
-        past, own_corners = np.zeros(6 * count), np.empty(48)
-        for e in range(len(mesh.connectivity)):
-            _add_to_corners(mesh, e, B[e].reshape(-1), own_corners, past)
-        _complete(mesh, past)
+        past = _carried(mesh, B.reshape(len(B), -1))
         for n in range(count):
-            F = add_identity(load(sums, n, count), 1.0)
+            F = add_identity(load(nodal, n, count), 1.0)
             out[n] = viscosity.von_mises(mesh.law.at(n), F, unpacked(load_packed(past, n, count)))
 
 
@@ -159,34 +154,25 @@ def _gradients(connectivity, flat, u, H):
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def _add_to_corners(mesh, e, values, corners, sums):
-    """Add an element's share of components (8 k,) at its points to sums (k nodes,) at its corners.
-
-    ``corners`` (8 k,) is scratch.
-    """
-    nodes, matrix, components = mesh.connectivity[e], mesh.to_corners[e], len(values) // 8
-    count = len(sums) // components
-    corners[:] = 0.0
-    for k in range(0, len(values), 8):
-        for q in range(8):
-            for c in range(8):
-                corners[k + c] += matrix[q, c] * values[k + q]
-    for k in range(components):
-        # unsigned numbers need no check whether they count from the end
-        for c in range(8):
-            sums[np.uint64(k * count + nodes[c])] += corners[8 * k + c]
-
-
-@njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def _complete(mesh, sums):
-    """Complete sums (k nodes,) on the boundary and at midsides."""
-    count = len(mesh.law.mu)
-    for first in range(0, len(sums), count):
-        own = sums[first : first + count]
-        for k in range(len(mesh.boundary)):
-            own[np.uint64(mesh.boundary[k])] += mesh.signs[k] * own[np.uint64(mesh.partners[k])]
+def _carried(mesh, values):
+    """Components (k nodes,) at the nodes of those at the points of elements (e, 8 k)."""
+    count, components = len(mesh.law.mu), values.shape[1] // 8
+    nodal = np.zeros(components * count, values.dtype)
+    for n in range(len(mesh.corners)):
+        node = np.uint64(mesh.corners[n])
+        for a in range(8):
+            own, weights = values[mesh.around[n, a]], mesh.weights[n, a]
+            for k in range(components):
+                value = weights[0] * own[8 * k]
+                for q in range(1, 8):
+                    value += weights[q] * own[8 * k + q]
+                nodal[k * count + node] += value
+    for first in range(0, len(nodal), count):
+        own = nodal[first : first + count]
         for m in range(len(mesh.midsides)):
-            value = mesh.shares[m, 0] * own[np.uint64(mesh.lines[m, 0])]
+            line, shares = mesh.lines[m], mesh.shares[m]
+            value = shares[0] * own[line[0]]
             for j in range(1, 4):
-                value += mesh.shares[m, j] * own[np.uint64(mesh.lines[m, j])]
-            own[np.uint64(mesh.midsides[m])] = value
+                value += shares[j] * own[line[j]]
+            own[mesh.midsides[m]] = value
+    return nodal

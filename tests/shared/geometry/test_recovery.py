@@ -5,7 +5,7 @@ import pytest
 
 from palpate.offline.fem.mesh import build_mesh
 from palpate.shared.geometry.elements import gauss, hexahedron, shape
-from palpate.shared.geometry.recovery import lattice, neighbours
+from palpate.shared.geometry.recovery import neighbours, patches
 from palpate.shared.scene import parse_scene
 
 BLOCK = """
@@ -36,11 +36,8 @@ def mesh(request):
 
 def carried(nodes, elements, values):
     """Values (n,) at the nodes, of those at the points (e, 8)."""
-    how = lattice(nodes, elements)
-    out = np.zeros(len(nodes))
-    np.add.at(out, elements[:, :8], np.einsum("eqc,eq->ec", how.to_corners, values))
-    for node, other, sign in zip(how.boundary, how.partners, how.signs, strict=True):
-        out[node] += sign * out[other]
+    how, out = patches(nodes, elements), np.zeros(len(nodes))
+    out[how.corners] = np.einsum("kaq,kaq->k", how.weights, values[how.elements])
     out[how.midsides] = np.sum(how.shares * out[how.lines], axis=1)
     return out
 
