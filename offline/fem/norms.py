@@ -7,8 +7,14 @@ import numpy as np
 from palpate.shared.arrays import Array
 
 
-def relative(approximation: Array, reference: Array) -> float:
-    """Relative L2 error; 0 where there is nothing to approximate."""
+def relative(approximation: Array, reference: Array, volumes: Array | None = None) -> float:
+    """Relative L2 error; 0 where there is nothing to approximate.
+
+    Of fields at nodes (n, ...), each of which stands for a volume (n,) if these are given.
+    """
+    if volumes is not None:
+        root = np.sqrt(volumes).reshape(-1, *[1] * (reference.ndim - 1))
+        approximation, reference = root * approximation, root * reference
     scale = np.linalg.norm(reference)
     return float(np.linalg.norm(approximation - reference) / scale) if scale else 0.0
 

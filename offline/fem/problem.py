@@ -106,6 +106,13 @@ class FullProblem:
         """Nodes (n,) at which stress is compared; see ``Body``."""
         return self.body.beyond_clamped_layer(self.mesh.nodes)
 
+    @cached_property
+    def nodal_volumes(self) -> Array:
+        """Volumes (n,) mm^3 that nodes stand for: those of the elements around, shared out."""
+        elements = self.mesh.elements
+        shares = np.repeat(self.model.weights.sum(axis=1) / elements.shape[1], elements.shape[1])
+        return np.bincount(elements.ravel(), shares, len(self.mesh.nodes))
+
     def points_in_body(self, points: Numbers) -> Numbers:
         """Numbers in the whole body of quadrature points."""
         per_element = self.model.weights.shape[1]

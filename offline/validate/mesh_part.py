@@ -127,16 +127,16 @@ def places(model: ReducedModel, rng: np.random.Generator, tip: bool = False) -> 
 def mesh_errors(problem: FullProblem, levels: Levels) -> list[Array]:
     """Levels and errors of a scene's mesh at one place; a task for ``run.workers``.
 
-    Relative L2 norms at its nodes, of stress outside the clamped layer; the relative error of a
+    Relative L2 norms over its volume, of stress outside the clamped layer; the relative error of a
     tip's force, or of the mean displacement under a footprint; those of the largest stress and its
     99th percentile.
     """
-    kept, found = problem.beyond_clamped_layer, []
+    kept, found, volumes = problem.beyond_clamped_layer, [], problem.nodal_volumes
     how = TIP_GRADING if isinstance(levels[0][1], TipPosition) else GRADING
     for level, _, own, exact in compared(problem, problem.scene, levels, how):
         errors = (
-            relative(own.displacement, exact.displacement),
-            relative(own.von_mises[kept], exact.von_mises[kept]),
+            relative(own.displacement, exact.displacement, volumes),
+            relative(own.von_mises[kept], exact.von_mises[kept], volumes[kept]),
             abs(float(np.linalg.norm(own.felt) / np.linalg.norm(exact.felt)) - 1.0),
             *np.abs(np.divide(own.peaks, exact.peaks) - 1.0),
         )
