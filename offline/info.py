@@ -1,7 +1,7 @@
 """What an artifact holds, read without building the model: for people or, as a whole, for JSON."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from palpate.shared.artifact import ArtifactError, read_artifact
 from palpate.shared.mechanics.footprint import TIP_DEPTH
+from palpate.shared.reduced.press import TOLERANCE
 from palpate.shared.scene import Patch, Scene, SceneError, parse_scene
 
 LABELS = 14  # column at which the values of ``lines`` stand
@@ -57,7 +58,7 @@ def info(artifact: Path) -> dict[str, Any]:
 
 
 def lines(report: Mapping[str, Any]) -> list[str]:
-    """What ``info`` found, one line for each aspect."""
+    """What ``info`` found, one line for each aspect, and a table of errors."""
     scene = parse_scene(report["text"])
     box = zip("xyz", *report["body"]["box"], strict=True)
     layout, provenance = report["training"]["layout"], report["provenance"]
@@ -78,35 +79,82 @@ def lines(report: Mapping[str, Any]) -> list[str]:
         else "not trained, so there are no sessions",
         "reduced model": f"{layout['patches']} local models of {layout['modes']} modes and "
         f"{layout['cubature_points_median']:g} points",
-        **accuracy(report),
+        **trust(report),
         "trained": f"{provenance['started'][:10]} in {duration(provenance['wall_seconds'])}, "
         f"commit {provenance['git_commit'][:12]}; {report['bytes'] / 1e6:.1f} MB",
     }
-    return [f"{label:<{LABELS}} {text}" for label, text in said.items()]
+    return [*(f"{label:<{LABELS}} {text}" for label, text in said.items()), *budget(report)]
 
 
 def accuracy(report: Mapping[str, Any]) -> dict[str, str]:
     """Errors that training found, by what presses."""
-    kinds = {"errors": ("validation", "loads"), "tip's errors": ("validation_tip", "positions")}
     return {
         label: f"95 of 100 random {noun} at most {percent(found['displacement']['p95'])} in "
         f"displacement, {percent(found['von_mises']['p95'])} in von Mises stress"
-        for label, (kind, noun) in kinds.items()
-        if (found := report.get(kind))
+        for label, noun, found in _validations(report)
     }
+
+
+def trust(report: Mapping[str, Any]) -> dict[str, str]:
+    """How far estimates of errors hold, and how many right answers they cast doubt on."""
+    said = {}
+    for label, _, found in _validations(report):
+        flagged = found["flagged"]
+        said[label.replace("errors", "trust")] = (
+            f"covers 95 % of errors, confidence {percent(found['confidence'])}; doubts "
+            f"{percent(flagged['share'])} of right ones"
+            + (f", most for {flagged['mostly']}" if flagged["mostly"] else "")
+        )
+    return said
+
+
+def budget(report: Mapping[str, Any]) -> list[str]:
+    """A table of what each source of errors has of them."""
+    training, scene = report["training"], parse_scene(report["text"])
+    tip = report.get("validation_tip", {})
+    sources = {
+        "mesh": training["mesh_errors"],
+        "reduction": report["validation"] | ({"force": tip["force"]} if tip else {}),
+        "- cubature": training["cubature_errors"],
+        "- solver": {"displacement": {"p95": TOLERANCE * math.sqrt(scene.tolerance.looseness)}},
+        "tolerance": {
+            name: {"p95": most} for name, most in scene.tolerance.total._asdict().items()
+        },
+    }
+    columns = {"displacement": "displacement", "von_mises": "von Mises", "force": "tip's force"}
+    if not tip:
+        del columns["force"]
+    rows = {
+        source: [percent(found.get(name, {}).get("p95", math.nan)) for name in columns]
+        for source, found in sources.items()
+    }
+    table = {"95 of 100": list(columns.values())} | rows
+    return [
+        f"{source:<{LABELS}} " + "".join(f"{value:<14}" for value in values).rstrip()
+        for source, values in table.items()
+    ]
+
+
+def _validations(report: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    """Label, what was asked, and summary of each kind of query at once."""
+    kinds = {"errors": ("validation", "loads"), "tip's errors": ("validation_tip", "positions")}
+    for label, (kind, noun) in kinds.items():
+        if kind in report:
+            yield label, noun, report[kind]
 
 
 def closing(artifact: Path) -> list[str]:
     """What to know of an artifact just trained, and what to do next."""
     report = info(artifact)
-    example, tolerance = report["loads"]["example"], parse_scene(report["text"]).tolerance
+    example, most = report["loads"]["example"], parse_scene(report["text"]).tolerance.reduction
     place = " ".join(f"{x:.4g}" for x in example["at"])
     errors = [f"{label}: {text}" for label, text in accuracy(report).items()]
-    if any(report["validation"][key]["p95"] > most for key, most in tolerance.model_dump().items()):
-        asked = f"{percent(tolerance.displacement)} and {percent(tolerance.von_mises)}"
+    found = report["validation"]
+    if any(found[key]["p95"] > getattr(most, key) for key in ("displacement", "von_mises")):
+        asked = f"{percent(most.displacement)} and {percent(most.von_mises)}"
         errors.append(
-            f"this is more than the {asked} that the scene asks for; most errors are near the "
-            "limits: a smaller load.max_indentation lowers them"
+            f"this is more than the {asked} that the scene leaves the reduction; most errors are "
+            "near the limits: a smaller load.max_indentation lowers them"
         )
     return [
         f"{artifact}: {report['bytes'] / 1e6:.1f} MB",

@@ -4,8 +4,8 @@
 2. Regions: windows, nonlinear Ritz vectors of many footprints and a common basis for them.
 3. Patches: modes, cubature and first guess of every local model.
 4. The reduced model, pressed everywhere, lowers the range where the tissue gives way.
-5. Full solutions of random queries, each half of which validates the error estimate of the other.
-6. Full solutions on finer meshes, for the mesh's part of that estimate.
+5. Full solutions on finer meshes, for the mesh's part of the error estimate.
+6. Full solutions of random queries, each half of which validates the rest of it for the other.
 
 Every finished task is on disk before it counts; see ``run.workers``.
 """
@@ -32,6 +32,7 @@ from tqdm import tqdm
 from palpate.offline.choose.mesh import with_mesh
 from palpate.offline.choose.size import Trial, choose, first_place, ladder, try_patch
 from palpate.offline.fem.mesh import mesh_quality
+from palpate.offline.fem.norms import statistics
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.info import duration
 from palpate.offline.reduce.footprint_models import compile_query, train_patch
@@ -54,7 +55,6 @@ from palpate.offline.scenes import default_artifact, find_scene
 from palpate.offline.validate import mesh_part
 from palpate.offline.validate.compare import (
     Row,
-    calibrate,
     calibrate_by_halves,
     compare,
     reference_task,
@@ -169,7 +169,8 @@ class Pipeline:
         compiled = self.executor.submit(run, compile_query)
         limits = self._load_range()
         compiled.result()
-        size, training = self.scene.training.size, {"mesh": mesh_quality(self.problem.mesh)}
+        size = self.scene.training.size
+        training: dict[str, Any] = {"mesh": mesh_quality(self.problem.mesh)}
         if size is None:
             scene, attempt = self.scene, partial(self._trial, limits)
             sizes = ladder(scene.tissue)
@@ -182,15 +183,20 @@ class Pipeline:
         limits = self._lowered(models, limits)
         model = untested(self.problem, models, limits)
         tables: dict[Kind, list[Row]] = {}
-        estimators: dict[str, Array] = {}
         documents: dict[str, Any] = {"provenance": self.provenance, "training": training}
-        for kind in KINDS:
-            if not kind.lacks(self.scene):
-                estimators[kind.name], tables[kind] = self._validate(kind, model)
-                documents[kind.document] = summarise(kind, tables[kind])
+        estimators: dict[str, Array] = {}
         estimators["mesh"], training["mesh_errors"] = self._mesh_part(model)
         if model.has_tip:
             estimators["mesh_tip"], training["mesh_errors_tip"] = self._mesh_part(model, tip=True)
+        model = untested(self.problem, models, limits, Estimators(**estimators))
+        for kind in KINDS:
+            if not kind.lacks(self.scene):
+                fitted, tables[kind] = self._validate(kind, model)
+                estimators[kind.name], confidence = fitted
+                documents[kind.document] = summarise(kind, tables[kind], self.scene.tolerance)
+                documents[kind.document]["confidence"] = confidence
+        known = models.cubature_errors[np.isfinite(models.cubature_errors)]
+        training["cubature_errors"] = {"displacement": statistics(known)}
         training |= {"seconds": self.seconds, "layout": self._describe(layout, models)}
         self.provenance["wall_seconds"] = round(time.perf_counter() - self.started, 1)
         where = "at vertices: limit along the normal, compliance, depth of the tip"
@@ -222,7 +228,7 @@ class Pipeline:
         rng = stream(self.scene.seed, Stage.TRIAL_PATCHES)
         places = spread_points(self.surface, min(TRIAL_PATCHES, len(layout.centres)), rng)
         chosen = np.unique(cKDTree(layout.centres).query(places)[1])
-        tasks = {f"trial-{size.modes}-{k}": (try_patch, layout.patch(k)) for k in chosen}
+        tasks = {f"trial-{size.modes}-{k}": (try_patch, layout.patch(k), limits) for k in chosen}
         return Trial.of(size, self._stage(f"trying {size.modes} modes", tasks))
 
     def _local_models(self, layout: Layout) -> LocalModels:
@@ -284,7 +290,7 @@ class Pipeline:
         self.asked += len(at)
         return np.concatenate(self._stage(title, tasks))
 
-    def _validate(self, kind: Kind, model: ReducedModel) -> tuple[Array, list[Row]]:
+    def _validate(self, kind: Kind, model: ReducedModel) -> tuple[tuple[Array, float], list[Row]]:
         """Calibrate the error estimate of a kind on random queries, each half for the other."""
         samples = self.scene.training.samples
         count = TIP_SAMPLES if kind.tip else fewer(samples, self.scene.tolerance)
@@ -299,8 +305,7 @@ class Pipeline:
             for query, found in zip(queries, self._stage(kind.title, tasks), strict=True)
             if found is not None
         ]
-        fit = partial(calibrate, share=kind.coverage, damping=kind.damping)
-        return calibrate_by_halves([row.known for row in rows], fit), rows
+        return calibrate_by_halves([row.known for row in rows], kind.damping), rows
 
     def _mesh_part(self, model: ReducedModel, tip: bool = False) -> tuple[Array, dict[str, Any]]:
         """Fit the mesh's part of the error estimate of loads or of the tip."""

@@ -30,6 +30,7 @@ class Answer(NamedTuple):
     error_von_mises: float = math.inf  # estimated
     error_force: float = math.inf  # estimated; that of a load is given
     error_reduction: Array = np.full(3, math.inf)  # of these, beside the same mesh's full model
+    error_mesh: Array = np.zeros(3)  # of these, of that beside a finer mesh's; 0 if not known
     min_jacobian: float = 1.0  # smallest det F among the cubature points
     pressure_limit: float = 0.0  # kPa, largest trained, in the direction of the load or the normal
     depth_limit: float = 0.0  # mm, largest trained of the tip; 0 in a scene without one

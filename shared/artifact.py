@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from palpate.shared.errors import PalpateError
 
 FORMAT = "palpate-artifact"
-FORMAT_VERSION = 9
+FORMAT_VERSION = 10
 
 SEAL_BYTES = 512
 """The smallest user block that HDF5 offers."""

@@ -132,6 +132,9 @@ class LocalModels:
     residuals: Annotated[
         Array, "patch_residuals", "1", "log of the residual in the full model (p, k)"
     ]
+    cubature_errors: Annotated[
+        Array, "patch_cubature_errors", "1", "of displacement beside every point; nan: none (p, k)"
+    ]
     extent: Annotated[float, "patch_extent", "mm", "largest distance of a contact"]
     blend: Annotated[float, "patch_blend", "mm", "width of blending"]
     viscous: ViscousModels | None = None

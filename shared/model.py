@@ -24,6 +24,7 @@ from palpate.shared.mechanics.tip import CURVED_WITHIN, dented, held
 from palpate.shared.near_field import Contact
 from palpate.shared.query import check_place, checked_load, out_of_range, vector
 from palpate.shared.reduced import press, touch
+from palpate.shared.reduced.features import RIM
 from palpate.shared.reduced.outcome import Outcome
 from palpate.shared.reduced.past import Elastic, Remembering
 from palpate.shared.reduced.transfer import LeftBehind, Local, Past, Transfer, estimate_history
@@ -91,7 +92,8 @@ class ReducedModel:
         self.fields = FieldRecovery(body, models, lambda: self.transfer)
         self._own = self.new_warm()
         bent = surface.curvature(CURVED_WITHIN * body.tip.radius)
-        self._index: SurfaceIndex = surface.ground(np.hstack([self.limits, bent]))
+        rim = surface.rim_distance()[:, None] / body.tip.radius
+        self._index: SurfaceIndex = surface.ground(np.hstack([self.limits, bent, rim]))
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -252,7 +254,7 @@ class ReducedModel:
         converged = found.status.item() == newton.CONVERGED
         unknown = bool(outside) or not converged
         reduction = _UNKNOWN if unknown else found.errors.copy()
-        total = _total(reduction, self.estimators.mesh, pressure / found.limit.item())
+        total, mesh = _total(reduction, self.estimators.mesh, pressure / found.limit.item())
         return Answer(
             contact_point=found.foot.copy(),
             normal=found.upward.copy(),
@@ -266,6 +268,7 @@ class ReducedModel:
             error_von_mises=total[1],
             error_force=0.0,
             error_reduction=reduction,
+            error_mesh=mesh,
             min_jacobian=found.min_jacobian.item(),
             pressure_limit=found.limit.item(),
             depth_limit=found.limits.item(TIP_DEPTH),
@@ -354,10 +357,10 @@ class ReducedModel:
         if depth > limit * (1 + 1e-9):
             outside += ("depth",)
         if not outside and converged and not touched and past is None:
-            reduction, total = _NONE, [0.0] * 3
+            reduction, (total, mesh) = _NONE, ([0.0] * 3, _NONE)
         else:
             reduction = _UNKNOWN if outside or not converged else found.errors.copy()
-            total = _total(reduction, self.estimators.mesh_tip, depth / limit)
+            total, mesh = _total(reduction, self.estimators.mesh_tip, depth / limit)
         return Answer(
             contact_point=found.point.copy(),
             normal=found.normal.copy(),
@@ -371,6 +374,7 @@ class ReducedModel:
             error_von_mises=total[1],
             error_force=total[2],
             error_reduction=reduction,
+            error_mesh=mesh,
             min_jacobian=found.min_jacobian.item(),
             pressure_limit=found.limits.item(0),
             depth_limit=limit,
@@ -389,6 +393,17 @@ class ReducedModel:
             active=active,
             solve_seconds=time.perf_counter() - started,
         )
+
+    def doubts(self, answer: Answer) -> tuple[str, ...]:
+        """Why not to trust an answer; nothing for one to be trusted.
+
+        It has not converged, fields of the query are out of range, or quantities are estimated to
+        err by more than the scene's tolerance.
+        """
+        if not answer.converged:
+            return ("convergence",)
+        errors = answer.error_displacement, answer.error_von_mises, answer.error_force
+        return answer.out_of_range or self.scene.tolerance.exceeded(errors)
 
     def _memory(self, tip: bool, warm: Warm | None, past: Past | None, dt: float) -> Workspace:
         """Memory to answer with: the caller's, or the model's own, which knows no last answer."""
@@ -425,16 +440,13 @@ class ReducedModel:
         return self.fields.peaks(answer, displacement)
 
 
-def _total(reduction: Array, mesh: Array | None, share: float) -> list[float]:
-    """Estimated errors of reduction and mesh together, at a share of the limit."""
-    errors: list[float] = reduction.tolist()
-    if mesh is None:
-        return errors
+def _total(reduction: Array, fitted: Array | None, share: float) -> tuple[list[float], Array]:
+    """Estimated errors of reduction and mesh together, and of the latter, at a load's share."""
+    if fitted is None:
+        return reduction.tolist(), _NONE
     share = min(max(share, 0.0), 1.0)
-    return [
-        math.hypot(e, math.exp(a + b * share))
-        for e, (a, b) in zip(errors, mesh.tolist(), strict=True)
-    ]
+    mesh = [math.exp(a + b * share) for a, b in fitted.tolist()]
+    return list(map(math.hypot, reduction.tolist(), mesh)), np.array(mesh)
 
 
 def _footprint(found: Outcome, radius: float) -> Contact:
@@ -442,7 +454,7 @@ def _footprint(found: Outcome, radius: float) -> Contact:
     return Contact(
         found.foot.copy(),
         found.upward.copy(),
-        found.limits[LIMIT_FIELDS:].copy(),
+        found.limits[LIMIT_FIELDS:RIM].copy(),
         found.force / -found.area.item(),
         radius,
     )

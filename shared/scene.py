@@ -10,11 +10,12 @@ The descriptions of the fields are the documentation of the keys: `palpate scene
 
 import difflib
 import json
+import math
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self, get_args
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
 
 from pydantic import (
     Field,
@@ -36,7 +37,7 @@ Element = Annotated[ElementName, Field(description="hex20, or hex8, which locks"
 
 Division = Annotated[int, Field(ge=1, le=500)]
 Divisions = tuple[Division, Division, Division]
-CHOSEN = "the coarsest mesh whose error is at most three times the tolerance"
+CHOSEN = "the coarsest mesh whose errors leave the reduction its share of the tolerance"
 Point2 = tuple[float, float]
 Range = tuple[float, float]
 
@@ -155,19 +156,55 @@ class Load(Part):
     )
 
 
-class Tolerance(Part):
-    """The errors a query may have against the full model on the same mesh."""
+class Errors(NamedTuple):
+    """Relative errors of what is answered."""
 
-    displacement: Fraction = Field(0.01, description="relative L2 error over all nodes")
-    von_mises: Fraction = Field(0.02, description="relative L2 error over all unclamped nodes")
+    displacement: float
+    von_mises: float
+    force: float  # of the rigid tip
+
+
+REDUCTION = Errors(3, 6, 3)
+"""The tolerance over what the reduction may take of it; errors of mesh and reduction add up by
+their squares, so that the mesh may take nearly all of it, too."""
+
+
+class Tolerance(Part):
+    """The errors an answer may have, those of mesh and reduction together."""
+
+    displacement: Fraction = Field(0.03, description="relative L2 error over all nodes")
+    von_mises: Fraction = Field(0.12, description="relative L2 error over all unclamped nodes")
+    force: Fraction = Field(0.05, description="relative error of the force of a rigid tip")
+
+    @property
+    def total(self) -> Errors:
+        """All of it."""
+        return Errors(self.displacement, self.von_mises, self.force)
+
+    @property
+    def reduction(self) -> Errors:
+        """What the reduced model may err by, beside the full model on the same mesh."""
+        return Errors(*(most / parts for parts, most in zip(REDUCTION, self.total, strict=True)))
+
+    @property
+    def mesh(self) -> Errors:
+        """What remains for the full model, beside an infinitely fine mesh."""
+        pairs = zip(REDUCTION, self.total, strict=True)
+        return Errors(*(math.sqrt(1 - parts**-2) * most for parts, most in pairs))
 
     @property
     def looseness(self) -> float:
-        """How many times it is 1 % of displacement and 2 % of stress, at least 1.
+        """How many times the reduction's is 1 % of displacement and 2 % of stress, at least 1.
 
         What training and the solver spend on more accuracy than asked for falls with it.
         """
-        return max(1.0, min(self.displacement / 0.01, self.von_mises / 0.02))
+        reduction = self.reduction
+        return max(1.0, min(reduction.displacement / 0.01, reduction.von_mises / 0.02))
+
+    def exceeded(self, errors: Iterable[float]) -> tuple[str, ...]:
+        """Names of those of the total errors, in the order of ``Errors``, that are too large."""
+        pairs = zip(Errors._fields, errors, self.total, strict=False)
+        return tuple(name for name, error, most in pairs if not error <= most)
 
 
 class Budget(Part):
@@ -235,7 +272,7 @@ class Scene(Part):
     endoscope: Endoscope = Field(description="the instrument that presses")
     load: Load = Field(description="how hard it presses")
     tolerance: Tolerance = Field(
-        description="errors against the full model on the same mesh; a looser one is faster"
+        description="errors of mesh and reduction together; a looser one is faster"
     )
     budget: Budget = Field(description="the time that a query may take")
     training: Training = Field(description="how the reduced model is trained")

@@ -1,38 +1,62 @@
-"""What a mesh errs by, and how fine it must be so that this does not dwarf the tolerance.
+"""How fine a mesh must be so that its errors leave the reduction its share of the tolerance.
 
-Meshes of ever smaller elements, about as long as wide, are pressed at the same places as meshes of
-twice their divisions.  In linear elasticity: that costs one factorisation each, and under the
-footprint the mesh's error is much the same there as under large loads.
+Meshes of ever smaller elements, about as long as wide, are pressed at the same places as meshes
+graded towards each of these, in all that the scene asks: displacement, von Mises stress, and under
+a tip the compliance of its footprint, beyond which its force does not err.  By a small load: linear
+elasticity costs one factorisation a mesh, and the errors of larger loads are much the same.
 """
 
 import re
 import sys
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
-from palpate.offline.fem.mesh import build_mesh, cells_of, divided, in_order, ticks_of
-from palpate.offline.fem.problem import FullProblem
+from palpate.offline.fem.graded import Graded, interpolated, parameters_of
+from palpate.offline.fem.mesh import Ticks, in_order, ticks_of
+from palpate.offline.fem.norms import relative
+from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.fem.shapes import shape_of
 from palpate.offline.reduce.sampling import spread_points
 from palpate.offline.run.streams import Stage, stream
-from palpate.shared.arrays import Array
-from palpate.shared.scene import Divisions, Scene, SceneError, parse_scene
-
-SHARE = 3.0
-"""Multiple of the tolerance of displacement that the mesh's error may have."""
+from palpate.offline.validate import mesh_part
+from palpate.shared.arrays import Array, Numbers
+from palpate.shared.scene import Divisions, Errors, Scene, SceneError, parse_scene
 
 COARSEST, FINER, SIZES = 1.0, 0.8, 7
 """Edge of the largest elements over the endoscope's radius, ratio of the next, and their number."""
 
 MOST_DOFS = 40_000
-"""Of a mesh that is tried; its reference has more than six times as many."""
+"""Of a mesh that is tried."""
 
-PLACES = 12
+MOST_PLACES = 12
+
+REFERENCE = mesh_part.GRADING._replace(coarsest=0.7, growth=0.6)
+"""Of references: in linear elasticity they may be finer."""
+
+SLIGHT = 1e-4
+"""Pressure over Young's modulus."""
 
 PROBE = 8
 """Steps along each axis in which a body is measured."""
+
+
+class Pressed(NamedTuple):
+    """What a mesh says of a small load at a place."""
+
+    displacement: Array  # (n, 3) mm
+    von_mises: Array  # (n,) kPa
+    depth: float  # mm, of the footprint
+
+
+class Reference(NamedTuple):
+    """What a mesh graded towards a place says there."""
+
+    place: Array  # (3,) mm
+    ticks: Ticks
+    elements: Numbers
+    pressed: Pressed
 
 
 def with_mesh(scene: Scene) -> tuple[Scene, dict[str, Any] | None]:
@@ -45,18 +69,27 @@ def with_mesh(scene: Scene) -> tuple[Scene, dict[str, Any] | None]:
     """
     if scene.geometry.divisions is not None:
         return scene, None
-    allowed = SHARE * scene.tolerance.displacement
-    tried: list[dict[str, Any]] = []
+    allowed, tried = scene.tolerance.mesh, list[dict[str, Any]]()
+    references: list[Reference] = []
     for divisions in tqdm(_candidates(scene), "choosing the mesh"):
         chosen = _divided(scene, divisions)
-        dofs, error = _try(chosen)
-        tried.append({"divisions": divisions, "dofs": dofs, "error": error})
-        if error <= allowed or FINER**-3 * dofs > MOST_DOFS:
+        problem = FullProblem(chosen)
+        references = references or _references(scene, problem)
+        errors = _errors(problem, references)
+        dofs = problem.mesh.nodes.size
+        tried.append({"divisions": divisions, "dofs": dofs, "errors": errors._asdict()})
+        beyond = [
+            name for name, e, most in zip(Errors._fields, errors, allowed, strict=True) if e > most
+        ]
+        if not beyond or FINER**-3 * dofs > MOST_DOFS:
             break
-    why = "the coarsest mesh tried with"
-    if error > allowed:
-        why = f"no mesh tried, of up to {dofs} DOFs, has"
-    why += f" at most {allowed:.1%} error under the footprint: {error:.2%}"
+    why = "the coarsest mesh tried that leaves the reduction its share"
+    if beyond:
+        why = f"no mesh tried, of up to {dofs} DOFs, does so in {' and '.join(beyond)}"
+    why += (
+        f": it errs by {errors.displacement:.1%} of displacement, {errors.von_mises:.1%} of stress"
+    )
+    why += f", {errors.force:.1%} of the tip's force" if scene.endoscope.tip else ""
     tqdm.write(f"mesh: {divisions}, {dofs} DOFs; {why}", file=sys.stderr)
     return chosen, {"why": why, "tried": tried}
 
@@ -89,24 +122,39 @@ def _candidates(scene: Scene) -> list[Divisions]:
     return found
 
 
-def _try(scene: Scene) -> tuple[int, float]:
-    """Degrees of freedom of a mesh, and the 95th percentile of its errors beside a finer one."""
-    ticks = ticks_of(scene.geometry)
-    a, b, c = cells_of(ticks)
-    finer = build_mesh(scene, divided(ticks, (2 * a, 2 * b, 2 * c)))
-    problem, reference = FullProblem(scene), FullProblem(scene, finer)
-    rng = stream(scene.seed, Stage.MESH_CHOICE)
-    errors = []
-    for point in spread_points(problem.surface, PLACES, rng):
-        x, normal, _ = problem.surface.project(point)
-        moved, exact = (_moved(body, x, normal) for body in (problem, reference))
-        errors.append(abs(moved / exact - 1))
-    return problem.mesh.nodes.size, float(np.percentile(errors, 95))
+def _references(scene: Scene, problem: FullProblem) -> list[Reference]:
+    """What graded meshes say at places all over the surface."""
+    count = min(mesh_part.places_of(scene, problem.surface), MOST_PLACES)
+    found = []
+    for x in spread_points(problem.surface, count, stream(scene.seed, Stage.MESH_CHOICE)):
+        fine = Graded(scene, x, REFERENCE)
+        mesh = fine.problem.mesh
+        found.append(Reference(x, fine.ticks, mesh.elements, _pressed(fine.problem, x)))
+    return found
 
 
-def _moved(problem: FullProblem, x: Array, normal: Array) -> float:
-    """Mean displacement under a footprint of unit pressure, along the normal; linear elasticity."""
-    nodal = problem.unit_load_at(x, normal)
-    load = (nodal[:, None] * normal).reshape(-1)[problem.model.free]
-    u = problem.model.solve_linear(load[:, None])[:, 0]
-    return float(load @ u) / float(nodal.sum())
+def _errors(problem: FullProblem, references: list[Reference]) -> Errors:
+    """95th percentiles of a mesh's errors; without a tip none of force."""
+    at = parameters_of(problem.scene, ticks_of(problem.scene.geometry))
+    kept, found = problem.nodal_volumes * problem.beyond_clamped_layer, []
+    for place, ticks, elements, exact in references:
+        own = _pressed(problem, place)
+        u, stress = (interpolated(ticks, elements, at, field) for field in exact[:2])
+        force = abs(own.depth / exact.depth - 1) if problem.scene.endoscope.tip else 0.0
+        moved = relative(own.displacement, u, problem.nodal_volumes)
+        off = moved, relative(own.von_mises, stress, kept), force
+        found.append(off)
+    return Errors(*np.percentile(found, 95, axis=0).tolist())
+
+
+def _pressed(problem: FullProblem, place: Array) -> Pressed:
+    """Press a small footprint along the normal; linear elasticity."""
+    x, normal, _ = problem.surface.project(place)
+    load = Load(x, -normal, SLIGHT * problem.scene.tissue.young)
+    nodal, u = problem.load_vector(load), np.zeros(problem.mesh.nodes.size)
+    free = problem.model.free
+    u[free] = problem.model.solve_linear(nodal.reshape(-1)[free, None])[:, 0]
+    displacement = u.reshape(-1, 3)
+    stress = problem.von_mises(displacement, contact=problem.footprint(load))
+    depth = float(np.linalg.norm(problem.under(x, displacement)))
+    return Pressed(displacement, stress, depth)

@@ -1,9 +1,9 @@
 """How large a reduced model must be: the smallest that meets the scene's tolerance.
 
 Sizes are tried on a few patches spread over the surface, each trained by itself and judged on loads
-that it has not seen, until the smallest of the ladder is found that is good enough.  The tolerance
-says where to begin, and each trial how far from there to go on: a loose tolerance is not made to
-pay for trials of large models.
+that it has not seen, by what its errors there would be estimated at, until the smallest of the
+ladder is found that is good enough.  The tolerance says where to begin, and each trial how far from
+there to go on: a loose tolerance is not made to pay for trials of large models.
 """
 
 import math
@@ -14,12 +14,21 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from palpate.offline.fem.norms import relative, statistics
+from palpate.offline.fem.norms import statistics
 from palpate.offline.fem.problem import FullProblem
-from palpate.offline.reduce.footprint_models import LocalTrainer, RandomLoads, trained_patch
+from palpate.offline.reduce.footprint_models import RandomLoads, trained_patch
 from palpate.offline.reduce.layout import Patch
+from palpate.offline.reduce.load_range import untested
 from palpate.offline.reduce.ritz import region
 from palpate.offline.run.streams import Stage, stream
+from palpate.offline.validate.compare import (
+    KnownAnswer,
+    calibrate,
+    compare,
+    play,
+    reference_task,
+)
+from palpate.offline.validate.queries import LOADS
 from palpate.shared.arrays import Array
 from palpate.shared.mechanics.laws import AnyTissue
 from palpate.shared.mechanics.tissue import lame
@@ -46,48 +55,39 @@ COMPRESSIBLE = 0.45
 PLACE = 3
 """On the ladder, of the size that the turbinate takes at the usual tolerance."""
 
-MARGIN = 0.8
-"""Share of the tolerance that the 95th percentile of a trial's errors may reach."""
-
-WORST = 3.0
-"""Multiple of the tolerance that its largest error may reach."""
+DAMPING = 3.0
+"""Of the fit of estimates to the few errors of a trial, see ``compare.calibrate``."""
 
 TRIAL_LOADS = 10
 
 
 class TrialResult(NamedTuple):
-    """One patch on loads it has not seen: relative errors (k,) and median time of a solve, s."""
+    """One patch on loads it has not seen."""
 
-    displacement: Array
-    von_mises: Array
-    seconds: float
+    known: list[KnownAnswer]
+    seconds: float  # median time of an answer
 
 
-def try_patch(problem: FullProblem, patch: Patch) -> TrialResult:
-    """Train a local model by itself and judge it on loads it has not seen."""
+def try_patch(problem: FullProblem, patch: Patch, limits: Array) -> TrialResult:
+    """Train a local model by itself and judge it on loads it has not seen.
+
+    ``limits`` is the load range at the surface's vertices.
+    """
     basis = region(problem, patch.footprints, patch.size.region_modes)
-    models = trained_patch(problem, basis, patch)
-    trainer, nodal = LocalTrainer(problem, models), models.modes[0].T @ models.window(0)[1]
+    model = untested(problem, trained_patch(problem, basis, patch), limits)
     loads = RandomLoads(problem.scene, patch, stream(patch.seed, Stage.TRIAL_LOADS))
-    kept, errors = problem.beyond_clamped_layer, list[tuple[float, float]]()
-    seconds = list[float]()
-    while len(seconds) < TRIAL_LOADS:
-        load = loads.any()
+    known, seconds = list[KnownAnswer](), list[float]()
+    while len(known) < TRIAL_LOADS:
+        query = [loads.any()]
         started = time.perf_counter()
-        sample = trainer.solve(load)
+        play(model, query)
         spent = time.perf_counter() - started
-        u = None if sample is None else (sample.q @ nodal).reshape(-1, 3)
-        known = problem.reference([load], u)
-        if known is None:
-            continue
-        seconds.append(spent)
-        errors.append((np.inf, np.inf))
-        if u is not None:
-            stress = problem.von_mises(u, contact=problem.footprint(load))
-            off = relative(stress[kept], known.s[0][kept])
-            errors[-1] = relative(u, known.u[0]), off
-    displacement, von_mises = np.transpose(errors)
-    return TrialResult(displacement, von_mises, float(np.median(seconds)))
+        solve, *given = reference_task(model, query)
+        full = solve(problem, *given)
+        if full is not None:
+            seconds.append(spent)
+            known += compare(LOADS, problem, model, query, full).known
+    return TrialResult(known, float(np.median(seconds)))
 
 
 @dataclass(frozen=True)
@@ -97,6 +97,7 @@ class Trial:
     size: Size
     displacement: dict[str, float]
     von_mises: dict[str, float]
+    estimates: tuple[float, float]  # 95th percentiles of what would be estimated of these
     loads: int
     solve_us: float
 
@@ -107,30 +108,41 @@ class Trial:
         Where the tissue gives way the load range is lowered only after training: loads beyond that
         say nothing about a size.
         """
-        worst = np.argmax([result.displacement.max() for result in results])
+        worst = np.argmax([_errors(result.known)[:, 0].max() for result in results])
         kept = [result for i, result in enumerate(results) if i != worst] or results
-        displacement = np.concatenate([result.displacement for result in kept])
-        von_mises = statistics(np.concatenate([result.von_mises for result in kept]))
-        seconds = float(np.median([result.seconds for result in results]))
-        loads = len(displacement)
-        return cls(size, statistics(displacement), von_mises, loads, round(1e6 * seconds, 1))
+        known = [answer for result in kept for answer in result.known]
+        displacement, von_mises = map(statistics, _errors(known).T)
+        seconds = round(1e6 * float(np.median([result.seconds for result in results])), 1)
+        return cls(size, displacement, von_mises, _estimates(known), len(known), seconds)
 
     def over(self, tolerance: Tolerance) -> float:
-        """Largest ratio of an error to what it may be, less the margin."""
-        return max(
-            errors[key] / (share * allowed)
-            for errors, allowed in (
-                (self.displacement, tolerance.displacement),
-                (self.von_mises, tolerance.von_mises),
-            )
-            for key, share in (("p95", MARGIN), ("max", WORST))
-        )
+        """Largest ratio of an estimate to what the reduction may err by.
+
+        An answer whose estimates are within the tolerance is trusted, so these count, not errors.
+        """
+        return max(np.divide(self.estimates, tolerance.reduction[:2]).tolist())
 
     def __str__(self) -> str:
         return (
             f"95th percentile of errors on {self.loads} trial loads "
-            f"{self.displacement['p95']:.2%} displacement, {self.von_mises['p95']:.2%} von Mises"
+            f"{self.displacement['p95']:.2%} displacement, {self.von_mises['p95']:.2%} von Mises, "
+            "of their estimates {:.2%} and {:.2%}".format(*self.estimates)
         )
+
+
+def _errors(known: Sequence[KnownAnswer]) -> Array:
+    """Errors (k, 2) of answers, all of it where there is none."""
+    return np.array([answer.errors if answer.converged else [1.0, 1.0] for answer in known])
+
+
+def _estimates(known: Sequence[KnownAnswer]) -> tuple[float, float]:
+    """95th percentiles of what would be estimated, calibrated by these answers themselves."""
+    if not all(answer.converged for answer in known):
+        return 1.0, 1.0
+    estimator, _ = calibrate([[answer] for answer in known], DAMPING)
+    estimates = np.exp([estimator @ answer.features for answer in known])
+    displacement, von_mises = np.percentile(estimates, 95, axis=0).tolist()
+    return displacement, von_mises
 
 
 def ladder(tissue: AnyTissue) -> tuple[Size, ...]:
@@ -193,8 +205,8 @@ def _reason(
         why = f"the smallest of {sizes} sizes that meets the tolerance: {chosen}"
     else:
         why = (
-            f"no size meets the tolerance of {tolerance.displacement:.2%} and "
-            f"{tolerance.von_mises:.2%}; this is the most accurate: {chosen}"
+            f"no size meets the reduction's share of {tolerance.reduction.displacement:.2%} and "
+            f"{tolerance.reduction.von_mises:.2%}; this is the most accurate: {chosen}"
         )
     allowed = 1e6 * budget.query
     if chosen.solve_us > allowed:

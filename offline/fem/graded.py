@@ -11,7 +11,7 @@ import numpy as np
 from palpate.offline.fem.mesh import Ticks, build_mesh, cells_of, divided, node_places
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.shapes import shape_of
-from palpate.shared.arrays import Array
+from palpate.shared.arrays import Array, Numbers
 from palpate.shared.geometry.elements import hexahedron, shape
 from palpate.shared.scene import Extrusion, Scene
 
@@ -54,15 +54,19 @@ class Graded:
 
     def at(self, parameters: Array, field: Array) -> Array:
         """A nodal field (n, ...) of this mesh at parameters (k, 3) of points of the body."""
-        cells, local = [], []
-        for ticks, t in zip(self.ticks, parameters.T, strict=True):
-            cell = np.clip(np.searchsorted(ticks, t, side="right") - 1, 0, len(ticks) - 2)
-            cells.append(cell)
-            local.append(2.0 * (t - ticks[cell]) / (ticks[cell + 1] - ticks[cell]) - 1.0)
-        elements = self.problem.mesh.elements
-        nodes = elements[np.ravel_multi_index(cells, cells_of(self.ticks))]
-        N, _ = shape(hexahedron(elements.shape[1]), np.column_stack(local))
-        return np.einsum("ka,ka...->k...", N, field[nodes])
+        return interpolated(self.ticks, self.problem.mesh.elements, parameters, field)
+
+
+def interpolated(grid: Ticks, elements: Numbers, parameters: Array, field: Array) -> Array:
+    """A nodal field (n, ...) of a mesh of elements at parameters (k, 3) of points of the body."""
+    cells, local = [], []
+    for ticks, t in zip(grid, parameters.T, strict=True):
+        cell = np.clip(np.searchsorted(ticks, t, side="right") - 1, 0, len(ticks) - 2)
+        cells.append(cell)
+        local.append(2.0 * (t - ticks[cell]) / (ticks[cell + 1] - ticks[cell]) - 1.0)
+    nodes = elements[np.ravel_multi_index(cells, cells_of(grid))]
+    N, _ = shape(hexahedron(elements.shape[1]), np.column_stack(local))
+    return np.einsum("ka,ka...->k...", N, field[nodes])
 
 
 def parameters_of(scene: Scene, ticks: Ticks) -> Array:

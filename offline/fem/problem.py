@@ -111,7 +111,7 @@ class FullProblem:
         """Volumes (n,) mm^3 that nodes stand for: those of the elements around, shared out."""
         elements = self.mesh.elements
         shares = np.repeat(self.model.weights.sum(axis=1) / elements.shape[1], elements.shape[1])
-        return np.bincount(elements.ravel(), shares, len(self.mesh.nodes))
+        return np.bincount(elements.ravel(), shares, len(self.mesh.nodes)).astype(float)
 
     def points_in_body(self, points: Numbers) -> Numbers:
         """Numbers in the whole body of quadrature points."""

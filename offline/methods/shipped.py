@@ -49,13 +49,7 @@ class Shipped(Method):
             return Answer(state, False, refused=True)
         if not found.converged:
             return Answer(state, False)
-        tolerance = self._atlas.scene.tolerance
-        doubted = not (
-            found.in_range
-            and found.error_reduction[0] <= tolerance.displacement
-            and found.error_reduction[1] <= tolerance.von_mises
-        )
-        return Answer(found, doubted=doubted)
+        return Answer(found, doubted=bool(self._atlas.doubts(found)))
 
     def _ask(self, state: Found | None, case: Case, dt: float) -> Found:
         """Put a case of one contact to the reduced model."""

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.reduce import cubature
 from palpate.offline.reduce.join import deviatoric_of, half, with_points
@@ -64,6 +65,9 @@ TANGENT_LOADS = 100
 """Equilibria that the first guess is fitted to, and those of them at which the tangent is looked
 at; the damping of both fits."""
 
+CUBATURE_LOADS = 3
+"""By which a local model is compared with itself with every quadrature point."""
+
 EQUATIONS = 300
 """Combinations of the reduced internal force that cubature is fitted to.
 
@@ -78,8 +82,8 @@ NO_LIMIT = 1e9
 
 
 def endless(surface: Surface) -> SurfaceIndex:
-    """The surface with a load range without end: see ``mechanics.footprint.pressure_limit``."""
-    fields = [NO_LIMIT, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, NO_LIMIT, *[0.0] * CURVATURE_FIELDS]
+    """The surface without end of its load range and without a rim; see ``outcome.Solver``."""
+    fields = [NO_LIMIT, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, NO_LIMIT, *[0.0] * CURVATURE_FIELDS, NO_LIMIT]
     return surface.ground(np.tile(fields, (len(surface.vertices), 1)))
 
 
@@ -214,6 +218,7 @@ def trained_patch(problem: FullProblem, region: Region, patch: Patch) -> LocalMo
         directions=half(directions),
         change=half(change),
         residuals=residual[None],
+        cubature_errors=_cubature_errors(galerkin, trained, modes, loads)[None],
         viscous=viscous,
     )
 
@@ -256,6 +261,7 @@ def _untrained(
         directions=np.zeros((1, CHANGING, modes), np.float32),
         change=np.zeros((1, TANGENT_FEATURES, CHANGES), np.float32),
         residuals=np.zeros((1, RESIDUAL_FEATURES)),
+        cubature_errors=np.zeros((1, 0)),
         extent=extent,
         blend=problem.scene.training.blend,
     )
@@ -314,6 +320,19 @@ def _fit_tangent(reduced: LocalTrainer, samples: Sequence[Sample]) -> tuple[Arra
     seen = (U.T @ changes @ U)[:, rows, columns]
     features = np.array([s.tangent_features for s in samples])
     return U.T, cubature.damped_fit(features, seen, GUESS_DAMPING)
+
+
+def _cubature_errors(
+    galerkin: LocalTrainer, reduced: LocalTrainer, modes: Array, loads: RandomLoads
+) -> Array:
+    """Relative errors (CUBATURE_LOADS,) of displacement that the points make; nan if not known."""
+    errors = np.full(CUBATURE_LOADS, np.nan)
+    for i in range(CUBATURE_LOADS):
+        load = loads.any()
+        exact, found = galerkin.solve(load), reduced.solve(load)
+        if exact is not None and found is not None:
+            errors[i] = relative(modes @ found.q, modes @ exact.q)
+    return errors
 
 
 def _fit_residual(

@@ -236,12 +236,12 @@ def bearable_shares(search: Search, model: ReducedModel, ask: Ask, rng: Rng) -> 
     return shares
 
 
-def untested(problem: FullProblem, models: LocalModels, limits: Array) -> ReducedModel:
-    """Reduced model of local models and a load range, without error estimates."""
-    scene = problem.scene
-    return ReducedModel(
-        scene.name, scene, {}, problem.body, problem.surface, limits, models, Estimators()
-    )
+def untested(
+    problem: FullProblem, models: LocalModels, limits: Array, known: Estimators | None = None
+) -> ReducedModel:
+    """Reduced model of local models and a load range, with the error estimates known so far."""
+    scene, known = problem.scene, known or Estimators()
+    return ReducedModel(scene.name, scene, {}, problem.body, problem.surface, limits, models, known)
 
 
 @lru_cache(maxsize=1)

@@ -31,10 +31,10 @@ def random_points(surface: Surface, count: int, rng: np.random.Generator) -> Arr
 def random_points_and_rim(
     surface: Surface, count: int, rng: np.random.Generator
 ) -> Iterator[Array]:
-    """As ``random_points``, one by one, but one in eight, the first among them, is on the rim."""
+    """As ``random_points``, one by one, but one in four, the first among them, is on the rim."""
     points, rim = random_points(surface, count, rng), surface.rim()
     for i, point in enumerate(points):
-        yield surface.vertices[rng.choice(rim)] if i % 8 == 0 else point
+        yield surface.vertices[rng.choice(rim)] if i % 4 == 0 else point
 
 
 def spread_points(surface: Surface, count: int, rng: np.random.Generator) -> Array:

@@ -194,7 +194,7 @@ def _draw_panel(axes: Axes, panel: Panel, rows: Sequence[Row], per: str) -> None
 
 
 def _draw_goals(axes: Axes, panel: Panel, rows: Sequence[Row], scene: Scene, per: str) -> None:
-    """The full model on the scene's mesh, and the scene's tolerance of reduction and budget."""
+    """The full model on the scene's mesh, the reduction's share of the tolerance and the budget."""
     full = next(row for row in rows if row["key"] == FULL)
     (left, right), (bottom, top), error = axes.get_xlim(), axes.get_ylim(), full[panel.error]
     if panel.field == "refined":
@@ -205,7 +205,7 @@ def _draw_goals(axes: Axes, panel: Panel, rows: Sequence[Row], scene: Scene, per
     where = full["time_us"], bottom ** (2 / 3) * top ** (1 / 3)
     time = duration(1e-6 * full["time_us"])
     _write(axes, f"full model:\n{time},\nno error", where, (6, 0))
-    tolerance = getattr(scene.tolerance, panel.field)
+    tolerance = getattr(scene.tolerance.reduction, panel.field)
     text = f"aim: {percent(tolerance)}"
     if per == "query":
         right = 1e6 * scene.budget.query

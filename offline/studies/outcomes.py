@@ -24,8 +24,8 @@ from palpate.offline.studies.hard_cases import CONTROL
 from palpate.offline.studies.references import Fields
 
 ROUGHLY = 0.1
-"""Displacement error up to which a wrong answer is roughly right; the artifact is nearly the only
-method within the tolerance of a scene."""
+"""Displacement error up to which a wrong answer is roughly right.  Right is what is within the
+tolerance of the scene, that of mesh and reduction together: who vouches promises that."""
 
 OUTCOMES = {
     "right": "#0072B2",

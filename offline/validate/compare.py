@@ -4,12 +4,15 @@ A query is a list of time steps; without time its length is one.  The errors fou
 reduced model's estimate of them.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.stats import beta
 from tqdm import tqdm
 
 from palpate.offline.fem.norms import relative, statistics
@@ -23,6 +26,7 @@ from palpate.shared.artifact import read_artifact
 from palpate.shared.errors import PalpateError, QueryError
 from palpate.shared.model import ReducedModel
 from palpate.shared.reduced.transfer import REST
+from palpate.shared.scene import Errors, Tolerance
 
 OTHER_EQUILIBRIUM = 0.1
 """Displacement error beyond which the models rest in different equilibria: a free edge can slip off
@@ -83,7 +87,9 @@ class KnownAnswer:
     features: Array  # of the error estimate
     converged: bool
     comparable: bool  # counts for the estimate: both models rest in the same equilibrium
-    estimated: Array = field(default_factory=lambda: np.empty(0))  # (quantities,)
+    near_rim: bool = False  # as its last feature says, if there is such a one
+    mesh: Array = field(default_factory=lambda: np.zeros(3))  # estimated errors of the mesh
+    estimated: Array = field(default_factory=lambda: np.empty(0))  # (quantities,), of ``errors``
 
 
 class Row(NamedTuple):
@@ -119,6 +125,8 @@ def compare(
             converged=answer.converged,
             # a pressed footprint has one equilibrium within the range of loads
             comparable=answer.converged and (kind is LOADS or own[0] <= OTHER_EQUILIBRIUM),
+            near_rim=not kind.in_time and answer.features[-1] > 0.0,
+            mesh=answer.error_mesh[: len(kind.quantities)],
             estimated=answer.error_reduction[: len(kind.quantities)],
         )
         for own, answer in zip(errors, answers, strict=True)
@@ -192,13 +200,14 @@ def _history(
     return table
 
 
-def summarise(kind: Kind, rows: Sequence[Row]) -> dict[str, Any]:
+def summarise(kind: Kind, rows: Sequence[Row], tolerance: Tolerance) -> dict[str, Any]:
     """Statistics over queries of one kind.
 
     ``unconverged`` counts answers, and ``covered`` is the share of all others that are within their
-    estimates.  Single answers that did not converge count in nothing else.  Under the tip queries
-    that the models spend in different equilibria, ``other_equilibrium``, are left out of all
-    errors but ``together_...``, which are those of moments at which they do not.
+    estimates, of single ones told of those ``near_rim``, too; ``flagged`` is what ``flags`` finds.
+    Single answers that did not converge count in nothing else.  Under the tip queries that the
+    models spend in different equilibria, ``other_equilibrium``, are left out of all errors but
+    ``together_...``, which are those of moments at which they do not.
     """
     known = [answer for row in rows for answer in row.known]
     converged = [answer for answer in known if answer.converged]
@@ -212,6 +221,9 @@ def summarise(kind: Kind, rows: Sequence[Row]) -> dict[str, Any]:
     if kind.tip:
         summary["other_equilibrium"] = len(answered) - len(alike)
     summary["covered"] = covered
+    if rim := [answer for answer in converged if answer.near_rim]:
+        summary["near_rim"] = {"queries": len(rim), "covered": coverage(rim)[0]}
+    summary["flagged"] = flags(converged, tolerance)
     if kind.tip and kind.in_time:
         moments = [row["apart"] for row in answered]
         summary["apart"] = {"histories": int(np.count_nonzero(moments)), "moments": sum(moments)}
@@ -276,7 +288,7 @@ def against_full(
         raise PalpateError(f"{artifact}: the full model has no equilibrium under any of the loads")
     if csv:
         write_rows(csv, kind, rows)
-    return summarise(kind, rows) | {"without_equilibrium": count - len(rows)}
+    return summarise(kind, rows, model.scene.tolerance) | {"without_equilibrium": count - len(rows)}
 
 
 def reference_task(model: ReducedModel, query: Sequence[Step]) -> tuple[Any, ...]:
@@ -291,15 +303,37 @@ def reference_task(model: ReducedModel, query: Sequence[Step]) -> tuple[Any, ...
     return FullProblem.reference, query, model.displacement(answer)
 
 
-def calibrate(known: Sequence[KnownAnswer], share: float, damping: float) -> Array:
-    """Fit the error estimate (quantities, features): it covers a share of the known errors in all.
+COVERAGE, CONFIDENCE = 0.95, 0.9
+"""Share of errors that estimates are to cover, and how sure it is that they cover so many."""
 
-    A least-squares fit of their logs is raised by a constant for each quantity.  The answers that
-    need not be covered are those that would raise one most.  What counts is how far an answer lies
-    from a fit to the others, or the estimate would cover fewer of new ones.  ``damping`` holds the
-    coefficients back, since known errors are few for many features.
+
+def covering(count: int) -> tuple[float, float]:
+    """Quantile of so many known scores that covers unseen ones, and the confidence.
+
+    Those below the k-th of n are a share of all scores that has the beta distribution of k and
+    n + 1 - k, whatever they are; its mean is the quantile k / (n + 1).  The k is the least that is
+    sure enough; of few scores, the last.
     """
-    known = [answer for answer in known if answer.comparable]
+    rank = np.arange(1, count + 1)
+    sure = beta.sf(COVERAGE, rank, count + 1 - rank)
+    k = min(int(np.searchsorted(sure, CONFIDENCE)), count - 1)
+    return float(rank[k] / (count + 1)), float(sure[k])
+
+
+def calibrate(queries: Sequence[Sequence[KnownAnswer]], damping: float) -> tuple[Array, float]:
+    """Fit the error estimate (quantities, features), conformally; return its confidence, too.
+
+    A least-squares fit of the logs of errors is raised until the scores that ``covering`` asks for
+    are covered.  A score is how far an answer lies above the fit, over the root of how far they
+    usually do, in the quantity in which that is most: between raising all quantities alike and each
+    as it scatters.  Answers near the rim are raised by themselves, through their last feature.
+    What counts is how far an answer lies from a fit to the others, or the estimate would cover
+    fewer of new ones.  The answers to one query are alike: for the confidence they count as one,
+    and the quantile is that of all of them.
+    ``damping`` holds the coefficients back, since known errors are few for many features.
+    """
+    own = [(i, answer) for i, query in enumerate(queries) for answer in query if answer.comparable]
+    query, known = np.array([i for i, _ in own]), [answer for _, answer in own]
     X = np.array([answer.features for answer in known])
     spread = X.std(axis=0)
     scale = np.where(spread > 1e-9, spread, np.inf)  # the constant one; others may be, too
@@ -313,24 +347,35 @@ def calibrate(known: Sequence[KnownAnswer], share: float, damping: float) -> Arr
     rest = Y - X @ coefficients
     coefficients[0] = np.median(rest, axis=0)
     rest = (rest - coefficients[0]) / (1 - leverage)[:, None]
-    covered = np.argsort(rest.max(axis=1))[: int(np.ceil(share * (len(known) + 1)))]
-    coefficients[0] += rest[covered].max(axis=0)
-    return np.ascontiguousarray(coefficients.T)
+    above = np.mean(np.maximum(rest, 1e-9) ** 2, axis=0) ** 0.25
+    score, near_rim = (rest / above).max(axis=1), np.array([answer.near_rim for answer in known])
+    raised, sure = list[Array](), 1.0
+    for group in (~near_rim, near_rim):
+        if group.any():
+            share, confidence = covering(len(np.unique(query[group])))
+            rank = math.ceil(share * (group.sum() + 1) - 1e-9)
+            covered = np.sort(score[group])[rank - 1]
+            raised.append(covered * above)
+            sure = min(sure, confidence)
+    coefficients[0] += raised[0]
+    if len(raised) == 2:
+        coefficients[-1] += raised[1] - raised[0]
+    return np.ascontiguousarray(coefficients.T), sure
 
 
 def calibrate_by_halves(
-    queries: Sequence[Sequence[KnownAnswer]], fit: Callable[[Sequence[KnownAnswer]], Array]
-) -> Array:
-    """Fit an estimate to the answers to all queries.
+    queries: Sequence[Sequence[KnownAnswer]], damping: float
+) -> tuple[Array, float]:
+    """Fit an estimate to the answers to all queries, as ``calibrate`` does.
 
     What an answer itself is estimated to err by comes from a fit to the other half of the queries.
     """
     for half in (0, 1):
-        estimator = fit([answer for answers in queries[1 - half :: 2] for answer in answers])
+        estimator, _ = calibrate(queries[1 - half :: 2], damping)
         for answers in queries[half::2]:
             for answer in answers:
                 answer.estimated = np.exp(estimator @ answer.features)
-    return fit([answer for answers in queries for answer in answers])
+    return calibrate(queries, damping)
 
 
 def coverage(known: Sequence[KnownAnswer]) -> tuple[float, Array]:
@@ -343,3 +388,30 @@ def coverage(known: Sequence[KnownAnswer]) -> tuple[float, Array]:
     estimated = np.array([answer.estimated for answer in known])
     ratios = np.median(estimated / np.maximum(errors, 1e-12), axis=0)
     return float(np.mean(np.all(errors <= estimated, axis=1))), ratios
+
+
+def flags(known: Sequence[KnownAnswer], tolerance: Tolerance) -> dict[str, Any]:
+    """Share of right answers that would be doubted, of how many, and what is to blame most often.
+
+    Right are those in range whose errors are within the reduction's share of the tolerance; they
+    are doubted where estimates of mesh and reduction together exceed it, see ``Tolerance``.
+    """
+    right, doubted, blamed = 0, 0, Counter[str]()
+    for answer in known:
+        if answer.estimated[0] == np.inf or np.any(
+            answer.errors > tolerance.reduction[: len(answer.errors)]
+        ):
+            continue
+        right += 1
+        names = tolerance.exceeded(np.hypot(answer.estimated, answer.mesh))
+        doubted += bool(names)
+        for name in names:
+            i = Errors._fields.index(name)
+            larger = "mesh" if answer.mesh[i] > answer.estimated[i] else "reduction"
+            blamed[f"the {larger}'s {name}"] += 1
+    most = blamed.most_common(1)
+    return {
+        "share": doubted / max(right, 1),
+        "right": right,
+        "mostly": most[0][0] if most else None,
+    }

@@ -20,10 +20,11 @@ from palpate.offline.reduce.sampling import spacing_count
 from palpate.offline.validate.compare import KnownAnswer, calibrate
 from palpate.offline.validate.queries import Place
 from palpate.shared.arrays import Array
+from palpate.shared.geometry.surface import Surface
 from palpate.shared.model import ReducedModel
-from palpate.shared.scene import Scene
+from palpate.shared.scene import Errors, Scene
 
-GRADING = Grading(finest=0.25, even=0.6, growth=0.9, support=0.15)
+GRADING = Grading(finest=0.25, even=0.6, growth=0.9, coarsest=1.4, support=0.15)
 """Of references: under a footprint, which is smooth, their own error is a fifth of that of meshes
 that serve."""
 
@@ -45,11 +46,8 @@ GIVEN_WAY = 0.3
 finer mesh has given way where the scene's own has not: that is no error of a size, and the limit
 there is too high.  Training says how many there are."""
 
-COVERED, DAMPING = 0.96, 0.3
+DAMPING = 0.3
 """Of the fit, see ``compare.calibrate``."""
-
-NAMES = "displacement", "von_mises", "force"
-"""What errors are estimated of; those of ``StressField.peaks`` are only told."""
 
 Levels = Sequence[tuple[float, Load | TipPosition]]
 """What presses at one place, harder and harder: share of the limit, or mm, and step."""
@@ -113,11 +111,15 @@ def compared(
         yield level, step, found, there._replace(displacement=u, von_mises=stress)
 
 
+def places_of(scene: Scene, surface: Surface) -> int:
+    """Number of places of a surface to look at."""
+    return max(LEAST, spacing_count(surface, APART * scene.endoscope.radius))
+
+
 def places(model: ReducedModel, rng: np.random.Generator, tip: bool = False) -> list[Levels]:
     """Footprints pressed along the normal at places all over the surface, or tips at a few."""
-    surface = model.surface
-    apart = spacing_count(surface, APART * model.scene.endoscope.radius)
-    points = centred_points_and_rim(surface, LEAST if tip else max(LEAST, apart), RIM, rng)
+    count = LEAST if tip else places_of(model.scene, model.surface)
+    points = centred_points_and_rim(model.surface, count, RIM, rng)
     found = [Place.at(model, point) for point in points]
     if tip:
         return [[(level, place.touch(level)) for level in DEPTHS] for place in found]
@@ -145,20 +147,23 @@ def mesh_errors(problem: FullProblem, levels: Levels) -> list[Array]:
 
 
 def fit(found: Sequence[list[Array]], tip: bool = False) -> tuple[Array, dict[str, Any]]:
-    """Coefficients (NAMES, 2) of the log of the mesh's errors in 1 and the share of the limit.
+    """Coefficients (3, 2) of the log of the mesh's errors in 1 and the share of the limit.
 
-    And what an artifact tells of these errors.
+    And what an artifact tells of these errors, of those of ``StressField.peaks`` as well.
     """
     rows = np.array([row for own in found for row in own])
     moved = rows[:, 3] if tip else np.maximum(rows[:, 1], rows[:, 3])
+    there = moved < GIVEN_WAY
+    answers = iter(there)
     known = [
-        KnownAnswer(row[1:4], np.array([1.0, row[0]]), True, comparable=far < GIVEN_WAY)
-        for row, far in zip(rows, moved, strict=True)
+        [KnownAnswer(row[1:4], np.array([1.0, row[0]]), True, next(answers)) for row in own]
+        for own in found
     ]
-    table = rows[moved < GIVEN_WAY, 1:].T
     told = {
         name: statistics(errors)
-        for name, errors in zip((*NAMES, "peak", "p99"), table, strict=True)
+        for name, errors in zip((*Errors._fields, "peak", "p99"), rows[there, 1:].T, strict=True)
     }
-    counts = {"answers": len(rows), "given_way": len(rows) - table.shape[1]}
-    return calibrate(known, COVERED, DAMPING), counts | told
+    fitted, confidence = calibrate(known, DAMPING)
+    given_way = int(np.sum(~there))
+    counts = {"answers": len(rows), "given_way": given_way, "confidence": confidence}
+    return fitted, counts | told

@@ -289,7 +289,9 @@ class SceneSummary(SceneEntry):
     """One scene: what may be asked and how well it is answered."""
 
     ranges: Ranges
-    tolerance: dict[str, float] = Field(description="Relative L2 errors promised, as fractions.")
+    tolerance: dict[str, float] = Field(
+        description="Largest relative errors of trusted answers, as fractions."
+    )
     size: dict[Literal["nodes", "dofs", "surface_nodes", "triangles"], int] = Field(
         description="What the fields of this scene hold."
     )

@@ -49,7 +49,7 @@ def patches(nodes: Array, elements: Numbers) -> Patches:
     next_to = neighbours(elements[:, :8])
     at = nodes[elements[:, :8]]
     lengths = np.linalg.norm(at[:, OPPOSITE] - at[:, :, None], axis=3)  # (e, 8, 3)
-    corners, first = np.unique(elements[:, :8], return_index=True)
+    corners, first = np.unique(elements[:, :8].astype(int), return_index=True)
     own, corner = np.divmod(first, 8)
     around, weights = own[:, None], np.ones((len(own), 1, 1))
     for d in range(3):
@@ -116,7 +116,7 @@ def _midsides(lengths: Array, elements: Numbers, next_to: Ints) -> tuple[Ints, I
             at[:, 1 + place], at[:, 3 * place] = sign, sign + 2.0 * sign * further
         lines.append(four)
         shares.append(_lagrange(at, known))
-    midsides, first = np.unique(elements[:, 8:].T, return_index=True)
+    midsides, first = np.unique(elements[:, 8:].T.astype(int), return_index=True)
     return midsides, np.concatenate(lines)[first], np.concatenate(shares)[first]
 
 

@@ -220,6 +220,10 @@ class Surface:
         unique, count = np.unique(edges, axis=0, return_counts=True)
         return np.unique(unique[count == 1])
 
+    def rim_distance(self) -> Array:
+        """Distance (v,) mm of the vertices from the nearest on the rim."""
+        return np.asarray(cKDTree(self.vertices[self.rim()]).query(self.vertices)[0])
+
 
 def tangent_frames(normals: Array) -> Array:
     """Two unit tangents (n, 2, 3) of each of unit normals (n, 3)."""

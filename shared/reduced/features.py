@@ -5,6 +5,13 @@ import math
 import numpy as np
 from numba import njit
 
+from palpate.shared.mechanics.footprint import LIMIT_FIELDS
+from palpate.shared.mechanics.tip import CURVATURE_FIELDS
+
+RIM = LIMIT_FIELDS + CURVATURE_FIELDS
+"""Which of the values at a place, after load range and curvature, is its distance from the rim of
+the surface, in radii of the endoscope."""
+
 CHANGING = 12
 """Directions in which the first tangent of a load's search is another than at rest."""
 
@@ -101,6 +108,12 @@ def log_residual(solver, x, direction, share):
             residual_features(models.frames[k], centre, x, direction, share, features)
             log += active.weight[slot] * np.dot(models.residuals[k], features)
     return log
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def near_rim(at):
+    """1 where values (RIM + 1,) are those of a place within a radius of the rim, 0 elsewhere."""
+    return 1.0 if at[RIM] < 1.0 else 0.0
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

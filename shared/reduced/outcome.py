@@ -11,8 +11,9 @@ from palpate.shared.reduced.press import PressModels, PressScratch, PressWarm
 Number = Annotated[Array, "1"]
 Vector = Annotated[Array, "3"]
 
-PRESS_FEATURES, TOUCH_FEATURES, HISTORY_FEATURES = 11, 10, 9
-"""Features of the error estimates of loads, of the tip, and of histories of both."""
+PRESS_FEATURES, TOUCH_FEATURES, HISTORY_FEATURES = 12, 11, 9
+"""Features of the error estimates of loads, of the tip, and of histories of both; the last of the
+first two is ``features.near_rim``."""
 
 
 class Outcome(NamedTuple):
@@ -42,7 +43,7 @@ class Outcome(NamedTuple):
     errors: Vector  # estimated: displacement, von Mises stress, force
     tangent: Annotated[Array, "3, 3"]  # mN/mm
     features: Annotated[Array, "features"]  # of the error estimate, with room for the most
-    limits: Annotated[Array, "limits"]  # load range there, see ``mechanics.footprint``; curvature
+    limits: Annotated[Array, "limits"]  # values there, see ``Solver.surface``
 
 
 class Solver(NamedTuple):
@@ -50,7 +51,7 @@ class Solver(NamedTuple):
 
     models: PressModels
     tip: Tip
-    surface: SurfaceIndex  # values at its vertices: the load range, and the curvature
+    surface: SurfaceIndex  # values at its vertices: load range, curvature, distance from the rim
     coefficients: Array  # (2 or 3, features) of the error estimate: displacement, von Mises, force
     past: Any  # Elastic or Remembering
     active: Active

@@ -32,7 +32,7 @@ from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import SurfaceQuadrature, footprint, pressure_limit
 from palpate.shared.reduced.blend import MAX_ACTIVE, activate
 from palpate.shared.reduced.corrections import Secants, forget_secants
-from palpate.shared.reduced.features import estimate_errors, load_features, log_residual
+from palpate.shared.reduced.features import estimate_errors, load_features, log_residual, near_rim
 from palpate.shared.reduced.points import FAST, Points, back_substitute, cholesky, superpose
 from palpate.shared.reduced.problem import Problem, Work, newton_method
 from palpate.shared.reduced.terms import Dead, TipScratch, TipWarm
@@ -324,7 +324,7 @@ def _estimate(solver, pressure):
     The features: 1, tilt over the largest, smallest det F, the normal (where on the body), and the
     logs of the pressure over its limit, of the departure from the linear response, of the residual
     that such answers leave in the full model, of the contact's displacement over pressure (mm/kPa)
-    and of the displacement in the energy norm.
+    and of the displacement in the energy norm; whether the contact is near the rim.
     """
     outcome, features = solver.outcome, solver.outcome.features
     load = pressure / outcome.limit[0]
@@ -339,4 +339,5 @@ def _estimate(solver, pressure):
     features[7] = math.log(max(outcome.departure[0], 1e-6))
     features[8], features[9] = residual, math.log(max(compliance, 1e-6))
     features[10] = math.log(max(outcome.energy[0], 1e-6))
+    features[11] = near_rim(outcome.limits)
     estimate_errors(solver.coefficients, features, outcome.errors)

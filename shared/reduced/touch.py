@@ -28,7 +28,7 @@ from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.mechanics.tip import LONGEST, follow, meet_wall, next_place, pushed
 from palpate.shared.reduced.blend import MAX_ACTIVE, activate, weight_gradients
 from palpate.shared.reduced.contact import press_at_place
-from palpate.shared.reduced.features import estimate_errors, log_residual
+from palpate.shared.reduced.features import estimate_errors, log_residual, near_rim
 
 ELSEWHERE = 3
 """Status where the place has moved to local models whose past the step did not begin with."""
@@ -336,8 +336,9 @@ def _estimate(solver):
     """Estimated errors of an answer at once.
 
     The features: 1, the depth over its limit and its log, smallest det F, the normal (where on the
-    body), and the logs of force over depth (mN/mm), of the energy over that of a linear spring, and
-    of the residual that a load of this force leaves in the full model.
+    body), the logs of force over depth (mN/mm), of the energy over that of a linear spring, and of
+    the residual that a load of this force leaves in the full model; whether the contact is near the
+    rim.
     """
     outcome, features = solver.outcome, solver.outcome.features
     pushed = math.sqrt(np.dot(outcome.force, outcome.force))
@@ -350,5 +351,6 @@ def _estimate(solver):
     features[8] = math.log(max(2.0 * outcome.energy[0] / max(pushed * depth, 1e-9), 1e-3))
     load = pushed / max(outcome.area[0] * outcome.limits[0], 1e-9)
     features[9] = log_residual(solver, outcome.foot, outcome.direction, load)
+    features[10] = near_rim(outcome.limits)
     count = solver.coefficients.shape[1]
     estimate_errors(solver.coefficients, features[:count], outcome.errors)

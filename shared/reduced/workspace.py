@@ -12,8 +12,7 @@ import numpy as np
 from palpate.shared.arrays import Array
 from palpate.shared.compiled import bind, room
 from palpate.shared.geometry.surface import SurfaceIndex
-from palpate.shared.mechanics.footprint import LIMIT_FIELDS
-from palpate.shared.mechanics.tip import CURVATURE_FIELDS, Tip
+from palpate.shared.mechanics.tip import Tip
 from palpate.shared.mechanics.viscosity import step_weights
 from palpate.shared.reduced.blend import MAX_ACTIVE, Active
 from palpate.shared.reduced.features import (
@@ -21,6 +20,7 @@ from palpate.shared.reduced.features import (
     CHANGING,
     LOAD_FEATURES,
     RESIDUAL_FEATURES,
+    RIM,
     TANGENT_FEATURES,
 )
 from palpate.shared.reduced.outcome import PRESS_FEATURES, Outcome, Solver
@@ -36,7 +36,7 @@ class Workspace:
     models : PressModels
     tip : Tip
     index : SurfaceIndex
-        With the load range and the curvature.
+        With load range, curvature and distance from the rim.
     coefficients : ndarray, shape (2 or 3, features)
         Of the error estimate.
     past : Elastic or Remembering
@@ -68,9 +68,7 @@ class Workspace:
         )  # fmt: skip
         self.past, self._dt = past, math.nan
         self.active = room(Active, **sizes)
-        self.outcome = room(
-            Outcome, features=PRESS_FEATURES, limits=LIMIT_FIELDS + CURVATURE_FIELDS
-        )
+        self.outcome = room(Outcome, features=PRESS_FEATURES, limits=RIM + 1)
         self.features = coefficients.shape[1]
         self.solver = bind(
             Solver(

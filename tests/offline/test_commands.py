@@ -7,9 +7,10 @@ import sys
 
 import pytest
 
-from palpate.offline.info import closing
+from palpate.offline.info import LABELS, budget, closing, percent
 from palpate.offline.scenes import find_scene
 from palpate.shared.cli import main
+from palpate.shared.scene import Errors
 
 CONTACT = ["--at", "4", "5.5", "8", "--pressure", "1.5"]
 
@@ -25,15 +26,31 @@ def test_info(answer, artifact):
     assert find_scene("quick").text == report["text"]
 
 
-def test_info_for_people_is_a_dozen_lines_in_units(run, artifact):
+def test_info_for_people_is_a_dozen_lines_in_units_and_a_table_of_errors(run, artifact):
     lines = run("info", artifact).stdout.splitlines()
-    assert len(lines) <= 12
+    assert len(lines) <= 18
     assert lines[0].startswith("scene          quick: A thin slab")
     assert "Young's modulus at rest 15 kPa" in lines[2]
-    assert lines[8].endswith(" % in von Mises stress")
+    assert re.search(r"trust +covers 95 % of errors, confidence \d\d %; doubts", lines[8])
     for line in lines:
         assert len(line) <= 120
         assert not re.search(r"[{}\[\]]|  %|None", line), line
+
+
+def test_info_tells_the_sources_of_errors_side_by_side(answer, artifact):
+    report = answer("info", artifact)
+    table = {line[:LABELS].strip(): line[LABELS:].split("  ") for line in budget(report)}
+    table = {key: [value.strip() for value in row if value.strip()] for key, row in table.items()}
+    assert table["95 of 100"] == ["displacement", "von Mises", "tip's force"]
+    assert table["tolerance"] == ["3 %", "12 %", "5 %"]
+    reduction = [report["validation"][key]["p95"] for key in ("displacement", "von_mises")]
+    reduction.append(report["validation_tip"]["force"]["p95"])
+    assert table["reduction"] == [percent(error) for error in reduction]
+    mesh = report["training"]["mesh_errors"]
+    assert table["mesh"] == [percent(mesh[key]["p95"]) for key in Errors._fields]
+    # the points are chosen so that they err by less than the modes
+    assert 0 < report["training"]["cubature_errors"]["displacement"]["p95"] < reduction[0]
+    assert table["- cubature"][1:] == table["- solver"][1:] == ["–", "–"]
 
 
 def test_info_builds_no_model(artifact):

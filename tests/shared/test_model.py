@@ -44,6 +44,29 @@ def test_an_answer_within_the_range_says_so(atlas, contact):
     assert solution.contact_displacement @ solution.normal < 0
 
 
+def test_an_answer_is_doubted_for_what_its_estimates_of_mesh_and_reduction_exceed(atlas, contact):
+    answer = atlas.press(*contact)
+    total = np.hypot(answer.error_reduction, answer.error_mesh)
+    assert total[0] == pytest.approx(answer.error_displacement)
+    assert total[1] == pytest.approx(answer.error_von_mises)
+    assert (answer.error_mesh > 0).all()
+    most = atlas.scene.tolerance
+    good = answer._replace(error_displacement=most.displacement, error_von_mises=most.von_mises)
+    assert atlas.doubts(good) == ()
+    assert atlas.doubts(good._replace(error_von_mises=1.01 * most.von_mises)) == ("von_mises",)
+    assert atlas.doubts(good._replace(error_force=1.01 * most.force)) == ("force",)
+    assert atlas.doubts(good._replace(converged=False)) == ("convergence",)
+    assert atlas.doubts(atlas.press(contact[0], 2.5 * contact[1])) == ("pressure",)
+
+
+def test_the_estimate_knows_whether_the_contact_is_near_the_rim(atlas, contact):
+    high, radius = atlas.nodes.max(axis=0), atlas.scene.endoscope.radius
+    for away in (0.0, 0.9, 1.1, 2.0):
+        x = high * [0.0, 0.5, 1.0] + [away * radius, 0.0, 0.0]
+        assert atlas.press(x, 0.2).features[-1] == (away < 1.0)
+        assert atlas.touch([*x[:2], x[2] + radius - 0.1]).features[-1] == (away < 1.0)
+
+
 def test_force_on_the_tool_is_pressure_times_the_projected_footprint(atlas):
     middle = atlas.nodes.max(axis=0) * [0.5, 0.5, 1.0]
     solution = atlas.press(middle, 2.0)

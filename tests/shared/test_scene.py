@@ -1,5 +1,6 @@
 """Scenes: what is accepted, what is refused, and how the refusal reads."""
 
+import math
 import re
 
 import pytest
@@ -79,8 +80,18 @@ length = 40
 
 
 def test_a_tolerance_is_as_loose_as_the_stricter_of_its_parts() -> None:
-    for u, s, expected in ((0.01, 0.02, 1), (0.05, 0.1, 5), (0.05, 0.02, 1), (0.005, 0.2, 1)):
+    for u, s, expected in ((0.03, 0.12, 1), (0.15, 0.6, 5), (0.15, 0.12, 1), (0.015, 0.9, 1)):
         assert Tolerance(displacement=u, von_mises=s).looseness == pytest.approx(expected)
+
+
+def test_mesh_and_reduction_together_have_the_tolerance() -> None:
+    tolerance = Tolerance(displacement=0.06, force=0.1)
+    assert tolerance.reduction == pytest.approx((0.02, 0.02, 0.1 / 3))
+    for parts in zip(tolerance.mesh, tolerance.reduction, tolerance.total, strict=True):
+        assert math.hypot(*parts[:2]) == pytest.approx(parts[2])
+    assert tolerance.exceeded(tolerance.total) == ()
+    assert tolerance.exceeded((0.07, 0.1)) == ("displacement",)  # of a load, whose force is given
+    assert tolerance.exceeded((0.01, math.inf, math.nan)) == ("von_mises", "force")
 
 
 @pytest.mark.parametrize(

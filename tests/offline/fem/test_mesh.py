@@ -88,7 +88,7 @@ def test_turbinate_has_the_promised_size_and_the_volume_of_the_section():
     assert turbinate_hex8().nodes.size == pytest.approx(6048, rel=0.03)
     # less what the turned corners take
     expected = 40.0 * abs(polygon_area(read_outline(OUTLINE))) * (1 - 3.5e-3)
-    for name, dofs, tolerance in (("turbinate-paper", 6048, 4e-3), ("turbinate-fine", 22143, 1e-3)):
+    for name, dofs, tolerance in (("turbinate-paper", 6048, 4e-3), ("turbinate", 22143, 1e-3)):
         mesh = shipped_mesh(name)
         assert mesh.nodes.size == pytest.approx(dofs, rel=0.03)
         assert mesh_quality(mesh)["volume_mm3"] == pytest.approx(expected, rel=tolerance)
@@ -101,7 +101,7 @@ def test_elements_are_well_shaped_and_of_even_size_along_the_outer_side():
     assert quality["aspect_ratio_max"] < 10
     assert quality["jacobian_ratio_min"] > 0.04
     # with rows at the lip its elements are slender, but less distorted
-    assert mesh_quality(shipped_mesh("turbinate-fine"))["jacobian_ratio_min"] > 0.15
+    assert mesh_quality(shipped_mesh("turbinate"))["jacobian_ratio_min"] > 0.15
     perfect = dict.fromkeys(quality, 1.0) | {"volume_mm3": 1000.0}
     assert mesh_quality(shipped_mesh("cube")) == pytest.approx(perfect)
     mesh = turbinate_hex8()
@@ -259,7 +259,7 @@ def test_impossible_meshes_are_refused(name, old, new, message):
 
 def test_a_scene_is_found_by_name_or_path_and_meshed_with_its_folder_alone():
     assert find_scene("quick") == find_scene(FOLDER / "quick.toml")
-    with pytest.raises(SceneError, match="turbinate-fine"):
+    with pytest.raises(SceneError, match="turbinate"):
         find_scene("turbine")
     with pytest.raises(SceneError, match="folder"):
         build_mesh(parse_scene(find_scene("turbinate").text))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from palpate.offline.fem.model import NoEquilibrium
-from palpate.offline.fem.problem import FullProblem, TipPosition
+from palpate.offline.fem.problem import FullProblem, Load, TipPosition
 from palpate.offline.scenes import find_scene
 from palpate.shared.scene import parse_scene
 
@@ -100,3 +100,19 @@ def test_a_held_tip_relaxes_and_a_lifted_one_leaves_a_dent_that_recovers(visco_p
     assert dent > 0.02
     later = problem.solve(TipPosition(over(problem, -0.2).position, 20.0), lifted.past)
     assert np.abs(later.displacement).max() < 0.05 * dent
+
+
+def test_the_turbinate_answers_from_a_millionth_of_its_range_on():
+    problem = FullProblem(find_scene("turbinate-paper"))
+    x, normal, _ = problem.surface.project(np.array([10.18, 20.0, 11.0]))
+    moved = [
+        problem.solve(Load(x, -normal, share * 3.67)).displacement / share
+        for share in (1e-6, 1e-5, 1e-4)
+    ]
+    for other in moved[:2]:
+        assert np.linalg.norm(other - moved[2]) <= 1e-3 * np.linalg.norm(moved[2])
+    forces = [
+        np.linalg.norm(problem.solve(TipPosition(x + (2.0 - 1.42 * share) * normal)).force)
+        for share in (1e-6, 1e-5, 1e-4, 1e-3)
+    ]
+    assert np.all(np.diff(forces) > 0.0)

@@ -5,8 +5,9 @@ import pytest
 
 from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import Reference
-from palpate.offline.validate.compare import Compared, compare, play, summarise
+from palpate.offline.validate.compare import Compared, KnownAnswer, compare, flags, play, summarise
 from palpate.offline.validate.queries import TIP_HISTORIES, random_histories
+from palpate.shared.scene import Tolerance
 
 
 def test_errors_are_relative_and_of_moments_to_the_largest_so_far():
@@ -30,6 +31,29 @@ def test_moments_in_different_equilibria_are_told_apart(visco_atlas, visco_probl
     assert row.table["apart"] == 1
     assert row.table["displacement"] > 0.01
     assert row.table["together_displacement"] <= 1e-6
-    found = summarise(TIP_HISTORIES, [row])
+    found = summarise(TIP_HISTORIES, [row], visco_atlas.scene.tolerance)
     assert found["apart"] == {"histories": 1, "moments": 1}
     assert found["together_displacement"]["max"] <= 1e-6 < found["displacement"]["max"]
+
+
+def answered(errors, estimated, mesh):
+    return KnownAnswer(
+        np.array(errors), np.ones(1), True, True, False, np.array(mesh), np.array(estimated)
+    )
+
+
+def test_right_answers_that_are_doubted_are_counted_and_what_is_to_blame():
+    right, wrong, small, large = (0.009, 0.01), (0.011, 0.01), (0.01, 0.02), (0.029, 0.02)
+    known = [
+        answered(right, small, (0.02, 0.1)),  # trusted: .022 and .102
+        answered(right, large, (0.02, 0.1)),  # .035 of displacement, mostly the reduction's
+        answered(right, small, (0.02, 0.2)),
+        answered(right, large, (0.02, 0.2)),
+        answered(right, small, (0.02, 0.2)),
+        answered(wrong, large, (0.02, 0.1)),  # is no right one
+        answered(right, (np.inf, np.inf), (0.02, 0.1)),  # out of range
+    ]
+    found = flags(known, Tolerance())
+    assert found == {"share": 0.8, "right": 5, "mostly": "the mesh's von_mises"}
+    assert flags(known[:2], Tolerance())["mostly"] == "the reduction's displacement"
+    assert flags(known[:1], Tolerance()) == {"share": 0.0, "right": 1, "mostly": None}

@@ -21,7 +21,7 @@ def block(*divisions):
     return scene.model_copy(update={"geometry": geometry})
 
 
-@pytest.mark.parametrize("name", ["turbinate-fine", "turbinate-paper", "quick"])
+@pytest.mark.parametrize("name", ["turbinate", "turbinate-paper", "quick"])
 def test_nodes_are_where_their_parameters_say(name):
     scene = find_scene(name)
     nodes = FullProblem(scene).mesh.nodes
@@ -46,7 +46,7 @@ def test_a_field_of_a_graded_mesh_is_found_at_the_nodes_of_another(name, place):
 
 
 def test_elements_are_small_at_the_contact_and_grow_away_from_it():
-    scene = find_scene("turbinate-fine")
+    scene = find_scene("turbinate")
     place = np.array([10.18, 20.0, 11.0])
     fine = Graded(scene, place, Grading(finest=0.25))
     mesh = fine.problem.mesh

@@ -106,11 +106,11 @@ def test_where_the_start_is_no_good_the_answer_is_found_from_rest(problem, singl
 def test_a_loose_tolerance_is_answered_in_fewer_iterations_and_well_within_it(
     problem, single, loads
 ):
-    tolerance, other = Tolerance(displacement=0.05, von_mises=0.1), copy(problem)
+    tolerance, other = Tolerance(displacement=0.15, von_mises=0.6), copy(problem)
     other.scene = problem.scene.model_copy(update={"tolerance": tolerance})
     (strict, exact), (loose, near) = (solved(own, single, loads) for own in (problem, other))
     # stresses follow the norm of energy: the solver's share is half at most
-    assert off(near, exact).max() < 0.5 * tolerance.von_mises
+    assert off(near, exact).max() < 0.5 * tolerance.reduction.von_mises
     assert loose < strict
 
 
