@@ -302,6 +302,20 @@ def truth(scene: str, artifact: Path | None, places: int, seed: int) -> Report:
     return truth(artifact or default_artifact(found), found, places, seed)
 
 
+@study.command()
+@click.argument("artifact", type=ARTIFACT, default="layer")
+@reporting
+def layer(artifact: Path) -> Report:
+    """Compare the rigid tip on a layer with the theory of a ball.
+
+    It presses the middle of the top of the artifact's block. The table goes to
+    NAME/report/layer.csv beside the artifact.
+    """
+    from palpate.offline.studies.layer import layer
+
+    return layer(artifact)
+
+
 @study.command("chart-in-time")
 @artifact_argument
 @count_option("--histories", 20, "Histories that all methods answer.")

@@ -20,6 +20,18 @@ def test_answers_under_a_gliding_tool_jump_no_more_than_the_full_models(artifact
     assert found["excess"]["max"] <= 0.01 or not tip
 
 
+def test_a_tip_on_a_layer_is_compared_with_the_theory(answer, artifact):
+    """On a block too narrow for it, which the tip's own law hides at small depths."""
+    report = answer("study", "layer", artifact)
+    assert max(map(abs, report["error"].values())) < 0.03
+    assert abs(report["exponent"] - report["exponent_of_theory"]) < 0.02
+    rows = table(artifact.parent / artifact.stem / "report" / "layer.csv")
+    assert [float(row["depth_mm"]) for row in rows] == [0.1, 0.2, 0.4]
+    for row in rows:
+        found = float(row["force_mN"]) / float(row["theory_mN"]) - 1
+        assert found == pytest.approx(report["error"][row["depth_mm"]], abs=1e-5)
+
+
 def test_mesh_error_is_tabled(tmp_path, monkeypatch):
     coarse, fine = (Discretisation("hex20", (n, 2, 4), 1.0) for n in (6, 9))
     hex8 = Discretisation("hex8", (8, 2, 5), 1.7)

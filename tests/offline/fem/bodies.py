@@ -39,16 +39,3 @@ def support_force(model, displacement):
     force = np.zeros(displacement.size)
     model.internal(displacement.ravel(), force)
     return force.reshape(-1, 3)[model.mesh.clamped].sum(axis=0)
-
-
-def hertz_on_a_layer(depth, radius, height, young=YOUNG, poisson=POISSON):
-    """Hertz's force on a bonded layer (Dimitriadis et al., Biophys. J. 82 (2002) 2798, eq. 12)."""
-    a = -(1.2876 - 1.4678 * poisson + 1.3442 * poisson**2) / (1 - poisson)
-    b = (0.6387 - 1.0277 * poisson + 1.5164 * poisson**2) / (1 - poisson)
-    chi, pi = np.sqrt(radius * depth) / height, np.pi
-    layer = (
-        1 - 2 * a / pi * chi + 4 * a**2 / pi**2 * chi**2
-        - 8 / pi**3 * (a**3 + 4 * pi**2 / 15 * b) * chi**3
-        + 16 * a / pi**4 * (a**3 + 3 * pi**2 / 5 * b) * chi**4
-    )  # fmt: skip
-    return 4 / 3 * young / (1 - poisson**2) * np.sqrt(radius) * depth**1.5 * layer

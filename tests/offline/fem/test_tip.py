@@ -6,9 +6,8 @@ import pytest
 from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.problem import FullProblem, Load, TipPosition
 from palpate.offline.scenes import find_scene
+from palpate.offline.studies.layer import ball_on_a_layer
 from palpate.shared.scene import parse_scene
-
-from .bodies import hertz_on_a_layer
 
 SLAB = """
 name = "slab"
@@ -38,7 +37,7 @@ def test_a_ball_on_a_layer_is_that_of_hertz_whatever_the_mesh():
     """Faces of 2.9 mm under a tip of 3 mm: the contact's radius is 0.4 to 1.1 mm."""
     problem, depths = FullProblem(parse_scene(SLAB)), np.array([0.05, 0.1, 0.2, 0.4])
     forces = [problem.solve(over(problem, depth)).force[2] for depth in depths]
-    theory = [hertz_on_a_layer(depth, radius=3.0, height=12.0, young=4.0) for depth in depths]
+    theory = [ball_on_a_layer(depth, 3.0, 12.0, young=4.0, poisson=0.45) for depth in depths]
     np.testing.assert_allclose(forces, theory, rtol=0.012)
     slope = np.polyfit(np.log(depths), np.log(np.divide(forces, theory)), 1)[0]
     assert abs(slope) < 0.01
