@@ -20,6 +20,7 @@ model is asked everywhere whether its answers depend on the way, and depths are 
 
 import pickle
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,10 +35,11 @@ from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.terms import DeadLoad
 from palpate.offline.reduce.ritz import energy_pod, ritz_vectors
 from palpate.offline.reduce.sampling import cone, random_points_and_rim, tangents
+from palpate.offline.reduce.window import WHOLE, part_of
 from palpate.offline.run.streams import Stage
 from palpate.offline.validate.queries import Place
 from palpate.shared.answer import Answer
-from palpate.shared.arrays import Array
+from palpate.shared.arrays import Array, Numbers
 from palpate.shared.errors import QueryError
 from palpate.shared.local_models import Estimators, LocalModels
 from palpate.shared.mechanics import newton
@@ -56,6 +58,9 @@ MAX_ITERATIONS = 20
 TRUSTED = 0.1
 """Residual left in the full model up to which Galerkin's solution is believed: as a displacement in
 the energy at rest, relative to the whole."""
+
+FAINT = 0.02
+"""Share of the largest displacement below which a body is held for its load range."""
 
 DEEPEST = 0.8
 """Largest depth of the tip, in radii: its centre must stay outside the undeformed body."""
@@ -165,6 +170,20 @@ def pressure_that_moves(
     return low, power, below
 
 
+def moving_part(problem: FullProblem, displacement: Array) -> tuple[FullModel, Numbers]:
+    """Model of the part of a body that moves by a displacement (n, 3), and its nodes; held beyond.
+
+    As it is after an infinite time.  Where that is most of the body it is the body.
+    """
+    size, elements = np.linalg.norm(displacement, axis=1), problem.mesh.elements
+    moving = (size > FAINT * size.max())[elements].any(axis=1)
+    if moving.mean() > WHOLE:
+        return problem.model.relaxed, np.arange(len(size), dtype=np.int32)
+    part, nodes, border = part_of(problem.mesh, np.flatnonzero(moving).astype(np.int32))
+    held = replace(part, clamped=part.clamped | border)
+    return FullModel(held, problem.scene.tissue).relaxed, nodes
+
+
 def load_range(problem: FullProblem, position: Array) -> Array:
     """Load range (LIMIT_FIELDS,) at a surface point; see ``mechanics.footprint.pressure_limit``.
 
@@ -179,12 +198,14 @@ def load_range(problem: FullProblem, position: Array) -> Array:
     thickness = local_thickness(problem.mesh, position[None], normal[None])[0]
     wanted = problem.scene.load.max_indentation * thickness
     pressure = wanted / np.linalg.norm((linear @ normal).reshape(-1, 3), axis=1).max()
-    path = LoadPath(model, -unit @ normal)
+    along = -nodal[:, None] * normal
+    model, nodes = moving_part(problem, model.filled(linear @ normal).reshape(-1, 3))
+    nodal, along = nodal[nodes], along[nodes]
+    path = LoadPath(model, along.ravel()[model.free])
 
     def full(pressure: float, start: Array | None) -> Array:
         # no load steps: where a jump fails, the pressure between is asked for
-        force = -pressure * nodal[:, None] * normal
-        return model.solve(force, start=start, smallest_step=1.0).displacement
+        return model.solve(pressure * along, start=start, smallest_step=1.0).displacement
 
     limit, power, moved = pressure_that_moves(path.solve, wanted, pressure)
     if moved is None or np.linalg.norm(moved, axis=1).max() < (1 - NEAR) * wanted:

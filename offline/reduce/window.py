@@ -167,33 +167,38 @@ class WindowModel(FullModel):
         return super().filled(u[: len(self.free)])
 
 
+def part_of(mesh: Mesh, elements: Numbers) -> tuple[Mesh, Numbers, Flags]:
+    """Mesh of some elements, its nodes' (n,) numbers in the whole, and which others share."""
+    inside = np.zeros(len(mesh.nodes), bool)
+    inside[mesh.elements[elements]] = True
+    border = np.zeros(len(mesh.nodes), bool)
+    border[np.delete(mesh.elements, elements, axis=0)] = True
+    number = np.cumsum(inside) - 1
+    faces = inside[mesh.faces].all(axis=1)
+    part = Mesh(
+        nodes=mesh.nodes[inside],
+        elements=number[mesh.elements[elements]].astype(np.int32),
+        faces=number[mesh.faces[faces]].astype(np.int32),
+        clamped=mesh.clamped[inside],
+        accessible=mesh.accessible[faces],
+    )
+    return part, np.flatnonzero(inside).astype(np.int32), border[inside]
+
+
 class WindowProblem(FullProblem):
     """The full problem of a window of another one, round points (k, 3) of its surface."""
 
     def __init__(self, whole: FullProblem, elements: Numbers, body: BodyModes) -> None:
-        mesh, self.scene, self.elements = whole.mesh, whole.scene, elements
-        inside = np.zeros(len(mesh.nodes), bool)
-        inside[mesh.elements[self.elements]] = True
-        border = np.zeros(len(mesh.nodes), bool)
-        border[np.delete(mesh.elements, self.elements, axis=0)] = True
-        self.nodes = np.flatnonzero(inside).astype(np.int32)
-        number = np.cumsum(inside) - 1
-        faces = inside[mesh.faces].all(axis=1)
-        self.mesh = Mesh(
-            nodes=mesh.nodes[self.nodes],
-            elements=number[mesh.elements[self.elements]].astype(np.int32),
-            faces=number[mesh.faces[faces]].astype(np.int32),
-            clamped=mesh.clamped[self.nodes],
-            accessible=mesh.accessible[faces],
-        )
+        self.scene, self.elements = whole.scene, elements
+        self.mesh, self.nodes, border = part_of(whole.mesh, elements)
         free = np.repeat(~self.mesh.clamped, 3)
-        values = body.values.reshape(-1, len(mesh.nodes), 3)[:, self.nodes]
+        values = body.values.reshape(-1, len(whole.mesh.nodes), 3)[:, self.nodes]
         values = values.reshape(-1, free.size)
         self.model = WindowModel(
             self.mesh,
             self.scene.tissue,
             body=(values[:, free] * body.steps[:, None]).T.astype(float),
-            inner=np.repeat(~border[self.nodes], 3)[free],
+            inner=np.repeat(~border, 3)[free],
             products=(body.products, body.relaxed),
         )
         self.surface = accessible_surface(self.mesh)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from palpate.offline.fem.model import NoEquilibrium
+from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.load_range import (
     FAR,
     GIVING_WAY,
@@ -18,12 +19,14 @@ from palpate.offline.reduce.load_range import (
     bearable_shares,
     limit_load_share,
     load_range,
+    moving_part,
     path_independent_share,
     pressure_that_moves,
 )
 from palpate.shared.errors import QueryError
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH
+from palpate.shared.scene import parse_scene
 
 LIMIT = RADIUS = 2.0
 EDGE = 5.0
@@ -86,6 +89,40 @@ def test_the_limit_moves_the_tissue_by_the_indentation_in_the_end(request, name)
         limit = load_range(problem, x)[0]
         u = problem.model.relaxed.solve(-limit * nodal[:, None] * normal).displacement
         assert np.linalg.norm(u, axis=1).max() == pytest.approx(wanted, rel=0.02)
+
+
+STRIP = """
+name = "strip"
+geometry.kind = "block"
+geometry.size = [48.0, 8.0, 6.0]
+geometry.divisions = [18, 3, 2]
+tissue.law = "neo-hookean"
+tissue.young = 15.0
+tissue.poisson = 0.45
+{past}
+support.side = "bottom"
+surface.side = "top"
+endoscope.radius = 2.0
+endoscope.max_tilt = 30.0
+load.max_indentation = 0.15
+"""
+
+
+@pytest.mark.parametrize("past", ["", "tissue.prony = [[0.25, 0.1]]"])
+def test_the_part_that_moves_has_the_range_of_the_body(past, monkeypatch):
+    problem = FullProblem(parse_scene(STRIP.format(past=past)))
+    x = np.array([20.0, 4.5, 6.0])
+    found = load_range(problem, x)
+    nodal, normal = problem.unit_load(x)
+    loads = (nodal[:, None] * normal).reshape(-1, 1)[problem.model.free]
+    linear = problem.model.filled(problem.model.solve_linear(loads)[:, 0]).reshape(-1, 3)
+    part, nodes = moving_part(problem, linear)
+    assert len(nodes) == len(part.mesh.nodes) < 0.6 * len(linear)
+    np.testing.assert_array_equal(part.mesh.nodes, problem.mesh.nodes[nodes])
+    left = np.delete(np.linalg.norm(linear, axis=1), nodes)
+    assert left.max() <= 0.02 * np.linalg.norm(linear, axis=1).max()
+    monkeypatch.setattr("palpate.offline.reduce.load_range.WHOLE", 0.0)
+    np.testing.assert_allclose(found, load_range(problem, x), rtol=0.02)
 
 
 class Plate:
