@@ -124,8 +124,8 @@ class WindowModel(FullModel):
         return csr_matrix(block_diag([self._near, self._far]))
 
     @cached_property
-    def _eliminated(self) -> tuple[SparseSolver, Array, Array, Array]:
-        """Solver of w alone, what body modes do to w, to w's forces, and their compliance then."""
+    def _eliminated(self) -> tuple[SparseSolver, Array, Array]:
+        """Solver of w alone, body modes (free dofs, G) with w in balance, and their compliance."""
         inside = np.flatnonzero(self.inner)
         own = csr_matrix(self._near[inside][:, inside])
         own.sort_indices()
@@ -136,19 +136,20 @@ class WindowModel(FullModel):
         stiffness, V = np.linalg.eigh(self.products[0] - coupling.T @ moved)
         kept = stiffness > NOTHING * np.abs(np.diag(self.products[0])).max()
         V = V[:, kept] / np.sqrt(stiffness[kept])
-        return solver, moved, coupling, V @ V.T
+        balanced = self.body.copy()
+        balanced[inside] -= moved
+        return solver, balanced, V @ V.T
 
     def solve_linear(self, loads: Array) -> Array:
         """Linear response to forces on states, or in the window alone."""
         n = len(self.free)
-        solver, moved, coupling, compliance = self._eliminated
-        w = solver.solve(loads[:n][self.inner])
-        on_body = self.body.T @ loads[:n] - coupling.T @ w
+        solver, balanced, compliance = self._eliminated
+        on_body = balanced.T @ loads[:n]
         if len(loads) > n:
             on_body += loads[n:]
         a = compliance @ on_body
-        u = self.body @ a
-        u[self.inner] += w - moved @ a
+        u = balanced @ a
+        u[self.inner] += solver.solve(loads[:n][self.inner])
         return np.concatenate([u, a])
 
     def internal_free(self, u: Array) -> Array:
