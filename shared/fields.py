@@ -57,9 +57,15 @@ class FieldRecovery:
         expand(models.body, models.body_steps * far, field.reshape(-1))
         return field
 
+    def of_mesh(self, answer: Answer) -> Field:
+        """Nodal displacement (n, 3) mm without the dent of a tip."""
+        return self._field(self.coefficients(answer))
+
     def displacement(self, answer: Answer) -> Field:
         """Nodal displacement (n, 3) mm."""
-        return self._field(self.coefficients(answer))
+        displacement = self.of_mesh(answer)
+        self._stress.add_dent(displacement, answer.footprint)
+        return displacement
 
     def von_mises(self, answer: Answer, displacement: Field) -> Field:
         """Nodal von Mises stress (n,) kPa of an answer with this displacement of all nodes."""

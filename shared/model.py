@@ -282,7 +282,7 @@ class ReducedModel:
             residual=found.residual.item(),
             contact_displacement=found.displacement.copy(),
             contact=pressure > 0.0,
-            footprint=_footprint(found, radius) if pressure > 0.0 else None,
+            footprint=_footprint(found, radius, tip=False) if pressure > 0.0 else None,
             time=0.0 if past is None else past.time + dt,
             past=after if converged else past,
             active=active,
@@ -383,7 +383,7 @@ class ReducedModel:
             tip=True,
             position=at,
             contact=touched,
-            footprint=_footprint(found, radius) if touched else None,
+            footprint=_footprint(found, radius, tip=True) if touched else None,
             tangent=found.tangent.copy(),
             depth=depth,
             penetration=found.penetration.item(),
@@ -449,7 +449,7 @@ def _total(reduction: Array, fitted: Array | None, share: float) -> tuple[list[f
     return list(map(math.hypot, reduction.tolist(), mesh)), np.array(mesh)
 
 
-def _footprint(found: Outcome, radius: float) -> Contact:
+def _footprint(found: Outcome, radius: float, tip: bool) -> Contact:
     """What presses in an outcome."""
     return Contact(
         found.foot.copy(),
@@ -457,6 +457,7 @@ def _footprint(found: Outcome, radius: float) -> Contact:
         found.limits[LIMIT_FIELDS:RIM].copy(),
         found.force / -found.area.item(),
         radius,
+        tip,
     )
 
 

@@ -7,6 +7,9 @@ that field is nearly its interpolant.  So the interpolant is taken off the displ
 nodes, gradients are recovered from what is left, which is smooth, and those of the local field are
 added.
 
+A tip presses closer than the footprint of its force: its near field is that of Hertz's pressure,
+and by what it does more than the footprint's the surface is dented.
+
 Moduli are those of tissue at once, also where the past has relaxed it: the stress that is added is
 then right, as it hardly depends on them, with the past ``B`` that the mesh has.
 """
@@ -19,7 +22,14 @@ from numba import njit
 
 from palpate.shared.arrays import Array
 from palpate.shared.local_models import Body
-from palpate.shared.mechanics.half_space import ABOVE, REACH, local_field, pressed
+from palpate.shared.mechanics.half_space import (
+    ABOVE,
+    REACH,
+    dent,
+    local_field,
+    pressed,
+    whole_field,
+)
 from palpate.shared.mechanics.stress import NearField
 from palpate.shared.mechanics.tip import bend, tangents_of
 
@@ -32,6 +42,16 @@ class Contact(NamedTuple):
     curvature: Array  # (6,) 1/mm there, see ``Surface.curvature``
     traction: Array  # (3,) kPa, on the tissue at the footprint's centre
     radius: float  # mm
+    tip: bool = False  # whether a sphere of that radius presses with the footprint's force
+
+
+class HalfSpace(NamedTuple):
+    """Tissue under a contact."""
+
+    local: Array  # see ``half_space.local_field``
+    whole: Array  # see ``half_space.whole_field``
+    poisson: float
+    softness: float  # 1/kPa, ``1 / 2 mu``
 
 
 NO_CONTACT = NearField(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
@@ -42,32 +62,38 @@ class NearFields:
 
     def __init__(self, body: Body) -> None:
         mu, lam = float(body.law.mu[0]), float(body.law.lam[0])
-        self._softness = 0.5 / mu
-        self._table = local_field(0.5 * lam / (lam + mu))
+        poisson = 0.5 * lam / (lam + mu)
+        self._tissue = HalfSpace(local_field(poisson), whole_field(poisson), poisson, 0.5 / mu)
 
-    def at(self, points: Array, contact: Contact | None) -> NearField:
-        """Near field of a contact, if there is one, at points (n, 3) mm."""
+    def dent(self, points: Array, contact: Contact | None) -> NearField:
+        """What a tip does more than the footprint of its force, at points (n, 3) mm."""
+        return self.at(points, contact if contact and contact.tip else None, 0.0)
+
+    def at(self, points: Array, contact: Contact | None, footprint: float = 1.0) -> NearField:
+        """Near field of a contact, if there is one, at points (n, 3) mm.
+
+        With a share of that of its footprint.
+        """
         if contact is None:
             return NO_CONTACT
         n = len(points)
         numbers, displacement = np.empty(n, np.int64), np.empty((n, 3))
         gradient = np.empty((n, 3, 3))
         found = numbers, displacement, gradient
-        count = near_field(self._table, points, contact, self._softness, *found)
+        count = near_field(self._tissue, points, contact, footprint, *found)
         return NearField(numbers[:count], displacement[:count], gradient[:count])
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def near_field(table, points, contact, softness, numbers, displacement, gradient):
+def near_field(tissue, points, contact, footprint, numbers, displacement, gradient):
     """Write the near field at the points (n, 3) mm it reaches; return how many these are.
 
     Parameters
     ----------
-    table : ndarray
-        See ``half_space.local_field``.
+    tissue : HalfSpace
     contact : Contact
-    softness : float, 1/kPa
-        ``1 / 2 mu``.
+    footprint : float
+        Share of the footprint's own; the dent of a tip comes on top.
     numbers, displacement, gradient : ndarray, shape (n,), (n, 3) mm, (n, 3, 3), out
         The first so many are written.
     """
@@ -82,7 +108,11 @@ def near_field(table, points, contact, softness, numbers, displacement, gradient
         Q[0] = shear / along
     Q[2] = -normal
     Q[1] = np.cross(Q[2], Q[0])
-    bend(contact.curvature, Q[:2], radius, bent)
+    sharpness, softness = bend(contact.curvature, Q[:2], radius, bent), tissue.softness
+    # Hertz's contact radius; the modulus is E / (1 - nu^2), the force that of the footprint
+    force = 8.0 / 15.0 * math.pi * radius**2 * max(into, 0.0)
+    cubed = 0.75 * force * softness * (1.0 - tissue.poisson) / sharpness
+    touched = max(cubed ** (1.0 / 3.0) / radius, 1e-3)
     count = 0
     for n in range(len(points)):
         far = 0.0
@@ -102,7 +132,11 @@ def near_field(table, points, contact, softness, numbers, displacement, gradient
         z -= 0.5 * (a * x + b * y)
         if x * x + y * y > REACH**2 or z > REACH or z < -ABOVE:
             continue
-        pressed(table, x, y, z, into, along, u, H)
+        u[:], H[:] = 0.0, 0.0
+        if footprint > 0.0:
+            pressed(tissue.local, x, y, z, footprint * into, footprint * along, u, H)
+        if contact.tip:
+            dent(tissue.whole, touched, tissue.poisson, x, y, z, into, u, H)
         numbers[count] = n
         for i in range(3):
             # of the gradient in the half-space's own coordinates, row i

@@ -22,13 +22,18 @@ class StressField:
     """Recovers stress from displacements (n, 3) mm; not to be shared between threads.
 
     ``B`` (e, 6, 8) is the past at the points of all elements, see ``mechanics.viscosity``; a
-    contact is what presses, and has a near field.
+    contact is what presses, and has a near field; that of a tip is in ``u`` by ``add_dent``.
     """
 
     def __init__(self, body: Body, precision: type = np.float64) -> None:
         self._body = body
         self._recovery = stress_recovery(body.nodes, body.elements, body.law, precision)
         self._near = NearFields(body)
+
+    def add_dent(self, u: Displacement, contact: Contact | None) -> None:
+        """Add to displacements of the mesh what it does not follow of a tip."""
+        near = self._near.dent(self._body.nodes, contact)
+        u[near.points] += near.displacement
 
     def von_mises(self, u: Displacement, B: Array | None, contact: Contact | None) -> Array:
         """Nodal stress (n,) kPa."""

@@ -280,8 +280,9 @@ class FullProblem:
                 found = self.solve(step, past, start)
             except NoEquilibrium:
                 return None
-            u, past, start = found.displacement, found.past, None
+            past, start = found.past, None
             contact = self.footprint(step, found) if near_field else None
+            u = self.displaced(found, contact)
             stress = self.von_mises(u, past, contact)
             fields = u.astype(np.float32), stress.astype(np.float32)
             rows.append((*fields, found.force, found.tangent))
@@ -302,7 +303,13 @@ class FullProblem:
             return None
         x, normal, _, curvature = self.surface.locate(found.foot, self._curvature)
         pressure = found.force / -self.unit_load_at(x, normal).sum()
-        return Contact(x, normal, curvature, pressure, radius)
+        return Contact(x, normal, curvature, pressure, radius, tip=True)
+
+    def displaced(self, found: Equilibrium, contact: Contact | None) -> Array:
+        """Displacement (n, 3) mm of the nodes, with the dent of a tip that is not the mesh's."""
+        u = found.displacement.copy()
+        self.stress_field.add_dent(u, contact)
+        return u
 
     def von_mises(
         self, displacement: Array, past: Past | None = None, contact: Contact | None = None

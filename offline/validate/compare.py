@@ -300,7 +300,7 @@ def reference_task(model: ReducedModel, query: Sequence[Step]) -> tuple[Any, ...
     if len(query) > 1:
         return FullProblem.reference, query
     (answer,) = play(model, query)
-    return FullProblem.reference, query, model.displacement(answer)
+    return FullProblem.reference, query, model.fields.of_mesh(answer)
 
 
 COVERAGE, CONFIDENCE = 0.95, 0.9

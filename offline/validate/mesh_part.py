@@ -2,7 +2,7 @@
 
 The errors found make the mesh's part of every answer's error estimate, as those of random queries
 make the reduction's.  Those under the tip are found beside the sphere integrated over the faces of
-such meshes, since an answer's fields lack its dent.
+such meshes, so that what the law of the tip and its dent in the fields err by is in them.
 """
 
 from collections.abc import Iterator, Sequence
@@ -85,8 +85,7 @@ class Pressed:
         else:
             found = problem.solve(step, start=start)
             contact = problem.footprint(step, found)
-        u = found.displacement
-        self._last = level, u
+        self._last, u = (level, found.displacement), problem.displaced(found, contact)
         stress, peaks = problem.von_mises(u, contact=contact), problem.stress_field.peaks
         return Seen(u, stress, peaks(u, None, contact), found.force if felt is None else felt)
 

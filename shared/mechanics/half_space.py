@@ -16,8 +16,15 @@ footprint's radius and for a pressure of 1 at its centre.
 Of that field only what a mesh cannot follow is wanted.  A footprint ``WIDE`` times as large with
 the same force is taken away, after which the rest falls off with the third power of the distance,
 and is faded out on the way to ``REACH``.
+
+Hertz's pressure of a sphere, ``P(k) = 4/5 (sin ka - ka cos ka) / (ka)^3`` for the force of such a
+footprint, has a field in closed form: with ``s = z - ia`` every integral is the imaginary part of
+an ``I_n(s) = int J0(kr) exp(-ks) / k^n dk`` less ``a`` times the real part of the next, and these
+are sums of ``log(s + S)`` and ``S = sqrt(r^2 + s^2)`` times polynomials.
 """
 
+import cmath
+import math
 from functools import lru_cache
 
 import numpy as np
@@ -31,6 +38,9 @@ WIDE = 2.0
 
 REACH, FADES_FROM = 2.5, 1.0
 """Distance from the contact at which the local field ends, and where it begins to fade."""
+
+DENT_ENDS = 2.0
+"""Distance at which a dent, which falls off with the third power, has faded out likewise."""
 
 ABOVE = 1.0
 """Height at which the field ends that goes on above the surface, which is not quite flat."""
@@ -110,6 +120,14 @@ def local_field(poisson: float) -> Array:
     return np.concatenate([above, field], axis=1).reshape(len(at), -1)
 
 
+@lru_cache(maxsize=4)
+def whole_field(poisson: float) -> Array:
+    """Tables like those of ``local_field`` of all of the field, zero above the surface."""
+    at = np.arange(0.0, REACH + CELL / 2, CELL)
+    above = np.zeros((len(at), round(ABOVE / CELL), FUNCTIONS, 3))
+    return np.concatenate([above, half_space(poisson, at)], axis=1).reshape(len(at), -1)
+
+
 @njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
 def _between(one, other, at, p, q, r, s, load):
     """A function and its derivatives, times a load, between four places of the tables."""
@@ -156,3 +174,59 @@ def pressed(table, x, y, z, into, along, u, H):
     H[2, 0] = (g_r + c_r * x) * x + c
     H[2, 1] = (g_r + c_r * x) * y
     H[2, 2] = g_z + c_z * x
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def dented(a, poisson, x, y, z, u, H):
+    """Write displacement (3,) and gradient (3, 3) under Hertz's pressure within a radius ``a``.
+
+    It acts into the half-space with the force of a footprint of pressure 1 at its centre.  Units
+    are those of ``pressed``; the point is not above the surface.
+    """
+    r2, s = x * x + y * y, complex(max(z, 1e-9), -a)
+    S = cmath.sqrt(r2 + s * s)
+    L, T = cmath.log(s + S), 1.0 / (S * (s + S))
+    i2 = s * L - S
+    i3 = 0.75 * s * S - (0.5 * s * s - 0.25 * r2) * L
+    # derivatives in r over r
+    d1, d2, d3 = -T, -S * T, 0.5 * L - (0.5 * s * s - 0.25 * r2) * T + 0.75 * s / S
+    d4 = s * (s * s / 6.0 - 0.25 * r2) * T - 0.5 * s * L + 2.0 * S / 9.0
+    d4 += (r2 / 9.0 - 11.0 * s * s / 36.0) / S
+    p = 0.8 / a**3
+    g0, g1 = p * (i3.imag - a * i2.real), p * (i2.imag + a * L.real)
+    g2 = -p * (L.imag + a * (1.0 / S).real)
+    j0, j1 = -p * (d4.imag - a * d3.real), -p * (d3.imag - a * d2.real)
+    j2 = -p * (d2.imag - a * d1.real)
+    k, m = 1.0 - 2.0 * poisson, 2.0 - 2.0 * poisson
+    f, f_z = z * j1 - k * j0, m * j1 - z * j2
+    u[0], u[1], u[2] = f * x, f * y, z * g1 + m * g0
+    # of the two in-plane stretches, the one along r less the other, over r^2
+    apart = (z * g2 - k * g1 - 2.0 * f) / max(r2, 1e-12)
+    H[0, 0], H[1, 1] = f + apart * x * x, f + apart * y * y
+    H[0, 1] = H[1, 0] = apart * x * y
+    H[0, 2], H[1, 2] = f_z * x, f_z * y
+    across = -z * j2 - m * j1
+    H[2, 0], H[2, 1], H[2, 2] = across * x, across * y, -k * g1 - z * g2
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def dent(whole, a, poisson, x, y, z, into, u, H):
+    """Add what Hertz's pressure within ``a`` does more than a footprint of the same force.
+
+    ``whole`` is of ``whole_field``; ``u`` and ``H`` are as in ``pressed``.  Above the surface it is
+    as there.
+    """
+    away, z = math.sqrt(x * x + y * y + z * z), max(z, 0.0)
+    if away > DENT_ENDS:
+        return
+    t = max((away - FADES_FROM) / (DENT_ENDS - FADES_FROM), 0.0)
+    fade = 1.0 - t * t * (3.0 - 2.0 * t)
+    slope = -6.0 * t * (1.0 - t) / (DENT_ENDS - FADES_FROM) / max(away, CELL)
+    one, other, at = np.empty((2, 3)), np.empty((2, 3, 3)), (x, y, z)
+    dented(a, poisson, x, y, z, one[0], other[0])
+    pressed(whole, x, y, z, 1.0, 0.0, one[1], other[1])
+    for i in range(3):
+        more = into * (one[0, i] - one[1, i])
+        u[i] += fade * more
+        for j in range(3):
+            H[i, j] += fade * into * (other[0, i, j] - other[1, i, j]) + slope * at[j] * more

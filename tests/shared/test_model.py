@@ -197,10 +197,22 @@ def test_elastic_tissue_has_no_time(atlas):
             ask(*query, past=REST, dt=0.1)
 
 
-def test_under_the_tip_an_estimate_holds_the_dent_that_the_fields_lack(atlas):
+def test_under_the_tip_estimates_hold_what_the_mesh_errs_by_there(atlas):
     middle = atlas.nodes.max(axis=0) * [0.5, 0.5, 1.0]
     found = atlas.touch(middle + np.array([0.0, 0.0, 0.85 * atlas.scene.endoscope.radius]))
-    pressed = atlas.press(middle, 0.3)
-    assert found.error_displacement > 1.5 * pressed.error_displacement
-    assert found.error_von_mises > 1.5 * pressed.error_von_mises
-    assert found.error_reduction[2] < found.error_force < 0.3
+    share = min(found.depth / found.depth_limit, 1.0)
+    mesh = np.exp(atlas.estimators.mesh_tip @ [1.0, share])
+    total = found.error_displacement, found.error_von_mises, found.error_force
+    np.testing.assert_allclose(total, np.hypot(found.error_reduction, mesh), rtol=1e-12)
+    assert (found.error_reduction < total).all()
+    assert max(total) < 0.7
+
+
+def test_under_the_tip_the_surface_has_its_dent(atlas):
+    """At the deepest point it is where the sphere is, which the mesh alone would not follow."""
+    top = atlas.nodes[np.argmin(np.linalg.norm(atlas.nodes - [5.0, 5.0, 8.0], axis=1))]
+    radius = atlas.scene.endoscope.radius
+    found = atlas.touch(top + np.array([0.0, 0.0, radius - 0.2]))
+    node = np.argmin(np.linalg.norm(atlas.nodes - top, axis=1))
+    assert atlas.displacement(found)[node, 2] == pytest.approx(-0.2, rel=0.03)
+    assert atlas.fields.of_mesh(found)[node, 2] > -0.15

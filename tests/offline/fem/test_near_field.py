@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
+from palpate.offline.fem.graded import Graded, Grading, parameters_of
+from palpate.offline.fem.mesh import ticks_of
 from palpate.offline.fem.problem import FullProblem, Load, TipPosition
 from palpate.offline.scenes import find_scene
+from palpate.offline.validate.mesh_part import Pressed
 from palpate.shared.near_field import NearFields
 
 PLACE, UP = np.array([5.6, 4.7, 8.0]), np.array([0.0, 0.0, 1.0])
@@ -75,6 +78,27 @@ def test_under_a_tip_it_is_that_of_its_force(coarse):
     nodal = coarse.unit_load_at(contact.place, contact.normal)
     np.testing.assert_allclose(contact.traction * nodal.sum(), -found.force, rtol=1e-12)
     assert coarse.footprint(TipPosition(PLACE + 2.1 * UP)) is None
+
+
+@pytest.mark.parametrize("depth", [0.2, 0.5])
+def test_under_a_tip_most_of_what_fields_lack_of_the_sphere_comes_back(depth):
+    problem, step = block(8, 8, 6), TipPosition(PLACE + (2.0 - depth) * UP)
+    graded = Graded(problem.scene, PLACE, Grading(finest=0.15, even=0.3, growth=0.9))
+    sphere = Pressed(graded.problem, integrated=True).harder(depth, step)
+    at = parameters_of(problem.scene, ticks_of(problem.scene.geometry))
+    found = problem.solve(step)
+    contact = problem.footprint(step, found)
+    u, plain = problem.displaced(found, contact), found.displacement
+    stress = problem.von_mises(u, contact=contact)
+    without = problem.von_mises(plain, contact=contact._replace(tip=False))
+    for own, dented, exact, share in (
+        (plain, u, sphere.displacement, 0.4), (without, stress, sphere.von_mises, 0.65)
+    ):  # fmt: skip
+        exact = graded.at(at, exact)
+        assert np.linalg.norm(dented - exact) < share * np.linalg.norm(own - exact)
+    peak, high = problem.stress_field.peaks(u, None, contact)
+    assert high == pytest.approx(sphere.peaks[1], rel=0.08)
+    assert peak == pytest.approx(sphere.peaks[0], rel=0.25)
 
 
 def test_peaks_are_nearer_to_those_of_a_fine_mesh_than_the_nodes_are(coarse, fine):

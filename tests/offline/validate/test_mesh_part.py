@@ -70,7 +70,7 @@ def test_errors_fall_with_the_mesh_and_a_finer_reference_says_the_same():
     assert (fine[:, 5] < 0.6 * coarse[:, 5]).all()
 
 
-def test_under_the_tip_errors_hold_the_dent_that_fields_lack(monkeypatch):
+def test_under_the_tip_errors_are_those_beside_a_sphere(monkeypatch):
     monkeypatch.setattr(mesh_part, "TIP_GRADING", Grading(finest=0.25, even=0.3, growth=0.9))
     problem = FullProblem(block(8, 8, 6))
     levels = [(depth, TipPosition(PLACE - (2.0 - depth) * DOWN)) for depth in (0.2, 0.4)]
@@ -78,9 +78,10 @@ def test_under_the_tip_errors_hold_the_dent_that_fields_lack(monkeypatch):
     pushed = np.linalg.norm(problem.solve(levels[1][1]).force)
     footprint = [(1.0, Load(PLACE, DOWN, pushed / problem.unit_load(PLACE)[0].sum()))]
     (load,) = mesh_errors(problem, footprint)
-    assert (rows[:, 1] > 5 * load[1]).all()
-    assert (rows[:, 2] > 3 * load[2]).all()
-    assert (rows[:, 3] < 0.05).all()
+    # a dent is harder to follow than a footprint
+    assert (rows[:, 2] > 1.5 * load[2]).all()
+    assert (rows[:, [1, 3]] < 0.1).all()
+    assert (rows[:, 3] > 0.002).all()
 
 
 def test_a_sphere_pressed_deeper_and_deeper_is_where_one_pressed_at_once_is():

@@ -5,7 +5,18 @@ import math
 import numpy as np
 import pytest
 
-from palpate.shared.mechanics.half_space import CELL, REACH, WIDE, half_space, local_field, pressed
+from palpate.shared.mechanics.half_space import (
+    CELL,
+    DENT_ENDS,
+    REACH,
+    WIDE,
+    dent,
+    dented,
+    half_space,
+    local_field,
+    pressed,
+    whole_field,
+)
 
 POISSON = 0.4
 AT = np.linspace(0.0, REACH, 11)
@@ -116,3 +127,63 @@ def test_near_the_contact_it_differs_smoothly_from_the_half_space(local, tables,
     for point in ((REACH, 0.0, 0.0), (0.0, 0.0, REACH), (1.8, 0.0, 1.8), (0.0, 0.5, -1.0)):
         u, H = at(local, point, load)
         assert np.abs(u).max() + np.abs(H).max() < 1e-12
+
+
+def under_a_sphere(a, point):
+    u, H = np.empty(3), np.empty((3, 3))
+    dented(a, POISSON, *point, u, H)
+    return u, H
+
+
+@pytest.mark.parametrize("a", [0.1, 0.7])
+def test_under_a_sphere_the_surface_carries_hertz_pressure_and_takes_its_shape(a):
+    modulus, force = 1 / (1 - POISSON), 8 * math.pi / 15  # E* over 2 mu
+    centre = under_a_sphere(a, (0.0, 0.0, 0.0))[0][2]
+    for r in (0.0, 0.5 * a, 0.9 * a, 1.2 * a, 2.0):
+        u, H = under_a_sphere(a, (0.6 * r, 0.8 * r, 0.0))
+        expected = 1.5 * force / (math.pi * a**2) * math.sqrt(max(1 - (r / a) ** 2, 0.0))
+        np.testing.assert_allclose(-stress(H)[:, 2], [0.0, 0.0, expected], atol=1e-3 * force / a**2)
+        if r < a:  # of a sphere of radius 4 a^3 E* / 3 F
+            assert centre - u[2] == pytest.approx(0.375 * force * r**2 / (a**3 * modulus), abs=1e-5)
+
+
+@pytest.mark.parametrize("point", [(0.05, 0.02, 0.03), (0.5, 0.4, 0.3), (-1.1, 0.6, 0.8)])
+def test_under_a_sphere_forces_balance_and_far_away_it_is_a_point_load(point):
+    a, step, numeric, divergence = 0.1, 1e-4, np.empty((3, 3)), np.zeros(3)
+    u, H = under_a_sphere(a, point)
+    for j, away in enumerate(step * np.eye(3)):
+        (ahead, more), (behind, less) = (
+            under_a_sphere(a, np.add(point, side)) for side in (away, -away)
+        )
+        numeric[:, j] = (ahead - behind) / (2 * step)
+        divergence += (stress(more) - stress(less))[:, j] / (2 * step)
+    np.testing.assert_allclose(H, numeric, atol=1e-5 * np.abs(H).max())
+    np.testing.assert_allclose(divergence, 0.0, atol=1e-4 * np.abs(H).max() / a)
+    x, far, one = np.array(point), math.hypot(*point), 1 - 2 * POISSON
+    side = x[2] / far**3 - one / (far * (far + x[2]))
+    load = [x[0] * side, x[1] * side, 2 * (1 - POISSON) / far + x[2] ** 2 / far**3]
+    if far > 5 * a:
+        np.testing.assert_allclose(u, 4 / 15 * np.array(load), rtol=0.03)
+
+
+def test_a_dent_is_what_a_sphere_does_more_than_a_footprint_and_ends():
+    table = whole_field(POISSON)
+    u, H = np.zeros(3), np.zeros((3, 3))
+    dent(table, 0.2, POISSON, 0.3, 0.1, 0.4, 2.0, u, H)
+    sphere, footprint = under_a_sphere(0.2, (0.3, 0.1, 0.4)), at(table, (0.3, 0.1, 0.4), (1.0, 0.0))
+    np.testing.assert_allclose(u, 2 * (sphere[0] - footprint[0]), atol=1e-12)
+    np.testing.assert_allclose(H, 2 * (sphere[1] - footprint[1]), atol=1e-12)
+    before = u.copy()
+    dent(table, 0.2, POISSON, 0.0, DENT_ENDS, 0.1, 2.0, u, H)
+    np.testing.assert_array_equal(u, before)
+    # just before the end it is small already, and its gradient is that of what fades
+    point, step, numeric = np.array([1.1, 0.6, 0.7]), 0.05, np.empty((3, 3))
+    for j, away in enumerate(step * np.eye(3)):
+        ahead, behind = np.zeros((2, 3))
+        dent(table, 0.2, POISSON, *(point + away), 1.0, ahead, H.copy())
+        dent(table, 0.2, POISSON, *(point - away), 1.0, behind, H.copy())
+        numeric[:, j] = (ahead - behind) / (2 * step)
+    u[:], H[:] = 0.0, 0.0
+    dent(table, 0.2, POISSON, *point, 1.0, u, H)
+    np.testing.assert_allclose(H, numeric, atol=2e-3)
+    assert np.abs(u).max() < 0.02 * np.abs(sphere[0]).max()
