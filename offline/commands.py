@@ -262,6 +262,24 @@ def mesh_error(report: Path | None) -> Report:
 
 @study.command()
 @click.argument("scene")
+@count_option("--places", 4, "Number of places.")
+@report_option
+@reporting
+def convergence(scene: str, places: int, report: Path | None) -> Report:
+    """Show how references converge: graded meshes of edges twice, once and half as long.
+
+    At PLACES places, with 2 x 2 x 2 and with 3 x 3 x 3 points per element. The finest meshes of the
+    turbinate take some minutes and 4 GB of memory.
+    """
+    from palpate.offline.scenes import find_scene
+    from palpate.offline.studies.convergence import convergence
+
+    found = find_scene(scene)
+    return convergence(found, places, report or Path("artifacts") / found.name / "report")
+
+
+@study.command()
+@click.argument("scene")
 @artifact_option
 @count_option("--snapshots", 200, "Full solutions to learn from.", least=20)
 @count_option("--queries", 100, "Number of random loads.")

@@ -78,11 +78,12 @@ class FullModel:
     mesh: Mesh
     tissue: AnyTissue
     terms: tuple[Term, ...] = ()  # of the tissue beside its elasticity, whatever the load
+    quadrature: int = 2  # points along each side of an element
 
     def __post_init__(self) -> None:
         mesh = self.mesh
         self.free = np.flatnonzero(np.repeat(~mesh.clamped, 3))
-        self.gradients, self.weights = volume_quadrature(mesh.nodes, mesh.elements, 2)
+        self.gradients, self.weights = volume_quadrature(mesh.nodes, mesh.elements, self.quadrature)
         self.connectivity = np.ascontiguousarray(mesh.elements, dtype=np.int32)
         self.law = law_of(self.tissue, len(mesh.elements))
         self._elements = self.connectivity, self.gradients, self.weights, self.law

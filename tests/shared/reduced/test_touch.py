@@ -37,7 +37,7 @@ def test_the_tool_is_pushed_back(atlas):
     assert answer.tangent[2, 2] < 0.0
     assert abs(answer.force[:2]).max() < 0.05 * answer.force[2]
     assert 0 < answer.penetration < answer.depth
-    assert atlas.displacement(answer)[:, 2].min() == pytest.approx(-0.3, abs=0.1)
+    assert atlas.displacement(answer)[:, 2].min() == pytest.approx(-0.4, rel=0.05)  # its dent
 
 
 def test_what_is_no_position_or_inside_the_body_is_refused(atlas):
