@@ -46,6 +46,9 @@ GIVEN_WAY = 0.3
 finer mesh has given way where the scene's own has not: that is no error of a size, and the limit
 there is too high.  Training says how many there are."""
 
+UNKNOWN = 0.01
+"""What references err by themselves: errors below are taken for as much."""
+
 DAMPING = 0.3
 """Of the fit, see ``compare.calibrate``."""
 
@@ -155,7 +158,10 @@ def fit(found: Sequence[list[Array]], tip: bool = False) -> tuple[Array, dict[st
     there = moved < GIVEN_WAY
     answers = iter(there)
     known = [
-        [KnownAnswer(row[1:4], np.array([1.0, row[0]]), True, next(answers)) for row in own]
+        [
+            KnownAnswer(np.maximum(row[1:4], UNKNOWN), np.array([1.0, row[0]]), True, next(answers))
+            for row in own
+        ]
         for own in found
     ]
     told = {
