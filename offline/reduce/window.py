@@ -35,7 +35,7 @@ NONLINEAR = 1e-3
 """Displacement gradient of an element times its displacement over the largest, from which on it
 belongs to a window: what linear elasticity makes of a rotation is off by about that."""
 
-REACH = 4.0
+REACH = 3.0
 """Radii of the endoscope from its footprints within which an element belongs to a window, too."""
 
 WHOLE = 0.6
