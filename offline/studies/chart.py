@@ -10,9 +10,9 @@ run was resumed later.
 Errors are relative L2 norms over the moments of a query and all nodes (displacement) or all nodes
 beyond the clamped layer (von Mises stress); a query in which a step has no answer counts as an
 error of 1.  Against the full model on the scene's own mesh that is the error of reduction.  For
-loads there is a refined mesh too, against which the error of the mesh comes on top: displacements
-only, since nodal stresses grow with refinement next to the support, and of few loads, so that their
-median is drawn.
+loads there are meshes graded towards each contact too, beside which the error of the mesh comes on
+top, as it does for full models on coarser and finer meshes: of few loads, over the volume, and with
+the near field of the contact in the stress, which is recovered from any method's displacement.
 
 Over histories the artifact is also asked as if there were no past ("artifact, warm"): warm queries
 of the same local models at the same loads.  They are compared with the full model of tissue that
@@ -28,7 +28,6 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from palpate.offline.fem.norms import relative
 from palpate.offline.methods.catalogue import Training, build
 from palpate.offline.methods.full import Full, Remeshed
 from palpate.offline.methods.method import Method, Steps
@@ -56,21 +55,20 @@ PLAN: Plan = {
     **dict.fromkeys(("pod-deim", "pod-gappy", "regression"), MODES),
     "linear": (*MODES, 160),
     **dict.fromkeys(("mass-spring", "tensor-mass"), (0.5, 1, 2)),
-    "full": (0.6, 0.75, 1, 1.5),
+    "full": (0.5, 0.75, 1, 1.25),
 }
 PLAN_IN_TIME: Plan = {
     **dict.fromkeys(("artifact", "artifact, warm", "full"), (1,)),
     **dict.fromkeys(("pod", "modal", "ritz"), MODES),
 }
 
-REFINEMENT = 2  # factor on the divisions of the reference mesh: eight times the elements
-REFINED_LOADS = 20  # number of queries solved in the refined mesh, the first ones
+GRADED_LOADS = 20  # number of queries solved on graded meshes, the first ones
 REPEATS = 10
 SLOW = 10e-3  # seconds of a step beyond which it is timed only once
 
 
-Queries = Sequence[tuple[Steps, Fields, Array | None]]
-"""What methods are asked, the full model's answers, and displacements (n, 3) in a refined mesh."""
+Queries = Sequence[tuple[Steps, Fields, tuple[Array, Array] | None]]
+"""What methods are asked, the full model's answers, and those of meshes graded towards a load."""
 
 
 def chart(
@@ -118,8 +116,8 @@ def chart(
     if not asked:
         raise PalpateError(f"{artifact}: the full model could follow none of the histories")
     loads = [] if scene is None else [steps[0][0].contacts[0] for steps, _ in asked]
-    tasks = {"refined": [(full.refined, scene, REFINEMENT, x) for x in loads[:REFINED_LOADS]]}
-    finer = full.in_parallel(artifact, checkpoint, "refined mesh", tasks)["refined"]
+    tasks = {"graded": [(full.graded, scene, load) for load in loads[:GRADED_LOADS]]}
+    finer = full.in_parallel(artifact, checkpoint, "graded meshes", tasks)["graded"]
     questions = [(*query, fine) for query, fine in zip_longest(asked, finer)]
     training = Training(problem, full.snapshots(learnt), atlas, seed, in_time)
     measured: dict[str, Mapping[str, Any]] = {}
@@ -144,7 +142,7 @@ def chart(
 def measure(training: Training, queries: Queries, name: str, size: float) -> dict[str, Any]:
     """Build a method and have it answer the queries.
 
-    Errors (``displacement``, ``von_mises``, ``refined``) are by query, nan where nothing is known,
+    Errors (``drawing.FIELDS``) are by query, nan where nothing is known,
     ``times`` (s) and those ``beside``, the artifact's, by step that presses.
     """
     problem = training.problem
@@ -153,7 +151,7 @@ def measure(training: Training, queries: Queries, name: str, size: float) -> dic
     queries = [query for query in queries if query[2] is not None or not other_mesh]
     for one in (method, yardstick):  # compiled code comes in from disk
         one.step(one.at_rest(), *queries[0][0][0])
-    errors, times, unconverged = np.ones((len(queries), 3)), [], 0
+    errors, times, unconverged = np.ones((len(queries), 4)), [], 0
     for i, (steps, exact, finer) in enumerate(queries):
         states, seconds, missed = play(method, steps)
         times.append(seconds[_pressing(steps)])
@@ -165,8 +163,8 @@ def measure(training: Training, queries: Queries, name: str, size: float) -> dic
                 exact = Fields.of(elastic, play(elastic, steps)[0])
             errors[i, :2] = fields.errors(problem, exact)
             if finer is not None:
-                errors[i, 2] = relative(fields.displacements[-1], finer)
-    errors[[finer is None for *_, finer in queries], 2] = np.nan
+                errors[i, 2:] = fields.total_errors(problem, steps[0][0].contacts[0], finer)
+    errors[[finer is None for *_, finer in queries], 2:] = np.nan
     if other_mesh:
         errors[:, :2] = np.nan
     least, beside = _times(method, yardstick, queries, np.concatenate(times))

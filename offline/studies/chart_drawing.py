@@ -26,8 +26,8 @@ compare: another mesh has no error of reduction."""
 SHIPPED, TWIN, FULL = "artifact 1", "artifact, warm 1", "full 1"
 """Keys of the artifact, of the artifact without memory, and of the full model on its own mesh."""
 
-FIELDS = ("displacement", "von_mises", "refined")
-"""Errors: of two fields on the scene's mesh, and of displacement against a refined one."""
+FIELDS = ("displacement", "von_mises", "total", "total_von_mises")
+"""Errors of two fields: beside the full model on the scene's mesh, and beside graded meshes."""
 
 STATISTICS = ("median", "p95", "max")
 
@@ -78,7 +78,7 @@ NAMES = {
     "tensor-mass 2": ("tensor-mass", (8, -3), "left"),
     "derivatives 9": ("static\nderivatives", (-8, -28), "right"),
     "full 0.75": ("coarser mesh", (-8, -4), "right"),
-    "full 1.5": ("finer mesh", (8, -16), "right"),
+    "full 1.25": ("finer mesh", (8, -16), "right"),
 }
 """What is written beside points: text, offset in points and alignment."""
 
@@ -106,6 +106,16 @@ class Panel(NamedTuple):
     axis: str = "error, 95th percentile"
 
     @property
+    def is_total(self) -> bool:
+        """Whether the error of the mesh is in it."""
+        return self.field.startswith("total")
+
+    @property
+    def quantity(self) -> str:
+        """What errs."""
+        return "von_mises" if self.field.endswith("von_mises") else "displacement"
+
+    @property
     def error(self) -> str:
         """The column that is drawn."""
         return f"{self.field}_{self.statistic}"
@@ -113,7 +123,7 @@ class Panel(NamedTuple):
     def plotted(self, rows: Sequence[Row]) -> list[Row]:
         """Points that have this error; the full model on its own mesh has none but rounding."""
         known = [row for row in rows if not math.isnan(row[self.error])]
-        return [row for row in known if self.field == "refined" or row["key"] != FULL]
+        return [row for row in known if self.is_total or row["key"] != FULL]
 
 
 class Layout(NamedTuple):
@@ -126,11 +136,12 @@ class Layout(NamedTuple):
 
 
 FIELD_PANELS = Panel("Displacement", "displacement"), Panel("Von Mises stress", "von_mises")
-MESH_PANEL = Panel(
-    "Displacement, error of the mesh included", "refined", "median",
-    "error against a refined mesh, median",
-)  # fmt: skip
-OF_LOADS = Layout("chart", "query", (*FIELD_PANELS, MESH_PANEL), (2, 2))
+TOTAL = "total error beside graded meshes, 95th percentile"
+TOTAL_PANELS = (
+    Panel("Displacement, mesh and reduction", "total", axis=TOTAL),
+    Panel("Von Mises stress, mesh and reduction", "total_von_mises", axis=TOTAL),
+)
+OF_LOADS = Layout("chart", "query", (*TOTAL_PANELS, *FIELD_PANELS), (2, 3))
 IN_TIME = Layout("chart_in_time", "step", FIELD_PANELS, (1, 3))
 NOTE = """\
 A point is a method of one size; a line joins its sizes.
@@ -162,6 +173,8 @@ def draw(path: Path, rows: Sequence[Row], scene: Scene, layout: Layout) -> None:
         _draw_panel(axes, panel, rows, layout.per)
         _draw_goals(axes, panel, rows, scene, layout.per)
         _draw_names(axes, panel, rows)
+    for axes in grid[len(layout.panels) :]:
+        axes.axis("off")
     _draw_legend(grid[-1], rows)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)
@@ -194,18 +207,19 @@ def _draw_panel(axes: Axes, panel: Panel, rows: Sequence[Row], per: str) -> None
 
 
 def _draw_goals(axes: Axes, panel: Panel, rows: Sequence[Row], scene: Scene, per: str) -> None:
-    """The full model on the scene's mesh, the reduction's share of the tolerance and the budget."""
+    """The full model on the scene's mesh, what the tolerance leaves to an error, and the budget."""
     full = next(row for row in rows if row["key"] == FULL)
     (left, right), (bottom, top), error = axes.get_xlim(), axes.get_ylim(), full[panel.error]
-    if panel.field == "refined":
+    if panel.is_total:
         axes.axhline(error, color="0.4", lw=0.9, ls=":")
-        _write(axes, f"error of the\nscene's mesh: {percent(error)}", (left, error), (8, -28))
-        return
-    axes.axvline(full["time_us"], color="black", lw=0.9, ls=":")
-    where = full["time_us"], bottom ** (2 / 3) * top ** (1 / 3)
-    time = duration(1e-6 * full["time_us"])
-    _write(axes, f"full model:\n{time},\nno error", where, (6, 0))
-    tolerance = getattr(scene.tolerance.reduction, panel.field)
+        _write(axes, f"scene's own mesh: {percent(error)}", (left, error), (8, 4))
+    else:
+        axes.axvline(full["time_us"], color="black", lw=0.9, ls=":")
+        where = full["time_us"], bottom ** (2 / 3) * top ** (1 / 3)
+        time = duration(1e-6 * full["time_us"])
+        _write(axes, f"full model:\n{time},\nno error", where, (6, 0))
+    allowed = scene.tolerance.total if panel.is_total else scene.tolerance.reduction
+    tolerance = getattr(allowed, panel.quantity)
     text = f"aim: {percent(tolerance)}"
     if per == "query":
         right = 1e6 * scene.budget.query
@@ -239,7 +253,6 @@ def _write(
 
 def _draw_legend(axes: Axes, rows: Sequence[Row]) -> None:
     """Groups with their methods in two columns, and what the chart shows."""
-    axes.axis("off")
     handles: list[Line2D] = []
     for title, own in groupby((look for look, _ in looks(rows)), lambda look: look.group):
         handles.append(Line2D([], [], ls="", label=title))

@@ -10,9 +10,11 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.offline.fem.graded import FIT_FOR_FOOTPRINTS, Graded, parameters_of
+from palpate.offline.fem.mesh import ticks_of
+from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import FullProblem, Load, TipPosition
-from palpate.offline.methods.full import Remeshed
 from palpate.offline.methods.method import Case, Method, Snapshots, Steps
 from palpate.offline.run.workers import Checkpoint, content_key, open_artifact, worker_pool
 from palpate.offline.validate import compare
@@ -20,7 +22,7 @@ from palpate.offline.validate.queries import HISTORIES, LOADS
 from palpate.shared.arrays import Array
 from palpate.shared.errors import PalpateError
 from palpate.shared.model import ReducedModel
-from palpate.shared.scene import Scene, parse_scene
+from palpate.shared.scene import Scene
 
 
 class Fields(NamedTuple):
@@ -45,6 +47,18 @@ class Fields(NamedTuple):
         kept = problem.beyond_clamped_layer
         u, s = (field.astype(float) for field in exact)
         return relative(self.displacements, u), relative(self.stresses[:, kept], s[:, kept])
+
+    def total_errors(
+        self, problem: FullProblem, load: Load, exact: tuple[Array, Array]
+    ) -> tuple[float, float]:
+        """The same of the answer to a load over the volume, beside a graded mesh.
+
+        Stress is recovered from the displacement, with the near field of the load.
+        """
+        u, volumes = self.displacements[-1].astype(float), problem.nodal_volumes
+        stress = problem.von_mises(u, contact=problem.footprint(load))
+        kept = volumes * problem.beyond_clamped_layer
+        return relative(u, exact[0], volumes), relative(stress, exact[1], kept)
 
 
 def opened(artifact: Path, scene: Scene | None) -> tuple[ReducedModel, FullProblem]:
@@ -123,16 +137,18 @@ def snapshots(solved: Sequence[tuple[Steps, Fields | None]]) -> Snapshots:
     return Snapshots(loads, rows.reshape(len(rows), -1))
 
 
-@lru_cache(maxsize=1)
-def _remeshed(text: str, folder: Path | None, factor: float) -> Remeshed:
-    return Remeshed(FullProblem(parse_scene(text, folder)), factor)
+def graded(problem: FullProblem, scene: Scene, load: Load) -> tuple[Array, Array] | None:
+    """What a mesh graded towards a load says at the nodes of a scene's own, if it has an answer.
 
-
-def refined(problem: FullProblem, scene: Scene, factor: float, load: Load) -> Array | None:
-    """Displacement (n, 3) mm of a scene's nodes in a finer mesh, if there is an equilibrium.
-
-    A task for ``run.workers``.
+    Displacement (n, 3) mm and von Mises stress (n,) kPa, the near field included.  A task for
+    ``run.workers``; ``scene`` is the problem's with its files.
     """
-    method = _remeshed(scene.text, scene.folder, factor)
-    answer = method.solve(Case.of(problem, load))
-    return method.displacement(answer.state) if answer.converged else None
+    x, normal, _ = problem.surface.project(load.position)
+    fine = Graded(scene, x, FIT_FOR_FOOTPRINTS)
+    try:
+        u, _ = fine.problem.press_at(x, normal, load.pressure * load.direction)
+    except NoEquilibrium:
+        return None
+    stress = fine.problem.von_mises(u, contact=fine.problem.footprint(load))
+    at = parameters_of(scene, ticks_of(scene.geometry))
+    return fine.at(at, u), fine.at(at, stress)
