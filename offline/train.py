@@ -81,7 +81,7 @@ TRIAL_PATCHES = 8
 PLACES = 64
 """Where the reduced model is asked in one task."""
 
-TIP_SAMPLES = 200
+TIP_SAMPLES = 150
 """Full solutions under the tip that validate and calibrate."""
 
 MOST_HISTORIES = 48

@@ -31,7 +31,7 @@ that serve."""
 TIP_GRADING = Grading(finest=0.15, even=0.2, growth=1.2, support=0.2)
 """The same under a tip, whose contact is a fifth of its radius across at a depth of a fiftieth."""
 
-APART, LEAST, RIM = 4.0, 6, 6
+APART, LEAST, RIM = 5.0, 6, 6
 """Distance of the places looked at, in radii, and their least number, which are those of the tip;
 one in so many is on the rim of the surface."""
 
