@@ -102,7 +102,7 @@ def trust(report: Mapping[str, Any]) -> dict[str, str]:
         flagged = found["flagged"]
         said[label.replace("errors", "trust")] = (
             f"covers 95 % of errors, confidence {percent(found['confidence'])}; doubts "
-            f"{percent(flagged['share'])} of right ones"
+            + (f"{percent(flagged['share'])} of right ones" if flagged["right"] else "all")
             + (f", most for {flagged['mostly']}" if flagged["mostly"] else "")
         )
     return said

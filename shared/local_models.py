@@ -173,10 +173,16 @@ class Estimators:
     histories: Annotated[Array | None, "history_error_coefficients", "1", _FITTED] = None
     courses: Annotated[Array | None, "tip_history_error_coefficients", "1", _FITTED] = None
     mesh: Annotated[
-        Array | None, "mesh_error_coefficients", "1", "same for the mesh; features: 1, load / limit"
+        Array | None,
+        "mesh_error_coefficients",
+        "1",
+        "same for the mesh; 1, load / limit, near the rim",
     ] = None
     mesh_tip: Annotated[
-        Array | None, "tip_mesh_error_coefficients", "1", "same under the tip; 1, depth / limit"
+        Array | None,
+        "tip_mesh_error_coefficients",
+        "1",
+        "same under the tip; 1, depth / limit, near the rim",
     ] = None
 
     def coefficients(self, tip: bool, in_time: bool) -> Array:

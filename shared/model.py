@@ -24,7 +24,7 @@ from palpate.shared.mechanics.tip import CURVED_WITHIN, dented, held
 from palpate.shared.near_field import Contact
 from palpate.shared.query import check_place, checked_load, out_of_range, vector
 from palpate.shared.reduced import press, touch
-from palpate.shared.reduced.features import RIM
+from palpate.shared.reduced.features import RIM, near_rim
 from palpate.shared.reduced.outcome import Outcome
 from palpate.shared.reduced.past import Elastic, Remembering
 from palpate.shared.reduced.transfer import LeftBehind, Local, Past, Transfer, estimate_history
@@ -254,7 +254,7 @@ class ReducedModel:
         converged = found.status.item() == newton.CONVERGED
         unknown = bool(outside) or not converged
         reduction = _UNKNOWN if unknown else found.errors.copy()
-        total, mesh = _total(reduction, self.estimators.mesh, pressure / found.limit.item())
+        total, mesh = _total(reduction, self.estimators.mesh, pressure, found)
         return Answer(
             contact_point=found.foot.copy(),
             normal=found.upward.copy(),
@@ -360,7 +360,7 @@ class ReducedModel:
             reduction, (total, mesh) = _NONE, ([0.0] * 3, _NONE)
         else:
             reduction = _UNKNOWN if outside or not converged else found.errors.copy()
-            total, mesh = _total(reduction, self.estimators.mesh_tip, depth / limit)
+            total, mesh = _total(reduction, self.estimators.mesh_tip, depth, found)
         return Answer(
             contact_point=found.point.copy(),
             normal=found.normal.copy(),
@@ -440,12 +440,17 @@ class ReducedModel:
         return self.fields.peaks(answer, displacement)
 
 
-def _total(reduction: Array, fitted: Array | None, share: float) -> tuple[list[float], Array]:
-    """Estimated errors of reduction and mesh together, and of the latter, at a load's share."""
+def _total(
+    reduction: Array, fitted: Array | None, level: float, found: Outcome
+) -> tuple[list[float], Array]:
+    """Estimated errors of reduction and mesh together, and of the latter.
+
+    At a pressure or depth, by its share of the limit and whether it is near the rim.
+    """
     if fitted is None:
         return reduction.tolist(), _NONE
-    share = min(max(share, 0.0), 1.0)
-    mesh = [math.exp(a + b * share) for a, b in fitted.tolist()]
+    share, rim = min(max(level / found.limit.item(), 0.0), 1.0), near_rim(found.limits)
+    mesh = [math.exp(a + b * share + c * rim) for a, b, c in fitted.tolist()]
     return list(map(math.hypot, reduction.tolist(), mesh)), np.array(mesh)
 
 

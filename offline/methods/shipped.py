@@ -62,8 +62,8 @@ class Shipped(Method):
         return self._atlas.press(*where, **time)
 
     def field(self, state: Found) -> Array:
-        """See ``Method``."""
-        return self._atlas.displacement(state).astype(float)
+        """See ``Method``; as of all others without the dent of a tip, which is the same for all."""
+        return self._atlas.fields.of_mesh(state).astype(float)
 
     def von_mises(self, state: Found | None) -> Array:
         """See ``Method``; as of all others without the near field, which is the same for all."""

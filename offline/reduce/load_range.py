@@ -55,6 +55,10 @@ LEAST = 1e-3
 TOLERANCE = 1e-3
 MAX_ITERATIONS = 20
 
+SURFACE = 0.9
+"""Pressure over the shear modulus from which on the surface itself may give way under a footprint,
+which derivatives at rest do not tell: full solutions decide."""
+
 TRUSTED = 0.1
 """Residual left in the full model up to which Galerkin's solution is believed: as a displacement in
 the energy at rest, relative to the whole."""
@@ -76,8 +80,7 @@ SUDDEN = 1.0
 has up to .6, a jump by 5 % of the displacement 1."""
 
 MARGIN = 1.1
-"""Limit at which the reduced model gives way over the one it gets: the full one may do so before
-that."""
+"""Limit at which tissue gives way, in the full or the reduced model, over the one it gets."""
 
 DEPTH_SHARES = np.linspace(1.0, 0.1, 7)
 """Of the depth limit that are tried, until one has the same answer by all ways."""
@@ -208,13 +211,19 @@ def load_range(problem: FullProblem, position: Array) -> Array:
         return model.solve(pressure * along, start=start, smallest_step=1.0).displacement
 
     limit, power, moved = pressure_that_moves(path.solve, wanted, pressure)
-    if moved is None or np.linalg.norm(moved, axis=1).max() < (1 - NEAR) * wanted:
+    if not _far(moved, wanted) or limit > SURFACE * problem.model.law.mu[0]:
         near = limit or pressure, power, moved
         limit, _, moved = pressure_that_moves(full, wanted, *near, stride=1.5)
+        limit /= 1.0 if _far(moved, wanted) else MARGIN
     depth = _tip_depth(problem, position, limit * nodal.sum())
     depth -= 0.0 if moved is None else float(nodal @ moved @ normal) / nodal.sum()
     depth = min(max(depth, SHALLOWEST), DEEPEST * problem.scene.endoscope.radius)
     return np.array([limit, *np.diag(C), C[0, 1], C[0, 2], C[1, 2], depth])
+
+
+def _far(moved: Array | None, wanted: float) -> bool:
+    """Whether a displacement (n, 3) mm is about as large as wanted."""
+    return moved is not None and float(np.linalg.norm(moved, axis=1).max()) > (1 - NEAR) * wanted
 
 
 def _tip_depth(problem: FullProblem, position: Array, force: float) -> float:

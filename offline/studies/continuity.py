@@ -65,7 +65,7 @@ def _forces(atlas: ReducedModel, problem: FullProblem, loads: Sequence[Load]) ->
     for i, load in enumerate(loads):
         tip = Place.at(atlas, load.position).touch(0.5)
         answer = atlas.touch(tip.position, warm=warm)
-        reduced = atlas.displacement(answer).astype(float)
+        reduced = atlas.fields.of_mesh(answer).astype(float)
         try:
             full = problem.solve(tip, start=reduced if before is None else before)
         except NoEquilibrium:

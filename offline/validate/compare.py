@@ -393,18 +393,17 @@ def coverage(known: Sequence[KnownAnswer]) -> tuple[float, Array]:
 def flags(known: Sequence[KnownAnswer], tolerance: Tolerance) -> dict[str, Any]:
     """Share of right answers that would be doubted, of how many, and what is to blame most often.
 
-    Right are those in range whose errors are within the reduction's share of the tolerance; they
-    are doubted where estimates of mesh and reduction together exceed it, see ``Tolerance``.
+    Right are those in range that are within the tolerance with all that the mesh is estimated to
+    err by; they are doubted where the estimates of mesh and reduction together exceed it.
     """
     right, doubted, blamed = 0, 0, Counter[str]()
     for answer in known:
-        if answer.estimated[0] == np.inf or np.any(
-            answer.errors > tolerance.reduction[: len(answer.errors)]
-        ):
+        if answer.estimated[0] == np.inf:
             continue
-        right += 1
+        is_right = not tolerance.exceeded(np.hypot(answer.errors, answer.mesh))
         names = tolerance.exceeded(np.hypot(answer.estimated, answer.mesh))
-        doubted += bool(names)
+        right += is_right
+        doubted += is_right and bool(names)
         for name in names:
             i = Errors._fields.index(name)
             larger = "mesh" if answer.mesh[i] > answer.estimated[i] else "reduction"

@@ -31,7 +31,7 @@ that serve."""
 TIP_GRADING = Grading(finest=0.15, even=0.2, growth=1.2, support=0.2)
 """The same under a tip, whose contact is a fifth of its radius across at a depth of a fiftieth."""
 
-APART, LEAST, RIM = 5.0, 6, 6
+APART, LEAST, RIM = 5.0, 9, 3
 """Distance of the places looked at, in radii, and their least number, which are those of the tip;
 one in so many is on the rim of the surface."""
 
@@ -49,8 +49,8 @@ there is too high.  Training says how many there are."""
 UNKNOWN = 0.01
 """What references err by themselves: errors below are taken for as much."""
 
-DAMPING = 0.3
-"""Of the fit, see ``compare.calibrate``."""
+DAMPING = 2.0
+"""Of the fit, see ``compare.calibrate``: few answers are known."""
 
 Levels = Sequence[tuple[float, Load | TipPosition]]
 """What presses at one place, harder and harder: share of the limit, or mm, and step."""
@@ -133,8 +133,10 @@ def mesh_errors(problem: FullProblem, levels: Levels) -> list[Array]:
 
     Relative L2 norms over its volume, of stress outside the clamped layer; the relative error of a
     tip's force, or of the mean displacement under a footprint; those of the largest stress and its
-    99th percentile.
+    99th percentile.  Last 1 within a radius of the rim of the surface, else 0.
     """
+    surface, away = problem.surface, problem.surface.rim_distance()[:, None]
+    near = surface.locate(levels[0][1].position, away)[-1] < problem.scene.endoscope.radius
     kept, found, volumes = problem.beyond_clamped_layer, [], problem.nodal_volumes
     how = TIP_GRADING if isinstance(levels[0][1], TipPosition) else GRADING
     for level, _, own, exact in compared(problem, problem.scene, levels, how):
@@ -144,12 +146,12 @@ def mesh_errors(problem: FullProblem, levels: Levels) -> list[Array]:
             abs(float(np.linalg.norm(own.felt) / np.linalg.norm(exact.felt)) - 1.0),
             *np.abs(np.divide(own.peaks, exact.peaks) - 1.0),
         )
-        found.append(np.array([level, *errors]))
+        found.append(np.array([level, *errors, near.item()]))
     return found
 
 
 def fit(found: Sequence[list[Array]], tip: bool = False) -> tuple[Array, dict[str, Any]]:
-    """Coefficients (3, 2) of the log of the mesh's errors in 1 and the share of the limit.
+    """Coefficients (3, 3) of the log of the mesh's errors: 1, share of the limit, near the rim.
 
     And what an artifact tells of these errors, of those of ``StressField.peaks`` as well.
     """
@@ -159,14 +161,20 @@ def fit(found: Sequence[list[Array]], tip: bool = False) -> tuple[Array, dict[st
     answers = iter(there)
     known = [
         [
-            KnownAnswer(np.maximum(row[1:4], UNKNOWN), np.array([1.0, row[0]]), True, next(answers))
+            KnownAnswer(
+                np.maximum(row[1:4], UNKNOWN),
+                np.array([1.0, row[0], row[-1]]),
+                True,
+                comparable=next(answers),
+                near_rim=row[-1] > 0.0,
+            )
             for row in own
         ]
         for own in found
     ]
     told = {
         name: statistics(errors)
-        for name, errors in zip((*Errors._fields, "peak", "p99"), rows[there, 1:].T, strict=True)
+        for name, errors in zip((*Errors._fields, "peak", "p99"), rows[there, 1:-1].T, strict=True)
     }
     fitted, confidence = calibrate(known, DAMPING)
     given_way = int(np.sum(~there))

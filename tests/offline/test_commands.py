@@ -98,7 +98,7 @@ REFUSED = {
     "validate text.h5": "text.h5: not an artifact of this software",
     "bench text.h5": "text.h5: not an artifact of this software",
     f"solve cube {AT} 1": "neither a file 'cube' nor artifacts/cube.h5, which palpate train",
-    "train septum": "neither a .toml file nor one of cube, cube-visco, quick",
+    "train septum": "neither a .toml file nor one of cube, cube-visco, layer, quick",
     "study stability cube": "cube.h5: cannot be read: No such file",
     "study relaxation A": "is elastic",
     "study chart-in-time A": "is elastic",

@@ -201,11 +201,13 @@ def test_under_the_tip_estimates_hold_what_the_mesh_errs_by_there(atlas):
     middle = atlas.nodes.max(axis=0) * [0.5, 0.5, 1.0]
     found = atlas.touch(middle + np.array([0.0, 0.0, 0.85 * atlas.scene.endoscope.radius]))
     share = min(found.depth / found.depth_limit, 1.0)
-    mesh = np.exp(atlas.estimators.mesh_tip @ [1.0, share])
+    mesh = np.exp(atlas.estimators.mesh_tip @ [1.0, share, 0.0])
     total = found.error_displacement, found.error_von_mises, found.error_force
     np.testing.assert_allclose(total, np.hypot(found.error_reduction, mesh), rtol=1e-12)
     assert (found.error_reduction < total).all()
-    assert max(total) < 0.7
+    # its mesh is coarse: faces of 2.5 mm under a tip of 2 mm
+    assert found.error_displacement < 0.4
+    assert found.error_force < 0.2
 
 
 def test_under_the_tip_the_surface_has_its_dent(atlas):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from palpate.offline.fem.mesh import (
+    accessible_surface,
     build_mesh,
     determinants,
     least_volume_ratio,
@@ -30,8 +31,9 @@ def shipped_mesh(name):
 
 
 BODIES = {(scene.geometry, scene.support, scene.surface): scene.name
-          for scene in map(find_scene, shipped_scenes())}  # fmt: skip
-"""A scene of every body that comes along."""
+          for scene in map(find_scene, shipped_scenes())
+          if scene.geometry.divisions is not None}  # fmt: skip
+"""A scene of every body that comes along with its mesh."""
 
 
 @pytest.fixture(params=BODIES.values())
@@ -124,7 +126,7 @@ def test_turbinate_is_touched_medially_and_below_end_to_end_and_clamped_on_the_l
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     assert np.abs(normals[:, 1]).max() < 1e-12
     assert normals[:, 0].max() > 0.99  # medial
-    assert normals[:, 2].min() < -0.99  # inferior
+    assert accessible_surface(mesh).normals[:, 2].min() < -0.99  # inferior
     assert normals[:, 0].min() < -0.6  # lateral-inferior, towards the hook
     x, y, z = mesh.nodes[mesh.clamped].T
     assert x.max() < 4.4

@@ -66,7 +66,7 @@ def test_errors_fall_with_the_mesh_and_a_finer_reference_says_the_same():
     assert fine[:, 0].tolist() == [0.3, 1.0]
     assert (fine[:, 1:4] < 0.5 * coarse[:, 1:4]).all()
     # largest stress and 99th percentile, whose errors change sign on the way
-    assert (fine[:, 4:] < 0.1).all()
+    assert (fine[:, 4:6] < 0.1).all()
     assert (fine[:, 5] < 0.6 * coarse[:, 5]).all()
 
 
@@ -99,24 +99,34 @@ def test_a_sphere_pressed_deeper_and_deeper_is_where_one_pressed_at_once_is():
 def test_an_estimate_covers_and_leaves_out_what_has_given_way():
     rng = np.random.default_rng(3)
     found = [
-        [np.array([level, *(0.02 * np.exp(level + 0.2 * rng.standard_normal(5)))])
+        [np.array([level, *(0.02 * np.exp(level + 0.2 * rng.standard_normal(5))), 0.0])
          for level in LEVELS]
         for _ in range(12)
     ]  # fmt: skip
-    found[4][1][1:] = 2 * GIVEN_WAY
+    found[4][1][1:6] = 2 * GIVEN_WAY
     coefficients, told = fit(found)
     assert told["given_way"] == 1
     assert told["answers"] == 24
     assert told["p99"]["max"] == max(row[5] for own in found for row in own if row[5] < GIVEN_WAY)
     for own in found[:4] + found[5:]:
         for row in own:
-            assert (row[1:4] <= 1.05 * np.exp(coefficients @ [1.0, row[0]])).all()
-    assert (np.exp(coefficients @ [1.0, 0.3]) < 2.5 * 0.02 * np.exp(0.3)).all()
+            assert (row[1:4] <= 1.05 * np.exp(coefficients @ [1.0, row[0], 0.0])).all()
+    assert (np.exp(coefficients @ [1.0, 0.3, 0.0]) < 2.5 * 0.02 * np.exp(0.3)).all()
 
 
 def test_under_the_tip_only_its_force_tells_what_has_given_way():
-    lacks_dent = [np.array([level, 0.5, 0.6, 0.01, 0.1, 0.1]) for level in (0.15, 0.8)]
-    slipped = [np.array([level, 0.5, 0.6, 2 * GIVEN_WAY, 0.1, 0.1]) for level in (0.15, 0.8)]
+    lacks_dent = [np.array([level, 0.5, 0.6, 0.01, 0.1, 0.1, 0.0]) for level in (0.15, 0.8)]
+    slipped = [np.array([level, 0.5, 0.6, 2 * GIVEN_WAY, 0.1, 0.1, 0.0]) for level in (0.15, 0.8)]
     coefficients, told = fit([lacks_dent] * 5 + [slipped], tip=True)
     assert told["given_way"] == 2
     np.testing.assert_allclose(np.exp(coefficients[:, 0]), [0.5, 0.6, 0.01], rtol=1e-6)
+
+
+def test_near_the_rim_errors_are_covered_by_themselves():
+    at_rim = [np.array([level, 0.1, 0.4, 0.2, 0.1, 0.1, 1.0]) for level in LEVELS]
+    inside = [np.array([level, 0.02, 0.1, 0.03, 0.1, 0.1, 0.0]) for level in LEVELS]
+    coefficients, _ = fit([inside] * 4 + [at_rim] * 2)
+    for rim, errors in ((0.0, [0.02, 0.1, 0.03]), (1.0, [0.1, 0.4, 0.2])):
+        told = np.exp(coefficients @ [1.0, 0.5, rim])
+        assert (told >= 0.999 * np.array(errors)).all()
+        assert (told < 2.0 * np.array(errors)).all()
