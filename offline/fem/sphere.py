@@ -29,9 +29,13 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from palpate.shared.arrays import Array, Flags, Ints, Numbers
 from palpate.shared.compiled import room
+from palpate.shared.geometry.edges import shared_edges
 from palpate.shared.geometry.elements import quadrilateral, shape
 
 HARDNESS = 12000.0
@@ -51,8 +55,8 @@ SAG = 4.0
 """By which the squared distance of the tip's centre from a point of a block is at most less than
 from the nearest corner of the block, in squared half diagonals at rest; 1 on a plane."""
 
-SMOOTH = np.cos(np.radians(45.0))
-"""Faces that meet at less than this angle go on in one another."""
+SMOOTH = np.radians(45.0)
+"""Angle of normals up to which faces go on in one another."""
 
 REACH = 1.25
 """A curved face stays in the box of its nodes stretched by this factor."""
@@ -106,6 +110,8 @@ def sphere_of(radius: float, young: float) -> Sphere:
 def sphere_surface(nodes: Array, faces: Numbers, accessible: Flags, radius: float) -> SphereSurface:
     """Faces that a tip on the accessible ones can touch: those and their smooth continuation.
 
+    As far as a radius of the tip.
+
     Parameters
     ----------
     nodes : ndarray, shape (n, 3), mm
@@ -115,7 +121,7 @@ def sphere_surface(nodes: Array, faces: Numbers, accessible: Flags, radius: floa
     radius : float, mm
         Of the tip; sets the distance of integration points.
     """
-    touched = faces[_with_smooth_neighbours(nodes, faces, accessible)]
+    touched = faces[_with_smooth_neighbours(nodes, faces, accessible, radius)]
     reference = quadrilateral(faces.shape[1])
     at, ends, corners = _grid(nodes[touched], SPACING * radius)
     N, dN = shape(reference, at)
@@ -164,27 +170,19 @@ def _grid(nodes: Array, spacing: float) -> tuple[Array, Array, Numbers]:
     return centres, np.stack(borders, axis=-1).reshape(-1, 2), np.stack(corners, -1).reshape(-1, 4)
 
 
-def _with_smooth_neighbours(nodes: Array, faces: Numbers, accessible: Flags) -> Ints:
-    """Accessible faces and those that share an edge with one at less than 45 degrees."""
-    reference = quadrilateral(faces.shape[1])
-    _, dN = shape(reference, reference[:4])
-    tangents = np.einsum("fai,qaj->fqij", nodes[faces], dN)
-    normals = np.cross(tangents[..., 0], tangents[..., 1])
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)  # (f, 4, 3) at the corners
-    corners = faces[:, :4]
-    edges = np.stack([corners, np.roll(corners, -1, axis=1)], axis=-1).reshape(-1, 2)
-    ends = np.stack([normals, np.roll(normals, -1, axis=1)], axis=2).reshape(-1, 2, 3)
-    ends[edges[:, 0] > edges[:, 1]] = ends[edges[:, 0] > edges[:, 1], ::-1]
-    _, number, count = np.unique(
-        np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    order = np.argsort(number.ravel(), kind="stable")
-    pairs = order[count[number.ravel()[order]] == 2].reshape(-1, 2)
-    smooth = (np.sum(ends[pairs[:, 0]] * ends[pairs[:, 1]], axis=-1) > SMOOTH).all(axis=1)
-    joined = pairs[smooth] // 4
-    kept = accessible.copy()
-    kept[joined[accessible[joined].any(axis=1)]] = True
-    return np.flatnonzero(kept)
+def _with_smooth_neighbours(nodes: Array, faces: Numbers, accessible: Flags, reach: float) -> Ints:
+    """Accessible faces and those that go on from them, edge by edge at less than 45 degrees.
+
+    As far as ``reach`` (mm).
+    """
+    edges = shared_edges(nodes, faces)
+    joined = edges.faces[edges.turn < SMOOTH]
+    away, _ = cKDTree(nodes[np.unique(faces[accessible])]).query(nodes[faces[:, :4]])
+    joined = joined[(away.min(axis=1) < reach)[joined].all(axis=1)]
+    graph = coo_matrix((np.ones(len(joined)), joined.T), shape=(len(faces), len(faces)))
+    _, part = connected_components(graph, directed=False)
+    # what goes on from an accessible face may do so by way of faces that are not
+    return np.flatnonzero(accessible | np.isin(part, part[accessible]))
 
 
 def room_for(surface: SphereSurface, f: int) -> Touching:

@@ -144,3 +144,11 @@ def test_the_surface_goes_on_round_a_blunt_edge_only(degrees, goes_on):
     accessible = bent[faces].mean(axis=1)[:, 0] < 0
     surface = sphere_surface(bent, faces, accessible, TIP.radius)
     assert len(surface.faces) == (4 if goes_on else 2)
+
+
+def test_the_surface_goes_on_as_far_as_a_radius_of_the_tip():
+    corners = [np.add(QUAD_CORNERS, [2.0 * i, 0.0]) / 2.0 for i in range(8)]  # 1 mm wide each
+    nodes, faces = np.unique(np.vstack(corners).round(9), axis=0, return_inverse=True)
+    nodes, faces = np.column_stack([nodes, np.zeros(len(nodes))]), faces.reshape(8, 4)
+    surface = sphere_surface(nodes, faces.astype(np.int32), np.arange(8) < 2, TIP.radius)
+    assert len(surface.faces) == 4

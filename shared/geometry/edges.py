@@ -1,0 +1,58 @@
+"""Edges of a boundary: which faces share one, and how sharply they meet there."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from palpate.shared.arrays import Array, Flags, Ints, Numbers
+from palpate.shared.geometry.elements import quadrilateral, shape
+
+BLUNT = np.radians(15.0)
+"""Angle of normals up to which faces are parts of one smooth surface."""
+
+ALONG = np.linspace(0.0, 1.0, 9)
+"""Where points of an edge lie, over its length."""
+
+
+class Edges(NamedTuple):
+    """Edges that two faces of a boundary share."""
+
+    faces: Ints  # (p, 2)
+    nodes: Numbers  # (p, 2 or 3), ends and then the middle, as one of the faces has them
+    turn: Array  # (p,) rad, largest angle of the normals
+
+
+def shared_edges(nodes: Array, faces: Numbers) -> Edges:
+    """Edges of faces (f, 4 or 8) whose nodes (n, 3) are given."""
+    reference = quadrilateral(faces.shape[1])
+    _, dN = shape(reference, reference[:4])
+    tangents = np.einsum("fai,qaj->fqij", nodes[faces], dN)
+    normals = np.cross(tangents[..., 0], tangents[..., 1])
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)  # (f, 4, 3) at the corners
+    corners = faces[:, :4]
+    parts = [corners, np.roll(corners, -1, axis=1), *([faces[:, 4:]] if faces.shape[1] > 4 else [])]
+    edges = np.stack(parts, axis=-1).reshape(-1, len(parts))
+    ends = np.stack([normals, np.roll(normals, -1, axis=1)], axis=2).reshape(-1, 2, 3)
+    ends[edges[:, 0] > edges[:, 1]] = ends[edges[:, 0] > edges[:, 1], ::-1]
+    _, number, count = np.unique(
+        np.sort(edges[:, :2], axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    order = np.argsort(number.ravel(), kind="stable")
+    pairs = order[count[number.ravel()[order]] == 2].reshape(-1, 2)
+    cosine = np.sum(ends[pairs[:, 0]] * ends[pairs[:, 1]], axis=-1).min(axis=1)
+    return Edges(pairs // 4, edges[pairs[:, 0]], np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def sharp_points(nodes: Array, faces: Numbers, clamped: Flags) -> tuple[Array, Array]:
+    """Points (k, 3) mm close together along sharp edges, and how sharp: 1 is a right angle, (k,).
+
+    Of edges that are free to move: nodes (n,) may be clamped.
+    """
+    edges = shared_edges(nodes, faces)
+    sharp = (edges.turn > BLUNT) & ~clamped[edges.nodes].any(axis=1)
+    ends, t = nodes[edges.nodes[sharp]], ALONG
+    N = np.array([1.0 - t, t])
+    if ends.shape[1] == 3:
+        N = np.array([(1.0 - t) * (1.0 - 2.0 * t), t * (2.0 * t - 1.0), 4.0 * t * (1.0 - t)])
+    sharpness = np.minimum(edges.turn[sharp] / (np.pi / 2), 1.0)
+    return np.einsum("ka,pki->pai", N, ends).reshape(-1, 3), np.repeat(sharpness, len(t))

@@ -1,0 +1,41 @@
+"""Edges of a boundary and how sharp they are."""
+
+import numpy as np
+import pytest
+
+from palpate.shared.geometry.edges import shared_edges, sharp_points
+
+
+def roof(degrees, nodes):
+    """Two square faces, 2 mm wide, that meet along y at an angle of their normals."""
+    turn = np.radians(degrees)
+    flat = [[-2, -1], [0, -1], [0, 1], [-2, 1], [2, -1], [2, 1]]
+    faces = [[0, 1, 2, 3], [1, 4, 5, 2]]
+    if nodes == 8:
+        flat += [[-1, -1], [0, 0], [-1, 1], [-2, 0], [1, -1], [2, 0], [1, 1]]
+        faces = [[*faces[0], 6, 7, 8, 9], [*faces[1], 10, 11, 12, 7]]
+    x, y = np.array(flat, float).T
+    down = np.where(x > 0.0, x, 0.0)
+    at = np.column_stack([np.where(x > 0.0, x * np.cos(turn), x), y, -down * np.sin(turn)])
+    return at, np.array(faces, np.int32)
+
+
+@pytest.mark.parametrize("nodes", [4, 8])
+@pytest.mark.parametrize("degrees", [0.0, 10.0, 40.0, 90.0])
+def test_an_edge_turns_by_the_angle_of_its_faces(degrees, nodes):
+    at, faces = roof(degrees, nodes)
+    edges = shared_edges(at, faces)
+    assert edges.faces.tolist() == [[0, 1]]
+    assert sorted(edges.nodes[0, :2]) == [1, 2]
+    np.testing.assert_allclose(edges.turn, np.radians(degrees), atol=1e-6)
+    points, sharpness = sharp_points(at, faces, np.zeros(len(at), bool))
+    assert len(points) == (0 if degrees < 15.0 else 9)
+    if len(points):
+        np.testing.assert_allclose(points[:, [0, 2]], 0.0, atol=1e-12)
+        np.testing.assert_allclose(np.sort(points[:, 1]), np.linspace(-1.0, 1.0, 9), atol=1e-12)
+        np.testing.assert_allclose(sharpness, degrees / 90.0)
+
+
+def test_a_clamped_edge_is_none():
+    at, faces = roof(90.0, 8)
+    assert len(sharp_points(at, faces, at[:, 1] < 0.0)[0]) == 0
