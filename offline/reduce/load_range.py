@@ -12,6 +12,10 @@ kind of answer that is converged, in range and wrong.  The reduced model is quic
 pressed everywhere, in all directions and a little beyond the range, and shows where its own path
 turns; the full model's does so close by.  The range is lowered to end before that.
 
+Where an endoscope is pushed inwards over the rim of the surface, or over a corner, it can fold a
+few elements of the full model that the modes of the reduced one do not tell apart.  There the full
+model's tangent at the reduced model's answer is not positive definite.
+
 Under the rigid tip a free edge can lie on either side of it, and slips off to the other as the tip
 slides on.  There one position has several answers, and which is the right one hangs on the way that
 the tip came: reduced and full model need not part from the same one at the same step.  The reduced
@@ -30,7 +34,7 @@ from scipy.spatial import cKDTree
 
 from palpate.offline.fem.mesh import local_thickness
 from palpate.offline.fem.model import FullModel, NoEquilibrium
-from palpate.offline.fem.potential import Projected
+from palpate.offline.fem.potential import Potential, Projected
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.terms import DeadLoad
 from palpate.offline.reduce.ritz import energy_pod, ritz_vectors
@@ -41,6 +45,7 @@ from palpate.offline.validate.queries import Place
 from palpate.shared.answer import Answer
 from palpate.shared.arrays import Array, Numbers
 from palpate.shared.errors import QueryError
+from palpate.shared.geometry.surface import Surface
 from palpate.shared.local_models import Estimators, LocalModels
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import TIP_DEPTH
@@ -53,6 +58,8 @@ NEAR = 0.1
 LEAST = 1e-3
 
 TOLERANCE = 1e-3
+"""Residual of solutions, relative to the load: a limit need not be known to a percent."""
+
 MAX_ITERATIONS = 20
 
 SURFACE = 0.9
@@ -81,6 +88,15 @@ has up to .6, a jump by 5 % of the displacement 1."""
 
 MARGIN = 1.1
 """Limit at which tissue gives way, in the full or the reduced model, over the one it gets."""
+
+FIRM = 0.6
+"""Pressure over the shear modulus below which no rim folds."""
+
+FIRM_SHARES = np.linspace(1.0, 0.5, 6)
+"""Of the limit that are tried, until the full model is stable."""
+
+ASIDE = np.pi / 4
+"""Largest angle of a tilt to the way inwards that is tried."""
 
 DEPTH_SHARES = np.linspace(1.0, 0.1, 7)
 """Of the depth limit that are tried, until one has the same answer by all ways."""
@@ -208,7 +224,9 @@ def load_range(problem: FullProblem, position: Array) -> Array:
 
     def full(pressure: float, start: Array | None) -> Array:
         # no load steps: where a jump fails, the pressure between is asked for
-        return model.solve(pressure * along, start=start, smallest_step=1.0).displacement
+        return model.solve(
+            pressure * along, start=start, smallest_step=1.0, tolerance=TOLERANCE
+        ).displacement
 
     limit, power, moved = pressure_that_moves(path.solve, wanted, pressure)
     if not _far(moved, wanted) or limit > SURFACE * problem.model.law.mu[0]:
@@ -239,6 +257,7 @@ class Search(NamedTuple):
     title: str
     field: int  # of the load range, which is lowered
     stage: Stage  # whose random numbers are drawn
+    points: Callable[[Surface, int, Rng], Iterable[Array]]  # of the surface, so many
     draw: Callable[..., tuple[Any, ...]]  # makes a place, its point first, of a point
     share: Callable[..., float]  # of the range that the model bears at a place
     first: int  # places for each local model
@@ -255,7 +274,7 @@ def bearable_shares(search: Search, model: ReducedModel, ask: Ask, rng: Rng) -> 
         shares = zip(places, ask(search.title, search.share, places), strict=True)
         return [(x, share) for (x, *_), share in shares if share < 1.0]
 
-    found = lacking(random_points_and_rim(surface, search.first * len(model.models.centres), rng))
+    found = lacking(search.points(surface, search.first * len(model.models.centres), rng))
     near = [rng.choice(vertices.query_ball_point(x, search.reach), search.closer) for x, _ in found]
     if near:
         found += lacking(surface.vertices[np.concatenate(near)])
@@ -299,6 +318,26 @@ def limit_load_share(model: ReducedModel, x: Array, direction: Array, limit: flo
     exponents = np.diff(np.log(moved)) / np.diff(np.log(SHARES))
     sudden = np.flatnonzero(np.diff(exponents) > SUDDEN)
     return float(SHARES[sudden[0] + 1]) / MARGIN if len(sudden) else 1.0
+
+
+def firm_share(model: ReducedModel, x: Array, direction: Array, limit: float) -> float:
+    """Share of a pressure (kPa) up to which the full model is stable, with ``MARGIN``; at most 1.
+
+    At the reduced model's answers.
+    """
+    if limit < FIRM * model.body.law.mu[0]:
+        return 1.0
+    full = _full(model)
+    for share in FIRM_SHARES:
+        u = model.fields.of_mesh(model.press(x, share * limit, direction)).astype(float)
+        if Potential(full, []).factorise(u.reshape(-1)[full.free], 0.0):
+            return 1.0 if share == 1.0 else float(share) / MARGIN
+    return float(FIRM_SHARES[-1]) / MARGIN
+
+
+@lru_cache(maxsize=1)
+def _full(model: ReducedModel) -> FullModel:
+    return FullModel(model.body, model.scene.tissue)
 
 
 def path_independent_share(model: ReducedModel, x: Array, turn: float = 0.0) -> float:
@@ -368,18 +407,43 @@ def _largest_load(
     return place.position, direction, place.limit(direction)
 
 
+def _rim_points(surface: Surface, count: int, rng: Rng) -> Array:
+    """So many vertices of the rim, or all of it."""
+    rim = rng.permutation(surface.rim())
+    return surface.vertices[rim[:count]]
+
+
+def _pushed_inwards(
+    model: ReducedModel, _: int, point: Array, rng: Rng
+) -> tuple[Array, Array, float]:
+    """Contact, direction and largest pressure of a load tilted towards the surface around."""
+    place, endoscope = Place.at(model, point), model.scene.endoscope
+    around = np.linalg.norm(model.surface.vertices - point, axis=1) < endoscope.radius
+    one, two = tangents(place.normal)
+    inwards = model.surface.vertices[around].mean(axis=0) - point
+    turn = np.arctan2(inwards @ two, inwards @ one) + rng.uniform(-ASIDE, ASIDE)
+    tilt = np.radians(endoscope.max_tilt)
+    aside = np.cos(turn) * one + np.sin(turn) * two
+    direction = np.sin(tilt) * aside - np.cos(tilt) * place.normal
+    return place.position, direction, place.limit(direction)
+
+
 def _contact(model: ReducedModel, _: int, point: Array, rng: Rng) -> tuple[Array, float]:
     """Contact of the tip, and the angle of the ways there."""
     return model.surface.project(point)[0], rng.uniform(0.0, 2.0 * np.pi)
 
 
 GIVING_WAY = Search(
-    "giving way", 0, Stage.GIVING_WAY, _largest_load, limit_load_share,
+    "giving way", 0, Stage.GIVING_WAY, random_points_and_rim, _largest_load, limit_load_share,
     first=16, closer=24, reach=2.0,
 )  # fmt: skip
+FOLDING = Search(
+    "folding of the rim", 0, Stage.FOLDING, _rim_points, _pushed_inwards, firm_share,
+    first=1, closer=4, reach=2.0,
+)  # fmt: skip
 SLIPPING_OFF = Search(
-    "slipping off", TIP_DEPTH, Stage.SLIPPING_OFF, _contact, path_independent_share,
-    first=6, closer=8, reach=1.0,
+    "slipping off", TIP_DEPTH, Stage.SLIPPING_OFF, random_points_and_rim, _contact,
+    path_independent_share, first=6, closer=8, reach=1.0,
 )  # fmt: skip
 
-SEARCHES = GIVING_WAY, SLIPPING_OFF
+SEARCHES = GIVING_WAY, FOLDING, SLIPPING_OFF

@@ -25,6 +25,7 @@ class Stage(IntEnum):
     TRIAL_LOADS = 13
     BODY_MODES = 14
     MESH_PART = 15
+    FOLDING = 16
     UNSEEN = 100
     SNAPSHOTS = 101
     HARD_CASES = 102

@@ -12,11 +12,14 @@ from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.load_range import (
     FAR,
+    FIRM,
+    FOLDING,
     GIVING_WAY,
     MARGIN,
     SLIPPING_OFF,
     LoadPath,
     bearable_shares,
+    firm_share,
     limit_load_share,
     load_range,
     moving_part,
@@ -182,6 +185,49 @@ def test_tissue_that_only_softens_and_slips_off_nowhere_keeps_its_range(rng):
 def test_a_trained_slab_hardly_gives_way_in_its_range_and_nothing_slips_off(atlas, rng):
     assert (borne(GIVING_WAY, atlas, rng) >= 0.7).all()
     assert (borne(SLIPPING_OFF, atlas, rng) == 1.0).all()
+
+
+class Squeezed:
+    """A reduced model whose answer to a pressure squeezes the middle of a surface along x.
+
+    By a percent for a kilopascal.  From some 30 percent on a free surface folds.
+    """
+
+    def __init__(self, problem):
+        self.body, self.scene, self.fields = problem.body, problem.scene, self
+
+    def press(self, position, pressure, direction):
+        return 0.01 * pressure
+
+    def of_mesh(self, share):
+        x, _, z = self.body.nodes.T
+        away, height = (x - x.mean()) / 6.0, z / z.max()
+        along = -6.0 * share * np.tanh(away) * height
+        up = share * z * height / (2.0 * np.cosh(away) ** 2)  # volumes are kept
+        return np.column_stack([along, 0.0 * x, up])
+
+
+@pytest.mark.parametrize(("squeezed", "least", "most"), [(20, 1.0, 1.0), (50, 0.5, 0.6)])
+def test_the_range_ends_before_the_full_model_folds(squeezed, least, most):
+    problem = FullProblem(parse_scene(STRIP.format(past="")))
+    model, down = Squeezed(problem), np.array([0.0, 0.0, -1.0])
+    assert least <= firm_share(model, np.zeros(3), down, squeezed) <= most
+    soft = 0.99 * FIRM * problem.model.law.mu[0]
+    assert firm_share(SimpleNamespace(body=model.body), np.zeros(3), down, soft) == 1.0
+
+
+def test_the_rim_is_pushed_inwards(rng):
+    plate, middle = Plate(np.inf), np.array([5.0, 5.0, 0.0])
+    points = list(FOLDING.points(plate.surface, 30, rng))
+    assert len(points) == 30
+    for point in points:
+        assert np.abs(point - middle).max() == 5.0
+        x, direction, limit = FOLDING.draw(plate, 0, point, rng)
+        np.testing.assert_array_equal(x, point)
+        assert direction[2] == pytest.approx(-np.cos(np.radians(30.0)))
+        assert np.linalg.norm(direction) == pytest.approx(1.0)
+        assert direction @ (middle - point) > 0.0
+        assert 0.0 < limit <= LIMIT
 
 
 class Side:
