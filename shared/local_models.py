@@ -16,10 +16,12 @@ from scipy.spatial import cKDTree
 
 from palpate.shared.arrays import Array, Field, Flags, Ints, Numbers
 from palpate.shared.artifact import values_of
+from palpate.shared.geometry.edges import sharp_points
 from palpate.shared.geometry.quadrature import surface_quadrature, volume_quadrature
+from palpate.shared.geometry.surface import Surface
 from palpate.shared.mechanics.footprint import SurfaceQuadrature
 from palpate.shared.mechanics.laws import law_of
-from palpate.shared.mechanics.tip import Tip, tip_of
+from palpate.shared.mechanics.tip import CURVED_WITHIN, Tip, tip_of
 from palpate.shared.mechanics.tissue import Law
 from palpate.shared.reduced.outcome import HISTORY_FEATURES, PRESS_FEATURES, TOUCH_FEATURES
 from palpate.shared.scene import Scene
@@ -27,6 +29,9 @@ from palpate.shared.scene import Scene
 CLAMPED_LAYER = 1.5
 """Millimetres from the support within which stress is not compared: at its edges it has no limit,
 and grows with every refinement of the mesh."""
+
+NO_EDGE = 1e6
+"""Millimetres from a sharp edge of a body that has none."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +72,17 @@ class Body(Mesh):
         """
         distance, _ = cKDTree(self.nodes[self.clamped]).query(points)
         return np.asarray(distance > min(CLAMPED_LAYER, 0.5 * distance.max()))
+
+    def contact_fields(self, surface: Surface) -> Array:
+        """What the law of a tip needs to know of the body at vertices, (v, CONTACT_FIELDS)."""
+        bent = surface.curvature(CURVED_WITHIN * self.tip.radius)
+        points, sharpness = sharp_points(self.nodes, self.faces, self.clamped)
+        away = np.full(len(bent), NO_EDGE)
+        for share in np.unique(sharpness.round(1)):
+            tree = cKDTree(points[sharpness.round(1) == share])
+            image = self.tip.image_distance(tree.query(surface.vertices)[0], share)
+            away = np.minimum(away, image)
+        return np.column_stack([bent, away])
 
     @cached_property
     def boundary(self) -> SurfaceQuadrature:

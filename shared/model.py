@@ -20,7 +20,7 @@ from palpate.shared.geometry.surface import Surface, SurfaceIndex, boundary_tria
 from palpate.shared.local_models import Body, Estimators, LocalModels
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH
-from palpate.shared.mechanics.tip import CURVED_WITHIN, dented, held
+from palpate.shared.mechanics.tip import dented, held
 from palpate.shared.near_field import Contact
 from palpate.shared.query import check_place, checked_load, out_of_range, vector
 from palpate.shared.reduced import press, touch
@@ -91,9 +91,9 @@ class ReducedModel:
         self.surface_nodes, self.surface_triangles = boundary_triangles(body.faces)
         self.fields = FieldRecovery(body, models, lambda: self.transfer)
         self._own = self.new_warm()
-        bent = surface.curvature(CURVED_WITHIN * body.tip.radius)
+        contact = body.contact_fields(surface)
         rim = surface.rim_distance()[:, None] / body.tip.radius
-        self._index: SurfaceIndex = surface.ground(np.hstack([self.limits, bent, rim]))
+        self._index: SurfaceIndex = surface.ground(np.hstack([self.limits, contact, rim]))
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

@@ -20,7 +20,7 @@ from palpate.shared.geometry.surface import Surface
 from palpate.shared.local_models import Body, Mesh
 from palpate.shared.mechanics.footprint import MEANS, footprint, means
 from palpate.shared.mechanics.tip import (
-    CURVED_WITHIN,
+    EDGE_FIELD,
     LONGEST,
     bend,
     dented,
@@ -141,8 +141,8 @@ class FullProblem:
         return load.pressure * nodal[:, None] * load.direction
 
     @cached_property
-    def _curvature(self) -> Array:
-        return self.surface.curvature(CURVED_WITHIN * self.body.tip.radius)
+    def _contact_fields(self) -> Array:
+        return self.body.contact_fields(self.surface)
 
     def tip_at(
         self, place: Array, centre: Array, normal: Array, *time: float
@@ -151,10 +151,11 @@ class FullProblem:
 
         It pushes along ``normal`` (3,); ``time`` is ``loss`` and ``held``, see ``tip.held``.
         """
-        x, out, _, curvature = self.surface.locate(place, self._curvature)
+        x, out, _, at = self.surface.locate(place, self._contact_fields)
         tip, tangents, bent = self.body.tip, np.empty((2, 3)), np.empty((2, 2))
         tangents_of(out, tangents)
-        law = *tip.local_law(bend(curvature, tangents, tip.radius, bent)), *(time or (0.0, 0.0))
+        sharpness = bend(at, tangents, tip.radius, bent)
+        law = *tip.local_law(sharpness, at[EDGE_FIELD]), *(time or (0.0, 0.0))
         nodal = np.empty((MEANS, len(self.mesh.nodes)))
         means(self.body.boundary, x, out, tangents, bent, tip.radius, nodal)
         return TipLoad(tip, nodal, tangents, bent, centre - x, normal, law), x
@@ -297,11 +298,11 @@ class FullProblem:
         """What presses in a step; of the tip, by the force in what was found."""
         radius = self.scene.endoscope.radius
         if isinstance(step, Load):
-            x, normal, _, curvature = self.surface.locate(step.position, self._curvature)
+            x, normal, _, curvature = self.surface.locate(step.position, self._contact_fields)
             return Contact(x, normal, curvature, step.pressure * step.direction, radius)
         if found is None or found.foot is None:
             return None
-        x, normal, _, curvature = self.surface.locate(found.foot, self._curvature)
+        x, normal, _, curvature = self.surface.locate(found.foot, self._contact_fields)
         pressure = found.force / -self.unit_load_at(x, normal).sum()
         return Contact(x, normal, curvature, pressure, radius, tip=True)
 

@@ -19,7 +19,7 @@ from palpate.shared.geometry.surface import Surface, SurfaceIndex
 from palpate.shared.local_models import LocalModels, ViscousModels
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import pressure_limit
-from palpate.shared.mechanics.tip import CURVATURE_FIELDS
+from palpate.shared.mechanics.tip import EDGE_FIELD
 from palpate.shared.reduced.features import (
     CHANGES,
     CHANGING,
@@ -83,7 +83,8 @@ NO_LIMIT = 1e9
 
 def endless(surface: Surface) -> SurfaceIndex:
     """The surface without end of its load range and without a rim; see ``outcome.Solver``."""
-    fields = [NO_LIMIT, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, NO_LIMIT, *[0.0] * CURVATURE_FIELDS, NO_LIMIT]
+    limits, curvature = [NO_LIMIT, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, NO_LIMIT], [0.0] * EDGE_FIELD
+    fields = [*limits, *curvature, NO_LIMIT, NO_LIMIT]
     return surface.ground(np.tile(fields, (len(surface.vertices), 1)))
 
 

@@ -16,7 +16,13 @@ what the footprint leaves of Hertz's approach of a sphere on a half-space:
 
 where ``1 / R_e^2 = det(1 / R + curvature)`` of the surface (Johnson, Contact Mechanics, 1985,
 ch. 4) and the last term is what a half-space moves by under the footprint itself.  On a half-space
-this is Hertz's law; layers, edges and finite strains are in ``u(X)``.
+this is Hertz's law; layers and finite strains are in ``u(X)``.
+
+At an edge with a right angle half of the contact is missing.  That half is made up for by a mirror
+image, which takes the shear stress off the side of the body, and the more so by a factor ``psi``,
+which takes off the normal stress (Guilbault, J. Tribol. 133 (2011) 031402).  So at an edge ``d`` is
+``(1 + psi) / 2`` times that of twice the force; further away, at a distance ``s``, the image fades
+with ``exp(-s / (EDGE R))``.  Blunter edges have a share of it.
 
 Tissue that remembers relaxes: the law's force is its elastic one less what the past takes off it,
 ``F = (1 - loss) F_e(d) - held`` (Lee & Radok, J. Appl. Mech. 27 (1960) 438-444).
@@ -56,14 +62,26 @@ round as the tip, contact is not local."""
 CURVED_WITHIN = 0.5
 """Distance, in radii of the tip, over which the surface's curvature is taken."""
 
-CURVATURE_FIELDS = 6
-"""Values that describe the curvature at a surface point: see ``geometry.surface``."""
+EDGE = 0.175
+"""Distance from a sharp edge, in radii of the tip, over which the image of a contact fades."""
+
+EXCESS = 0.5
+"""Share of ``psi - 1`` that spheres integrated at edges show, at Poisson's ratios of 0.3 and 0.45.
+"""
+
+EDGE_FIELD = 6
+CONTACT_FIELDS = EDGE_FIELD + 1
+"""Values that describe the body at a surface point: its curvature, see ``geometry.surface``, and
+the distance (mm) from a sharp edge."""
 
 LONGEST = 0.3
 """Longest step from place to place, in radii of the tip."""
 
 BARRED = 0.1
 """Share of a step that is lost where the surface ends, and not for its curvature."""
+
+ROUND_OFF = 1e-12
+"""Millimetres of a step that are none."""
 
 LEAST_KEPT = 0.1
 """Share of a force that a step to the next place must leave for its prediction to be believed."""
@@ -79,11 +97,21 @@ class Tip(NamedTuple):
     radius: float  # mm
     modulus: float  # kPa, E*
     lost: float  # share of it that is lost with a share of the shear modulus, over the latter
+    image: float  # ``psi``
 
-    def local_law(self, sharpness):
-        """Coefficients ``beta, relief`` of the law where the contact's curvature is ``1 / R_e``."""
-        beta = (0.75 / self.modulus) ** (2.0 / 3.0) * sharpness ** (1.0 / 3.0)
-        return beta, RELIEF / (self.modulus * self.radius)
+    def local_law(self, sharpness, edge):
+        """Coefficients ``beta, relief`` of the law where the contact's curvature is ``1 / R_e``.
+
+        It is ``edge`` mm away from an edge with a right angle.
+        """
+        fade = math.exp(-edge / (EDGE * self.radius))
+        images, softer = 1.0 + fade, 1.0 + 0.5 * (self.image - 1.0) * fade
+        beta = (0.75 * images / self.modulus) ** (2.0 / 3.0) * sharpness ** (1.0 / 3.0)
+        return softer * beta, softer * images * RELIEF / (self.modulus * self.radius)
+
+    def image_distance(self, away, share):
+        """Distance from a right angle that does as much as one ``away`` mm with a share of it."""
+        return away - EDGE * self.radius * math.log(share)
 
 
 def tip_of(radius: float, tissue: AnyTissue) -> Tip:
@@ -91,7 +119,9 @@ def tip_of(radius: float, tissue: AnyTissue) -> Tip:
     share = sum(g for g, _ in tissue.prony)
     mu, lam = lame(tissue.young, tissue.poisson)
     whole, left = (plane_modulus(m, lam + 2.0 * mu / 3.0) for m in (mu, (1.0 - share) * mu))
-    return Tip(radius, whole, (1.0 - left / whole) / share if share else 1.0)
+    lost = (1.0 - left / whole) / share if share else 1.0
+    psi = 1.29 - (0.08 - 0.5 * tissue.poisson) / (1.0 - tissue.poisson)
+    return Tip(radius, whole, lost, 1.0 + EXCESS * (psi - 1.0))
 
 
 def plane_modulus(shear: float, bulk: float) -> float:
@@ -284,13 +314,14 @@ def next_place(g, H, wall, moved):
     """Write Newton's step (2,) mm of the place along the two tangents; return its length.
 
     ``wall`` (2,) points out of the surface where the place lies on its rim, and is zero elsewhere:
-    a step that it bars goes along the rim.  It is zeroed where it does not bar.
+    where the energy, largest at the place sought, grows that way a step goes along the rim.  It is
+    zeroed where it does not bar.
     """
     a, b, c = H[0, 0], 0.5 * (H[0, 1] + H[1, 0]), H[1, 1]
     det = a * c - b * b
     moved[0] = -(c * g[0] - b * g[1]) / det
     moved[1] = -(a * g[1] - b * g[0]) / det
-    if moved[0] * wall[0] + moved[1] * wall[1] > 0.0:
+    if g[0] * wall[0] + g[1] * wall[1] > 0.0:
         x, y = -wall[1], wall[0]
         along = -(g[0] * x + g[1] * y) / (a * x * x + 2.0 * b * x * y + c * y * y)
         moved[0], moved[1] = along * x, along * y
@@ -304,7 +335,7 @@ def meet_wall(wanted, moved, wall):
     """Write the ``wall`` (2,) that has kept a place from going as far as wanted, if one has."""
     x, y = wanted[0] - moved[0], wanted[1] - moved[1]
     lost = math.sqrt(x * x + y * y)
-    if lost > BARRED * math.sqrt(wanted[0] ** 2 + wanted[1] ** 2):
+    if lost > BARRED * math.sqrt(wanted[0] ** 2 + wanted[1] ** 2) + ROUND_OFF:
         wall[0], wall[1] = x / lost, y / lost
 
 

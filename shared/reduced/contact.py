@@ -11,7 +11,7 @@ from numba import njit
 from palpate.shared.compiled import bind_compiled
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, means
-from palpate.shared.mechanics.tip import bend, settle, squeeze, tangents_of
+from palpate.shared.mechanics.tip import EDGE_FIELD, bend, settle, squeeze, tangents_of
 from palpate.shared.reduced.blend import MAX_ACTIVE
 from palpate.shared.reduced.corrections import Secants, TouchedSecants, forget_secants
 from palpate.shared.reduced.points import superpose
@@ -50,7 +50,9 @@ def press_at_place(solver, x, sure):
     tip.H[:] = 0.0
     tangents_of(outcome.upward, tip.tangents)
     sharpness = bend(outcome.limits[LIMIT_FIELDS:], tip.tangents, radius, tip.bent)
-    contact.law[0], contact.law[1] = solver.tip.local_law(sharpness)
+    contact.law[0], contact.law[1] = solver.tip.local_law(
+        sharpness, outcome.limits[LIMIT_FIELDS + EDGE_FIELD]
+    )
     contact.law[4] = radius
     for i in range(3):
         contact.away[i] = x[i] - outcome.foot[i]

@@ -6,11 +6,11 @@ import numpy as np
 from numba import njit
 
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS
-from palpate.shared.mechanics.tip import CURVATURE_FIELDS
+from palpate.shared.mechanics.tip import CONTACT_FIELDS
 
-RIM = LIMIT_FIELDS + CURVATURE_FIELDS
-"""Which of the values at a place, after load range and curvature, is its distance from the rim of
-the surface, in radii of the endoscope."""
+RIM = LIMIT_FIELDS + CONTACT_FIELDS
+"""Which of the values at a place, after load range and what a contact needs, is its distance from
+the rim of the surface, in radii of the endoscope."""
 
 CHANGING = 12
 """Directions in which the first tangent of a load's search is another than at rest."""

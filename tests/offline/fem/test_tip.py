@@ -7,6 +7,7 @@ from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.problem import FullProblem, Load, TipPosition
 from palpate.offline.scenes import find_scene
 from palpate.offline.studies.layer import ball_on_a_layer
+from palpate.offline.validate.mesh_part import TIP_GRADING, compared
 from palpate.shared.scene import parse_scene
 
 SLAB = """
@@ -41,6 +42,21 @@ def test_a_ball_on_a_layer_is_that_of_hertz_whatever_the_mesh():
     np.testing.assert_allclose(forces, theory, rtol=0.012)
     slope = np.polyfit(np.log(depths), np.log(np.divide(forces, theory)), 1)[0]
     assert abs(slope) < 0.01
+
+
+@pytest.mark.parametrize("poisson", [0.3, 0.45])
+def test_at_an_edge_the_force_is_that_of_a_sphere_integrated_on_a_fine_mesh(poisson):
+    """Without its image the contact is too stiff by a fifth."""
+    scene = parse_scene(SLAB.replace("tissue.poisson = 0.45", f"tissue.poisson = {poisson}"))
+    problem, radius = FullProblem(scene), scene.endoscope.radius
+    for aside in (0.0, 0.1):
+        levels = [
+            (depth, TipPosition(np.array([16.0, aside * radius, 12.0 + radius - depth])))
+            for depth in (0.15, 0.6)
+        ]
+        for *_, found, exact in compared(problem, scene, levels, TIP_GRADING):
+            off = np.linalg.norm(found.felt) / np.linalg.norm(exact.felt) - 1.0
+            assert abs(off) < 0.07
 
 
 @pytest.mark.parametrize(

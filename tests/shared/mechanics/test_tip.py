@@ -13,7 +13,7 @@ from .material_point import TISSUES
 
 TISSUE = TISSUES["neo-hookean"]
 TIP = tip.tip_of(2.0, TISSUE)
-LAW = TIP.local_law(1.0 / TIP.radius)
+LAW = TIP.local_law(1.0 / TIP.radius, np.inf)
 DEPTHS = (1e-6, 1e-3, 0.05, 0.3, 0.8, 1.6)
 
 
@@ -48,6 +48,19 @@ def test_with_a_footprint_on_a_half_space_it_is_hertzs_law():
         force = 4 / 3 * TIP.modulus * np.sqrt(TIP.radius) * depth**1.5
         under = tip.RELIEF * force / (TIP.modulus * TIP.radius)
         assert tip.squeeze(beta, relief, depth - under)[0] == pytest.approx(force, rel=1e-9)
+
+
+def test_an_edge_dents_as_twice_the_force_does_and_more_and_further_away_it_is_not_felt():
+    psi = 1.29 - (0.08 - 0.5 * TISSUE.poisson) / (1.0 - TISSUE.poisson)
+    softer = 1.0 + tip.EXCESS * (psi - 1.0) / 2.0
+    at_edge, away = (TIP.local_law(1.0 / TIP.radius, edge) for edge in (0.0, 4.0 * TIP.radius))
+    for force in (0.01, 1.0):
+        assert tip.approach(*at_edge, force) == pytest.approx(
+            softer * tip.approach(*LAW, 2 * force)
+        )
+        assert tip.approach(*away, force) == pytest.approx(tip.approach(*LAW, force), rel=1e-8)
+    blunt = TIP.local_law(1.0 / TIP.radius, TIP.image_distance(0.0, 0.3))
+    assert LAW[0] < blunt[0] < at_edge[0]
 
 
 def test_the_relief_is_the_mean_displacement_of_a_half_space_under_its_footprint():
@@ -182,3 +195,17 @@ def test_a_step_leads_to_the_place(rng):
         tip.next_place(g, H, np.zeros(2), moved)
         errors.append(np.linalg.norm(X + moved - exact))
     assert errors[1] < 0.3 * errors[0] < 0.3 * 0.001
+
+
+@pytest.mark.parametrize("bend", [-2.0, 0.5])
+def test_a_wall_bars_where_the_energy_grows_beyond_it(bend):
+    g, H, moved = np.array([0.4, 0.2]), np.diag([bend, -1.0]), np.empty(2)
+    tip.next_place(g, H, np.zeros(2), moved)
+    np.testing.assert_allclose(moved, [-0.4 / bend, 0.2])
+    wall = np.array([1.0, 0.0])
+    tip.next_place(g, H, wall, moved)
+    np.testing.assert_allclose(moved, [0.0, 0.2])
+    assert wall.any()
+    tip.next_place(-g, H, wall, moved)
+    np.testing.assert_allclose(moved, [0.4 / bend, -0.2])
+    assert not wall.any()

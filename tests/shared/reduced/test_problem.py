@@ -177,7 +177,7 @@ class Touched(Pressed):
         self.contact.mean[:] = np.einsum("n,nir->ir", self.mean, self.nodal.reshape(-1, 3, modes))
         self.contact.normal[:] = NORMAL
         self.contact.along[:] = NORMAL @ self.contact.mean
-        self.contact.law[:2] = self.tip.local_law(1.0 / RADIUS)
+        self.contact.law[:2] = self.tip.local_law(1.0 / RADIUS, np.inf)
         self.steady, answer = np.zeros((2, modes))
         self.load = bind(Pushed(self.contact, np.zeros(modes), self.steady, self.external))
         secants = Secants(self.inverse, self.origin, self.external, np.zeros(modes))
@@ -193,7 +193,10 @@ class Touched(Pressed):
     def full_load(self, share):
         nodal = np.zeros((MEANS, len(self.mean)))
         nodal[0] = self.mean
-        law, away = (*self.tip.local_law(1.0 / RADIUS), 0.0, 0.0), (RADIUS - share * DEPTH) * NORMAL
+        law, away = (
+            (*self.tip.local_law(1.0 / RADIUS, np.inf), 0.0, 0.0),
+            (RADIUS - share * DEPTH) * NORMAL,
+        )
         return TipLoad(self.tip, nodal, np.eye(3)[:2], np.zeros((2, 2)), away, NORMAL, law)
 
 
