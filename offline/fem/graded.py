@@ -11,7 +11,7 @@ import numpy as np
 from palpate.offline.fem.mesh import Ticks, build_mesh, cells_of, divided, node_places
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.shapes import shape_of
-from palpate.shared.arrays import Array, Numbers
+from palpate.shared.arrays import Array, Ints, Numbers
 from palpate.shared.geometry.elements import hexahedron, shape
 from palpate.shared.scene import Extrusion, Scene
 
@@ -59,14 +59,23 @@ class Graded:
 
 def interpolated(grid: Ticks, elements: Numbers, parameters: Array, field: Array) -> Array:
     """A nodal field (n, ...) of a mesh of elements at parameters (k, 3) of points of the body."""
-    cells, local = [], []
-    for ticks, t in zip(grid, parameters.T, strict=True):
-        cell = np.clip(np.searchsorted(ticks, t, side="right") - 1, 0, len(ticks) - 2)
-        cells.append(cell)
-        local.append(2.0 * (t - ticks[cell]) / (ticks[cell + 1] - ticks[cell]) - 1.0)
-    nodes = elements[np.ravel_multi_index(cells, cells_of(grid))]
-    N, _ = shape(hexahedron(elements.shape[1]), np.column_stack(local))
+    first, second, third = grid
+    t, u, v = parameters.T
+    i, along = _cell(np.broadcast_to(first, (len(t), len(first))), t)
+    j, across = _cell(np.broadcast_to(second, (len(t), len(second))), u)
+    rows = np.broadcast_to(third, (len(first), third.shape[-1]))
+    share = (along[:, None] + 1.0) / 2.0
+    k, through = _cell((1.0 - share) * rows[i] + share * rows[i + 1], v)
+    nodes = elements[np.ravel_multi_index((i, j, k), cells_of(grid))]
+    N, _ = shape(hexahedron(elements.shape[1]), np.column_stack([along, across, through]))
     return np.einsum("ka,ka...->k...", N, field[nodes])
+
+
+def _cell(ticks: Array, at: Array) -> tuple[Ints, Array]:
+    """Between which of its ticks (k, n) each of values (k,) lies, and where: -1 to 1."""
+    cell = np.clip(np.sum(ticks <= at[:, None], axis=1) - 1, 0, ticks.shape[1] - 2)
+    low, high = (np.take_along_axis(ticks, cell[:, None] + n, axis=1)[:, 0] for n in (0, 1))
+    return cell, 2.0 * (at - low) / (high - low) - 1.0
 
 
 def parameters_of(scene: Scene, ticks: Ticks) -> Array:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from palpate.offline.fem.graded import Graded, Grading, parameters_of
-from palpate.offline.fem.mesh import ticks_of
+from palpate.offline.fem.graded import Graded, Grading, interpolated, parameters_of
+from palpate.offline.fem.mesh import build_mesh, ticks_of
 from palpate.offline.fem.problem import FullProblem, Load, TipPosition
 from palpate.offline.fem.shapes import shape_of
 from palpate.offline.scenes import find_scene
@@ -43,6 +43,16 @@ def test_a_field_of_a_graded_mesh_is_found_at_the_nodes_of_another(name, place):
     # faces of 4 mm cut the round edges of a curved body
     assert away.max() < (1e-9 if name == "quick" else 0.1)
     assert np.median(away) < 5e-3
+
+
+def test_a_field_of_a_mesh_with_a_refined_lip_is_found_at_the_nodes_of_a_graded_one():
+    scene = find_scene("turbinate")
+    ticks = ticks_of(scene.geometry)
+    assert ticks[2].ndim == 2
+    at = parameters_of(scene, ticks)
+    wanted = parameters_of(scene, Graded(scene, np.array([10.1, 22.0, 8.0]), COARSE).ticks)
+    found = interpolated(ticks, build_mesh(scene).elements, wanted, at)
+    np.testing.assert_allclose(found, wanted, atol=1e-12)
 
 
 def test_elements_are_small_at_the_contact_and_grow_away_from_it():
