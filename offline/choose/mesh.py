@@ -42,7 +42,7 @@ PROBE = 8
 """Steps along each axis in which a body is measured."""
 
 
-class Pressed(NamedTuple):
+class Response(NamedTuple):
     """What a mesh says of a small load at a place."""
 
     displacement: Array  # (n, 3) mm
@@ -56,7 +56,7 @@ class Reference(NamedTuple):
     place: Array  # (3,) mm
     ticks: Ticks
     elements: Numbers
-    pressed: Pressed
+    response: Response
 
 
 def with_mesh(scene: Scene) -> tuple[Scene, dict[str, Any] | None]:
@@ -136,18 +136,18 @@ def _references(scene: Scene, problem: FullProblem) -> list[Reference]:
 def _errors(problem: FullProblem, references: list[Reference]) -> Errors:
     """95th percentiles of a mesh's errors; without a tip none of force."""
     at = parameters_of(problem.scene, ticks_of(problem.scene.geometry))
-    kept, found = problem.nodal_volumes * problem.beyond_clamped_layer, []
+    found = []
     for place, ticks, elements, exact in references:
         own = _pressed(problem, place)
         u, stress = (interpolated(ticks, elements, at, field) for field in exact[:2])
         force = abs(own.depth / exact.depth - 1) if problem.scene.endoscope.tip else 0.0
         moved = relative(own.displacement, u, problem.nodal_volumes)
-        off = moved, relative(own.von_mises, stress, kept), force
+        off = moved, relative(own.von_mises, stress, problem.counted_volumes), force
         found.append(off)
     return Errors(*np.percentile(found, 95, axis=0).tolist())
 
 
-def _pressed(problem: FullProblem, place: Array) -> Pressed:
+def _pressed(problem: FullProblem, place: Array) -> Response:
     """Press a small footprint along the normal; linear elasticity."""
     x, normal, _ = problem.surface.project(place)
     load = Load(x, -normal, SLIGHT * problem.scene.tissue.young)
@@ -157,4 +157,4 @@ def _pressed(problem: FullProblem, place: Array) -> Pressed:
     displacement = u.reshape(-1, 3)
     stress = problem.von_mises(displacement, contact=problem.footprint(load))
     depth = float(np.linalg.norm(problem.under(x, displacement)))
-    return Pressed(displacement, stress, depth)
+    return Response(displacement, stress, depth)

@@ -113,6 +113,11 @@ class FullProblem:
         shares = np.repeat(self.model.weights.sum(axis=1) / elements.shape[1], elements.shape[1])
         return np.bincount(elements.ravel(), shares, len(self.mesh.nodes)).astype(float)
 
+    @cached_property
+    def counted_volumes(self) -> Array:
+        """The same where stress is compared, 0 in the clamped layer."""
+        return self.nodal_volumes * self.beyond_clamped_layer
+
     def points_in_body(self, points: Numbers) -> Numbers:
         """Numbers in the whole body of quadrature points."""
         per_element = self.model.weights.shape[1]

@@ -38,7 +38,7 @@ from palpate.offline.fem.potential import Potential, Projected
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.terms import DeadLoad
 from palpate.offline.reduce.ritz import energy_pod, ritz_vectors
-from palpate.offline.reduce.sampling import cone, random_points_and_rim, tangents
+from palpate.offline.reduce.sampling import cone, farthest, random_points_and_rim, tangents
 from palpate.offline.reduce.window import WHOLE, part_of
 from palpate.offline.run.streams import Stage
 from palpate.offline.validate.queries import Place
@@ -408,9 +408,9 @@ def _largest_load(
 
 
 def _rim_points(surface: Surface, count: int, rng: Rng) -> Array:
-    """So many vertices of the rim, or all of it."""
-    rim = rng.permutation(surface.rim())
-    return surface.vertices[rim[:count]]
+    """So many vertices of the rim, or every other one, corners first."""
+    rim = surface.vertices[rng.permutation(surface.rim())]
+    return rim[farthest(rim, min(count, -(-len(rim) // 2)))]
 
 
 def _pushed_inwards(

@@ -57,8 +57,8 @@ class Fields(NamedTuple):
         """
         u, volumes = self.displacements[-1].astype(float), problem.nodal_volumes
         stress = problem.von_mises(u, contact=problem.footprint(load))
-        kept = volumes * problem.beyond_clamped_layer
-        return relative(u, exact[0], volumes), relative(stress, exact[1], kept)
+        moved = relative(u, exact[0], volumes)
+        return moved, relative(stress, exact[1], problem.counted_volumes)
 
 
 def opened(artifact: Path, scene: Scene | None) -> tuple[ReducedModel, FullProblem]:

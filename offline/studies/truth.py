@@ -75,7 +75,7 @@ def at_place(problem: FullProblem, artifact: Path, folder: Path | None, x: Array
     scene = parse_scene(problem.scene.text, folder)
     away = np.linalg.norm(problem.mesh.nodes - x, axis=1)
     volumes, rows = problem.nodal_volumes, []
-    kept = volumes * problem.beyond_clamped_layer
+    kept = problem.counted_volumes
     near = kept * (away < NEAR * atlas.body.tip.radius)
     for kind, levels in _levels(atlas, x):
         for level, step, own, exact in compared(problem, scene, levels, GRADINGS[kind]):

@@ -148,12 +148,12 @@ def mesh_errors(problem: FullProblem, levels: Levels) -> list[Array]:
     """
     surface, away = problem.surface, problem.surface.rim_distance()[:, None]
     near = surface.locate(levels[0][1].position, away)[-1] < problem.scene.endoscope.radius
-    kept, found, volumes = problem.beyond_clamped_layer, [], problem.nodal_volumes
+    found, volumes, counted = [], problem.nodal_volumes, problem.counted_volumes
     how = TIP_GRADING if isinstance(levels[0][1], TipPosition) else GRADING
     for level, _, own, exact in compared(problem, problem.scene, levels, how):
         errors = (
             relative(own.displacement, exact.displacement, volumes),
-            relative(own.von_mises[kept], exact.von_mises[kept], volumes[kept]),
+            relative(own.von_mises, exact.von_mises, counted),
             abs(float(np.linalg.norm(own.felt) / np.linalg.norm(exact.felt)) - 1.0),
             *np.abs(np.divide(own.peaks, exact.peaks) - 1.0),
         )
@@ -166,23 +166,9 @@ def fit(found: Sequence[list[Array]], tip: bool = False) -> tuple[Array, dict[st
 
     And what an artifact tells of these errors, of those of ``StressField.peaks`` as well.
     """
+    known = [[_known(row, tip) for row in own] for own in found]
     rows = np.array([row for own in found for row in own])
-    moved = rows[:, 3] if tip else np.maximum(rows[:, 1], rows[:, 3])
-    there = moved < GIVEN_WAY
-    answers = iter(there)
-    known = [
-        [
-            KnownAnswer(
-                np.maximum(row[1:4], UNKNOWN),
-                np.array([1.0, row[0], row[-1]]),
-                True,
-                comparable=next(answers),
-                near_rim=row[-1] > 0.0,
-            )
-            for row in own
-        ]
-        for own in found
-    ]
+    there = np.array([answer.comparable for own in known for answer in own])
     told = {
         name: statistics(errors)
         for name, errors in zip((*Errors._fields, "peak", "p99"), rows[there, 1:-1].T, strict=True)
@@ -191,3 +177,16 @@ def fit(found: Sequence[list[Array]], tip: bool = False) -> tuple[Array, dict[st
     given_way = int(np.sum(~there))
     counts = {"answers": len(rows), "given_way": given_way, "confidence": confidence}
     return fitted, counts | told
+
+
+def _known(row: Array, tip: bool) -> KnownAnswer:
+    """An answer of ``mesh_errors``, comparable unless the finer mesh has given way."""
+    level, *errors, _, _, near_rim = row.tolist()
+    moved = errors[2] if tip else max(errors[0], errors[2])
+    return KnownAnswer(
+        np.maximum(errors, UNKNOWN),
+        np.array([1.0, level, near_rim]),
+        True,
+        comparable=moved < GIVEN_WAY,
+        near_rim=near_rim > 0.0,
+    )
