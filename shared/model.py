@@ -20,11 +20,11 @@ from palpate.shared.geometry.surface import Surface, SurfaceIndex, boundary_tria
 from palpate.shared.local_models import Body, Estimators, LocalModels
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH
-from palpate.shared.mechanics.tip import dented, held
+from palpate.shared.mechanics.tip import EDGE_FIELD, dented, held
 from palpate.shared.near_field import Contact
 from palpate.shared.query import check_place, checked_load, out_of_range, vector
 from palpate.shared.reduced import press, touch
-from palpate.shared.reduced.features import RIM, near_rim
+from palpate.shared.reduced.features import near_rim
 from palpate.shared.reduced.outcome import Outcome
 from palpate.shared.reduced.past import Elastic, Remembering
 from palpate.shared.reduced.transfer import LeftBehind, Local, Past, Transfer, estimate_history
@@ -459,7 +459,7 @@ def _footprint(found: Outcome, radius: float, tip: bool) -> Contact:
     return Contact(
         found.foot.copy(),
         found.upward.copy(),
-        found.limits[LIMIT_FIELDS:RIM].copy(),
+        found.limits[LIMIT_FIELDS : LIMIT_FIELDS + EDGE_FIELD].copy(),
         found.force / -found.area.item(),
         radius,
         tip,

@@ -303,13 +303,14 @@ class FullProblem:
         """What presses in a step; of the tip, by the force in what was found."""
         radius = self.scene.endoscope.radius
         if isinstance(step, Load):
-            x, normal, _, curvature = self.surface.locate(step.position, self._contact_fields)
-            return Contact(x, normal, curvature, step.pressure * step.direction, radius)
+            x, normal, _, at = self.surface.locate(step.position, self._contact_fields)
+            traction = step.pressure * step.direction
+            return Contact(x, normal, at[:EDGE_FIELD], traction, radius)
         if found is None or found.foot is None:
             return None
-        x, normal, _, curvature = self.surface.locate(found.foot, self._contact_fields)
-        pressure = found.force / -self.unit_load_at(x, normal).sum()
-        return Contact(x, normal, curvature, pressure, radius, tip=True)
+        x, normal, _, at = self.surface.locate(found.foot, self._contact_fields)
+        traction = found.force / -self.unit_load_at(x, normal).sum()
+        return Contact(x, normal, at[:EDGE_FIELD], traction, radius, tip=True)
 
     def displaced(self, found: Equilibrium, contact: Contact | None) -> Array:
         """Displacement (n, 3) mm of the nodes, with the dent of a tip that is not the mesh's."""

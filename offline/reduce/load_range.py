@@ -328,9 +328,10 @@ def firm_share(model: ReducedModel, x: Array, direction: Array, limit: float) ->
     if limit < FIRM * model.body.law.mu[0]:
         return 1.0
     full = _full(model)
+    tissue = Potential(full, [])
     for share in FIRM_SHARES:
         u = model.fields.of_mesh(model.press(x, share * limit, direction)).astype(float)
-        if Potential(full, []).factorise(u.reshape(-1)[full.free], 0.0):
+        if tissue.factorise(u.reshape(-1)[full.free], 0.0):
             return 1.0 if share == 1.0 else float(share) / MARGIN
     return float(FIRM_SHARES[-1]) / MARGIN
 

@@ -22,7 +22,8 @@ At an edge with a right angle half of the contact is missing.  That half is made
 image, which takes the shear stress off the side of the body, and the more so by a factor ``psi``,
 which takes off the normal stress (Guilbault, J. Tribol. 133 (2011) 031402).  So at an edge ``d`` is
 ``(1 + psi) / 2`` times that of twice the force; further away, at a distance ``s``, the image fades
-with ``exp(-s / (EDGE R))``.  Blunter edges have a share of it.
+with ``exp(-s / (EDGE R))``.  Blunter edges have a share of it.  Of
+``psi - 1`` the share ``EXCESS`` counts.
 
 Tissue that remembers relaxes: the law's force is its elastic one less what the past takes off it,
 ``F = (1 - loss) F_e(d) - held`` (Lee & Radok, J. Appl. Mech. 27 (1960) 438-444).
@@ -97,7 +98,7 @@ class Tip(NamedTuple):
     radius: float  # mm
     modulus: float  # kPa, E*
     lost: float  # share of it that is lost with a share of the shear modulus, over the latter
-    image: float  # ``psi``
+    image: float  # ``1 + EXCESS (psi - 1)``
 
     def local_law(self, sharpness, edge):
         """Coefficients ``beta, relief`` of the law where the contact's curvature is ``1 / R_e``.
