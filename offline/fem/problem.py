@@ -79,21 +79,28 @@ class Reference(NamedTuple):
 
 
 class FullProblem:
-    """The full model of a scene, on its mesh unless another is given, and what presses it."""
+    """The full model of a scene, on its mesh unless another is given, and what presses it.
 
-    def __init__(self, scene: Scene, mesh: Mesh | None = None) -> None:
+    The surface pressed is that of the scene's body, or of the faces of another mesh if absent.
+    """
+
+    def __init__(
+        self, scene: Scene, mesh: Mesh | None = None, surface: Surface | None = None
+    ) -> None:
         self.scene = scene
         self.mesh = build_mesh(scene) if mesh is None else mesh
         self.model = FullModel(self.mesh, scene.tissue)
-        self.surface: Surface = accessible_surface(self.mesh)
+        self.surface = surface or accessible_surface(self.mesh, scene if mesh is None else None)
         self.nodes = np.arange(len(self.mesh.nodes), dtype=np.int32)  # of the whole body
         self.elements = np.arange(len(self.mesh.elements), dtype=np.int32)
         self._nodal = np.zeros(len(self.mesh.nodes))
 
     @classmethod
     def of_artifact(cls, artifact: Artifact) -> FullProblem:
-        """Full model on the very mesh that an artifact was trained on."""
-        return cls(parse_scene(artifact.scene), Mesh(**values_of(Mesh, artifact.arrays)))
+        """Full model on the very mesh and surface that an artifact was trained on."""
+        arrays = artifact.arrays
+        mesh, surface = Mesh(**values_of(Mesh, arrays)), Surface(**values_of(Surface, arrays))
+        return cls(parse_scene(artifact.scene), mesh, surface)
 
     @cached_property
     def body(self) -> Body:

@@ -22,6 +22,9 @@ class Shape(Protocol):
     def grid(self, u: Array, v: Array, w: Array) -> Array:
         """Points (a, b, c, 3) mm of a grid of parameters (a,), (b,) and (c,) or (a, c)."""
 
+    def at(self, parameters: Array) -> Array:
+        """Points (..., 3) mm of parameters (..., 3)."""
+
 
 class BlockShape:
     """A box: parameters along x, y, z."""
@@ -34,6 +37,10 @@ class BlockShape:
         third = np.atleast_2d(w)[:, None]
         grid = np.broadcast_arrays(u[:, None, None], v[:, None], third)
         return np.stack(grid, axis=-1) * self._size
+
+    def at(self, parameters: Array) -> Array:
+        """See ``Shape``."""
+        return parameters * self._size
 
 
 class ExtrusionShape:
@@ -50,6 +57,11 @@ class ExtrusionShape:
         points[..., [0, 2]] = plane[:, None]
         points[..., 1] = self._length * v[:, None]
         return points
+
+    def at(self, parameters: Array) -> Array:
+        """See ``Shape``."""
+        plane = self._section(parameters[..., 0], parameters[..., 2])
+        return np.stack([plane[..., 0], self._length * parameters[..., 1], plane[..., 1]], axis=-1)
 
 
 @lru_cache(maxsize=8)

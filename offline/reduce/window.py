@@ -23,7 +23,6 @@ from scipy.sparse import block_diag, csr_matrix
 from scipy.spatial import cKDTree
 
 from palpate.offline.fem.linear_solver import SparseSolver, sparse_solver
-from palpate.offline.fem.mesh import accessible_surface
 from palpate.offline.fem.model import FullModel
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.ritz import Footprint
@@ -202,7 +201,7 @@ class WindowProblem(FullProblem):
             inner=np.repeat(~border, 3)[free],
             products=(body.products, body.relaxed),
         )
-        self.surface = accessible_surface(self.mesh)
+        self.surface = whole.surface
         self._nodal = np.zeros(len(self.mesh.nodes))
 
 

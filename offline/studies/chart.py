@@ -54,7 +54,7 @@ PLAN: Plan = {
     **dict.fromkeys(("pod", "pod-euclidean", "pod-ecm", "pod-ecsw"), MODES),
     **dict.fromkeys(("pod-deim", "pod-gappy", "regression"), MODES),
     "linear": (*MODES, 160),
-    **dict.fromkeys(("mass-spring", "tensor-mass"), (0.5, 1, 2)),
+    **dict.fromkeys(("mass-spring", "tensor-mass"), (0.5, 0.75, 1)),
     "full": (0.5, 0.75, 1, 1.25),
 }
 PLAN_IN_TIME: Plan = {

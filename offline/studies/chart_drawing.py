@@ -75,7 +75,7 @@ NAMES = {
     "pod 80": ("POD", (8, -4), "left"),
     "modal 80": ("linear modes", (0, 10), "left"),
     "mass-spring 1": ("mass-spring", (8, 3), "left"),
-    "tensor-mass 2": ("tensor-mass", (8, -3), "left"),
+    "tensor-mass 1": ("tensor-mass", (8, -3), "left"),
     "derivatives 9": ("static\nderivatives", (-8, -28), "right"),
     "full 0.75": ("coarser mesh", (-8, -4), "right"),
     "full 1.25": ("finer mesh", (8, -16), "right"),

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from palpate.offline.fem.graded import Graded, Grading, parameters_of
-from palpate.offline.fem.mesh import accessible_surface, build_mesh, ticks_of
+from palpate.offline.fem.graded import Graded, Grading
+from palpate.offline.fem.mesh import accessible_surface, build_mesh, parameters_of, ticks_of
 from palpate.offline.fem.model import FullModel
 from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import FullProblem, Load

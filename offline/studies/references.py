@@ -10,8 +10,8 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.fem.graded import FIT_FOR_FOOTPRINTS, Graded, parameters_of
-from palpate.offline.fem.mesh import ticks_of
+from palpate.offline.fem.graded import FIT_FOR_FOOTPRINTS, Graded
+from palpate.offline.fem.mesh import parameters_of, ticks_of
 from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import FullProblem, Load, TipPosition
@@ -76,7 +76,7 @@ def opened(artifact: Path, scene: Scene | None) -> tuple[ReducedModel, FullProbl
     atlas, problem = compare.opened(artifact)
     if atlas.scene.text != scene.text:
         raise PalpateError(f"{artifact}: trained on another scene than {scene.name!r}")
-    return atlas, FullProblem(scene, problem.mesh)
+    return atlas, FullProblem(scene, problem.mesh, problem.surface)
 
 
 @lru_cache(maxsize=4)
@@ -86,7 +86,7 @@ def of_tissue(problem: FullProblem, **changes: Any) -> FullProblem:
     if all(getattr(scene.tissue, key) == value for key, value in changes.items()):
         return problem
     other = scene.tissue.model_copy(update=changes)
-    return FullProblem(scene.model_copy(update={"tissue": other}), problem.mesh)
+    return FullProblem(scene.model_copy(update={"tissue": other}), problem.mesh, problem.surface)
 
 
 def kept_results(artifact: Path, scene: Scene, name: str, settings: object) -> Checkpoint:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from palpate.offline.fem.graded import Graded, Grading, parameters_of
-from palpate.offline.fem.mesh import ticks_of
+from palpate.offline.fem.graded import Graded, Grading
+from palpate.offline.fem.mesh import parameters_of, ticks_of
 from palpate.offline.fem.problem import FullProblem, Load, TipPosition
 from palpate.offline.scenes import find_scene
 from palpate.offline.validate.mesh_part import Pressed

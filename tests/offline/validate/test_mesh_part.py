@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from palpate.offline.fem.graded import Graded, Grading, interpolated, parameters_of
-from palpate.offline.fem.mesh import build_mesh, ticks_of
+from palpate.offline.fem.graded import Graded, Grading, interpolated
+from palpate.offline.fem.mesh import build_mesh, parameters_of, ticks_of
 from palpate.offline.fem.problem import FullProblem, Load, TipPosition
 from palpate.offline.fem.shapes import shape_of
 from palpate.offline.scenes import find_scene
