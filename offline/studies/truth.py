@@ -49,7 +49,7 @@ def truth(artifact: Path, scene: Scene, places: int, seed: int) -> dict[str, Any
     dict
         Statistics of relative errors: ``total``, ``mesh`` and ``reduction`` by quantity, of loads
         and of the tip; ``covered``, the share of total errors within the estimates, by
-        quantity.
+        quantity; ``out_of_range``, answers that say so, as of a tip that slides: they do not count.
     """
     atlas, _ = opened(artifact)
     points = centred_points_and_rim(atlas.surface, places, RIM, held_out(atlas, seed))
@@ -141,6 +141,7 @@ def _errors(
 
 def _summary(rows: Sequence[Row], estimated: Sequence[str]) -> dict[str, Any]:
     """Statistics over the rows of one kind, with estimates of some quantities."""
+    asked, rows = len(rows), [row for row in rows if np.isfinite(row["estimated_displacement"])]
     if not rows:
         return {}
     names = [key.removeprefix("total_") for key in rows[0] if key.startswith("total_")]
@@ -152,4 +153,5 @@ def _summary(rows: Sequence[Row], estimated: Sequence[str]) -> dict[str, Any]:
         name: float(np.mean([row[f"total_{name}"] <= row[f"estimated_{name}"] for row in rows]))
         for name in estimated
     }
-    return {"answers": len(rows), "covered": covered} | found
+    counts = {"answers": len(rows), "out_of_range": asked - len(rows)}
+    return counts | {"covered": covered} | found

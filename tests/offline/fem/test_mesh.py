@@ -134,6 +134,30 @@ def test_turbinate_is_touched_medially_and_below_end_to_end_and_clamped_on_the_l
     assert (y.min(), y.max()) == (0.0, pytest.approx(40.0))
 
 
+def test_the_surface_is_that_of_the_body_and_not_of_the_faces():
+    scene = find_scene("turbinate")
+    problem, rng = FullProblem(scene), np.random.default_rng(0)
+    at = np.column_stack([rng.random((300, 2)), np.ones(300)])  # of the outer side
+    on = shape_of(scene).at(at)
+    inside = on[:, 2] < 15.0
+    ways = 1e-5 * np.eye(3)[:2]
+    along, across = (shape_of(scene).at(at + way) - shape_of(scene).at(at - way) for way in ways)
+    normals = np.cross(along, across)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+
+    def off(surface):
+        found = [surface.project(x) for x in on[inside]]
+        turned = [n @ normal for (_, n, _), normal in zip(found, normals[inside], strict=True)]
+        return 1e3 * max(gap for *_, gap in found), np.degrees(np.arccos(min(turned)))
+
+    gap, angle = off(problem.surface)
+    assert gap < 2.5  # um
+    assert angle < 0.2  # degrees
+    gap, angle = off(accessible_surface(problem.mesh))
+    assert gap > 5.0
+    assert angle > 1.5
+
+
 @pytest.mark.parametrize("grading", ["1.0", "1.7"])
 @pytest.mark.parametrize("divisions", [(7, 2), (10, 2), (13, 3), (20, 4), (40, 3)])
 def test_no_element_of_the_turbinate_is_inverted_however_coarse_or_fine(divisions, grading):
