@@ -32,8 +32,10 @@ class Grading(NamedTuple):
     support: float = 0.05  # at the edges of a clamped lip, on whose meshing all hangs
 
 
-FIT_FOR_FOOTPRINTS = Grading(finest=0.2, even=0.8, growth=0.7)
-"""Some 62 000 to 89 000 degrees of freedom on the turbinate."""
+FIT_FOR_FOOTPRINTS = Grading(finest=0.2, even=0.8, growth=0.7, coarsest=1.2)
+"""Some 92 000 to 118 000 degrees of freedom on the turbinate.  Beside 142 000 to 166 000, with
+elements of .8 radii far away, displacement differs by .1 % and von Mises stress by 3 to 4 %; with
+elements of 2 radii stress by 5 to 13."""
 
 FIT_FOR_THE_TIP = Grading(finest=0.1, even=0.2, growth=1.0)
 """Some 35 000 to 48 000 degrees of freedom on the turbinate.  A tip as deep as a twentieth of its

@@ -303,7 +303,7 @@ def reference_task(model: ReducedModel, query: Sequence[Step]) -> tuple[Any, ...
     return FullProblem.reference, query, model.fields.of_mesh(answer)
 
 
-COVERAGE, CONFIDENCE = 0.95, 0.98
+COVERAGE, CONFIDENCE = 0.95, 0.95
 """Share of errors that estimates are to cover, and how sure it is that they cover so many."""
 
 
