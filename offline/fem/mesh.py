@@ -42,9 +42,9 @@ and last layer over the whole, and how far along the section its layers go over 
 SLIGHTLY = 1e-5
 """Step in parameters, over that of a face, by which its tangents are found."""
 
-SAG, SQUARES = 0.002, (2, 16)
+SAG, SQUARES, STRAIGHT = 0.002, (4, 16), 2
 """Millimetres between a curved face and its triangles, and least and most squares along an edge: as
-many as that takes."""
+many as that takes.  Faces of straight edges have as many squares as the last."""
 
 
 def build_mesh(scene: Scene, ticks: Ticks | None = None) -> Mesh:
@@ -318,7 +318,7 @@ def accessible_surface(mesh: Mesh, scene: Scene | None = None) -> Surface:
 def _squares(faces: Array) -> tuple[int, int]:
     """Squares along both axes of faces (f, 4 or 8, 3) mm, as many as their curvature asks for."""
     if faces.shape[1] == 4:
-        return SQUARES[0], SQUARES[0]
+        return STRAIGHT, STRAIGHT
     # edges 0-1 and 2-3 run along the first axis, 1-2 and 3-0 along the second
     chords = (faces[:, :4] + faces[:, [1, 2, 3, 0]]) / 2
     bent = np.linalg.norm(faces[:, 4:] - chords, axis=2).max(axis=0)

@@ -24,11 +24,11 @@ from palpate.shared.geometry.surface import Surface
 from palpate.shared.model import ReducedModel
 from palpate.shared.scene import Errors, Scene
 
-GRADING = Grading(finest=0.3, even=0.4, growth=0.9, coarsest=1.4)
+GRADING = Grading(finest=0.25, even=0.4, growth=0.9, coarsest=1.4)
 """Of references: on the turbinate their own errors under a footprint are .2 to .6 % of displacement
 and 5 to 6 % of stress, to which elements far away add as much as those near the contact."""
 
-TIP_GRADING = Grading(finest=0.15, even=0.2, growth=0.9, coarsest=3.0)
+TIP_GRADING = Grading(finest=0.15, even=0.2, growth=1.0, coarsest=3.0)
 """The same under a tip, whose contact is a fifth of its radius across at a depth of a fiftieth."""
 
 APART, LEAST, RIM = 5.0, 9, 3
