@@ -39,7 +39,7 @@ LEVELS, DEPTHS = (0.3, 1.0), (0.15, 0.8)
 """Shares of the limit at which footprints and tips press there."""
 
 CLOSE = 1e-4
-"""Residual of the integrated sphere, relative to its force, which then errs by as little."""
+"""Residual of solutions, relative to the load or the tip's force, which then errs by as little."""
 
 GIVEN_WAY = 0.3
 """Error of displacement, of all or under the footprint, or of the tip's force, beyond which the
@@ -87,7 +87,7 @@ class Pressed:
         if isinstance(step, Load):  # where it is on every mesh, however far its surface goes
             nodal = problem.unit_load_at(step.position, -step.direction)
             forces = step.pressure * nodal[:, None] * step.direction
-            found = problem.model.solve(forces, start=start)
+            found = problem.model.solve(forces, start=start, tolerance=CLOSE)
             contact, felt = problem.footprint(step), nodal @ found.displacement / nodal.sum()
         elif self._integrated:
             load = problem.sphere_at(step.position)
