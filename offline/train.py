@@ -185,10 +185,7 @@ class Pipeline:
         model = untested(self.problem, models, limits)
         tables: dict[Kind, list[Row]] = {}
         documents: dict[str, Any] = {"provenance": self.provenance, "training": training}
-        estimators: dict[str, Array] = {}
-        estimators["mesh"], training["mesh_errors"] = self._mesh_part(model)
-        if model.has_tip:
-            estimators["mesh_tip"], training["mesh_errors_tip"] = self._mesh_part(model, tip=True)
+        estimators = self._mesh_part(model, training)
         model = untested(self.problem, models, limits, Estimators(**estimators))
         for kind in KINDS:
             if not kind.lacks(self.scene):
@@ -308,12 +305,21 @@ class Pipeline:
         ]
         return calibrate_by_halves([row.known for row in rows], kind.damping), rows
 
-    def _mesh_part(self, model: ReducedModel, tip: bool = False) -> tuple[Array, dict[str, Any]]:
-        """Fit the mesh's part of the error estimate of loads or of the tip."""
-        places = mesh_part.places(model, stream(self.scene.seed, Stage.MESH_PART), tip)
-        name, title = ("mesh-tip", " under the tip") if tip else ("mesh", "")
-        tasks = {f"{name}-{i}": (mesh_part.mesh_errors, own) for i, own in enumerate(places)}
-        return mesh_part.fit(self._stage(f"errors of the mesh{title}", tasks), tip)
+    def _mesh_part(self, model: ReducedModel, training: dict[str, Any]) -> dict[str, Array]:
+        """Fit the mesh's part of the error estimates of loads and of the tip; tell of it."""
+        # those under the tip first: where tissue gives way sideways one takes minutes
+        kinds = {"mesh_tip": "mesh_errors_tip"} if model.has_tip else {}
+        kinds["mesh"] = "mesh_errors"
+        tasks, fitted = dict[str, Any](), dict[str, Array]()
+        for name in kinds:
+            rng = stream(self.scene.seed, Stage.MESH_PART)
+            for i, levels in enumerate(mesh_part.places(model, rng, tip=name == "mesh_tip")):
+                tasks[f"{name}-{i}"] = mesh_part.mesh_errors, levels
+        found = dict(zip(tasks, self._stage("errors of the mesh", tasks), strict=True))
+        for name, document in kinds.items():
+            own = [rows for task, rows in found.items() if task.startswith(f"{name}-")]
+            fitted[name], training[document] = mesh_part.fit(own, tip=name == "mesh_tip")
+        return fitted
 
     # --- pieces --------------------------------------------------------------------------------
 

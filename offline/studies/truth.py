@@ -19,7 +19,7 @@ from palpate.offline.reduce.layout import centred_points_and_rim
 from palpate.offline.run.tables import write_csv
 from palpate.offline.studies.references import in_parallel, kept_results
 from palpate.offline.validate.compare import opened
-from palpate.offline.validate.mesh_part import Levels, Seen, compared
+from palpate.offline.validate.mesh_part import Levels, Seen, answered, compared
 from palpate.offline.validate.queries import LOADS, TIP, Place, held_out
 from palpate.shared.arrays import Array
 from palpate.shared.mechanics.footprint import TIP_DEPTH
@@ -104,11 +104,12 @@ def _opened(artifact: Path) -> ReducedModel:
 def _levels(atlas: ReducedModel, x: Array) -> Iterator[tuple[str, Levels]]:
     """What presses at a point, by kind: growing levels (share of the limit, or mm) and steps."""
     place = Place.at(atlas, x)
-    yield "load", [(level, place.press(-place.normal, level)) for level in LEVELS]
+    pressed = [(level, place.press(-place.normal, level)) for level in LEVELS]
+    yield "load", answered(atlas, pressed)
     limit = float(place.limits[TIP_DEPTH])
     depths = [depth * place.radius for depth in DEPTHS if depth * place.radius <= limit]
     if depths:
-        yield "tip", [(depth, place.touch(depth / limit)) for depth in depths]
+        yield "tip", answered(atlas, [(depth, place.touch(depth / limit)) for depth in depths])
 
 
 def _reduced(atlas: ReducedModel, step: Load | TipPosition) -> tuple[Any, Seen]:

@@ -17,7 +17,7 @@ from palpate.offline.fem.norms import relative, statistics
 from palpate.offline.fem.problem import FullProblem, Load, TipPosition
 from palpate.offline.reduce.layout import centred_points_and_rim
 from palpate.offline.reduce.sampling import spacing_count
-from palpate.offline.validate.compare import KnownAnswer, calibrate
+from palpate.offline.validate.compare import KnownAnswer, calibrate, reduced_guess
 from palpate.offline.validate.queries import Place
 from palpate.shared.arrays import Array
 from palpate.shared.geometry.surface import Surface
@@ -52,8 +52,9 @@ UNKNOWN = 0.01
 DAMPING = 2.0
 """Of the fit, see ``compare.calibrate``: few answers are known."""
 
-Levels = Sequence[tuple[float, Load | TipPosition]]
-"""What presses at one place, harder and harder: share of the limit, or mm, and step."""
+Levels = Sequence[tuple[float, Load | TipPosition, Array | None]]
+"""What presses at one place, harder and harder: share of the limit, or mm; the step; if known the
+reduced model's answer (n, 3) mm, near which the full one is."""
 
 
 class Seen(NamedTuple):
@@ -112,9 +113,9 @@ def compared(
     at, near = parameters_of(scene, ticks), None
     fine_at = parameters_of(scene, fine.ticks)
     own, exact = Pressed(problem), Pressed(fine.problem, integrated=True)
-    for level, step in levels:
+    for level, step, answer in levels:
         try:
-            found = own.harder(level, step)
+            found = own.harder(level, step, answer)
             if isinstance(step, TipPosition):  # whose contact takes half as many iterations so
                 near = interpolated(ticks, problem.mesh.elements, fine_at, own.displacement)
             there = exact.harder(level, step, near)
@@ -135,8 +136,14 @@ def places(model: ReducedModel, rng: np.random.Generator, tip: bool = False) -> 
     points = centred_points_and_rim(model.surface, count, RIM, rng)
     found = [Place.at(model, point) for point in points]
     if tip:
-        return [[(level, place.touch(level)) for level in DEPTHS] for place in found]
-    return [[(level, place.press(-place.normal, level)) for level in LEVELS] for place in found]
+        return [answered(model, [(at, place.touch(at)) for at in DEPTHS]) for place in found]
+    along = [[(at, place.press(-place.normal, at)) for at in LEVELS] for place in found]
+    return [answered(model, own) for own in along]
+
+
+def answered(model: ReducedModel, steps: Sequence[tuple[float, Load | TipPosition]]) -> Levels:
+    """Levels of one place with the reduced model's answers."""
+    return [(level, step, reduced_guess(model, step)) for level, step in steps]
 
 
 def mesh_errors(problem: FullProblem, levels: Levels) -> list[Array]:

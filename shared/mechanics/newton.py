@@ -8,8 +8,8 @@ rest stiffness; False if it is not positive definite.  ``correct(residual, step)
 one it is compiled.
 
 Equilibria are sought as minima: where the tangent is not positive definite it is shifted by a
-multiple of the rest stiffness until it is, and every step must lower the potential (Nocedal &
-Wright, Numerical Optimization, ch. 3).
+multiple of the rest stiffness until it is, from a quarter of the last one on (Nocedal & Wright,
+Numerical Optimization, algorithm 3.3), and every step must lower the potential (ch. 3).
 """
 
 import math
@@ -20,7 +20,7 @@ CONVERGED, STALLED, EXHAUSTED = 0, 1, 2
 
 SUFFICIENT_DECREASE = 1e-4
 SMALLEST_STEP = 1e-6
-LARGEST_SHIFT = 1e4
+SMALLEST_SHIFT, LARGEST_SHIFT = 0.01, 1e4
 
 
 def newton(system, u, work, target, reuse, max_iterations, factorised, round_off=1e-9, noise=0.0):
@@ -66,14 +66,14 @@ def newton(system, u, work, target, reuse, max_iterations, factorised, round_off
         return STALLED, 0, energy, smallest
     norm = math.sqrt(np.dot(residual, residual))
     stale = not factorised
-    iterations = 0
+    iterations, shift = 0, 0.0
     while not norm <= target:
         if iterations == max_iterations:
             return EXHAUSTED, iterations, energy, smallest
         if stale:
-            shift = 0.0
+            shift = 0.25 * shift if shift > SMALLEST_SHIFT else 0.0
             while not system.factorise(u, shift):
-                shift = max(0.01, 4.0 * shift)
+                shift = max(SMALLEST_SHIFT, 4.0 * shift)
                 if shift > LARGEST_SHIFT:
                     return STALLED, iterations, energy, smallest
         system.correct(residual, step)

@@ -51,7 +51,7 @@ def test_at_an_edge_the_force_is_that_of_a_sphere_integrated_on_a_fine_mesh(pois
     problem, radius = FullProblem(scene), scene.endoscope.radius
     for aside in (0.0, 0.1):
         levels = [
-            (depth, TipPosition(np.array([16.0, aside * radius, 12.0 + radius - depth])))
+            (depth, TipPosition(np.array([16.0, aside * radius, 12.0 + radius - depth])), None)
             for depth in (0.15, 0.6)
         ]
         for *_, found, exact in compared(problem, scene, levels, TIP_GRADING):

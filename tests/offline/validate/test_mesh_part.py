@@ -68,7 +68,7 @@ def test_elements_are_small_at_the_contact_and_grow_away_from_it():
 
 
 def test_errors_fall_with_the_mesh_and_a_finer_reference_says_the_same():
-    levels = [(share, Load(PLACE, DOWN, 1.5 * share)) for share in (0.3, 1.0)]
+    levels = [(share, Load(PLACE, DOWN, 1.5 * share), None) for share in (0.3, 1.0)]
     coarse, fine = (
         np.array(mesh_errors(FullProblem(block(*divisions)), levels))
         for divisions in ((3, 3, 2), (8, 8, 6))
@@ -83,10 +83,10 @@ def test_errors_fall_with_the_mesh_and_a_finer_reference_says_the_same():
 def test_under_the_tip_errors_are_those_beside_a_sphere(monkeypatch):
     monkeypatch.setattr(mesh_part, "TIP_GRADING", Grading(finest=0.25, even=0.3, growth=0.9))
     problem = FullProblem(block(8, 8, 6))
-    levels = [(depth, TipPosition(PLACE - (2.0 - depth) * DOWN)) for depth in (0.2, 0.4)]
+    levels = [(depth, TipPosition(PLACE - (2.0 - depth) * DOWN), None) for depth in (0.2, 0.4)]
     rows = np.array(mesh_errors(problem, levels))
     pushed = np.linalg.norm(problem.solve(levels[1][1]).force)
-    footprint = [(1.0, Load(PLACE, DOWN, pushed / problem.unit_load(PLACE)[0].sum()))]
+    footprint = [(1.0, Load(PLACE, DOWN, pushed / problem.unit_load(PLACE)[0].sum()), None)]
     (load,) = mesh_errors(problem, footprint)
     # a dent is harder to follow than a footprint
     assert (rows[:, 2] > 1.5 * load[2]).all()

@@ -121,6 +121,21 @@ def test_an_indefinite_start_is_shifted_downhill():
     assert system.shifts[-1] == 0.0
 
 
+def test_shifts_go_on_from_the_last():
+    """A long way through an indefinite region costs about one factorisation a step."""
+    system = System(
+        lambda u: 40.0 * np.cos(u / 20), lambda u: -2.0 * np.sin(u / 20),
+        lambda u: -0.1 * np.cos(u / 20), force=0.05,
+    )  # fmt: skip
+    u, status, iterations, _, _ = solve(system, [0.0])
+    assert status == CONVERGED
+    assert np.sin(u[0] / 20) == pytest.approx(-0.025)
+    indefinite = [shift for shift in system.shifts if shift > 0.0]
+    assert len(indefinite) >= 4
+    assert len(system.shifts) < 2 * iterations
+    assert system.shifts[-1] == 0.0
+
+
 FAILURES = {
     "no minimum": (lambda u: -u, lambda u: -np.ones_like(u), np.zeros_like, (EXHAUSTED, 7)),
     "no descent": (
