@@ -266,11 +266,14 @@ class Pipeline:
     def _lowered(self, models: LocalModels, limits: Array) -> Array:
         """Load range that ends before the tissue gives way, or slips off the tip."""
         asking = partial(self._ask, self.checkpoint.store("models", (models, limits)))
-        model, lowered = untested(self.problem, models, limits), limits.copy()
-        for search in SEARCHES:
+        lowered = limits.copy()
+        for i, search in enumerate(SEARCHES):
+            model = untested(self.problem, models, lowered)  # places are drawn in what is left
             if search.field == TIP_DEPTH and not model.has_tip:
                 continue
-            shares = bearable_shares(search, model, asking, stream(self.scene.seed, search.stage))
+            shares = bearable_shares(
+                search, model, asking, stream(self.scene.seed, search.stage, i)
+            )
             lowered[:, search.field] *= shares
             tqdm.write(
                 f"{search.title}: load range lowered on {np.mean(shares < 1):.1%} of the surface, "

@@ -10,7 +10,8 @@ Near a fold of the load path a small error of the force is a large one of the di
 between the folds of the full and of the reduced model the two lie on different branches: the one
 kind of answer that is converged, in range and wrong.  The reduced model is quick enough to be
 pressed everywhere, in all directions and a little beyond the range, and shows where its own path
-turns; the full model's does so close by.  The range is lowered to end before that.
+turns, or where it has no answer; the full model's turns close by.  The range is lowered to end
+before that.
 
 Where an endoscope is pushed inwards over the rim of the surface, or over a corner, it can fold a
 few elements of the full model that the modes of the reduced one do not tell apart.  There the full
@@ -310,13 +311,13 @@ def ask(
 
 def limit_load_share(model: ReducedModel, x: Array, direction: Array, limit: float) -> float:
     """Share of a pressure (kPa) up to which tissue yields gradually, with ``MARGIN``; at most 1."""
-    moved = np.full(len(SHARES), np.nan)  # where it does not converge an answer says so itself
+    moved = np.full(len(SHARES), np.nan)
     for i, share in enumerate(SHARES):
         answer = model.press(x, share * limit, direction)
         if answer.converged:
             moved[i] = sum(weight * np.linalg.norm(q) for _, weight, q in answer.parts)
     exponents = np.diff(np.log(moved)) / np.diff(np.log(SHARES))
-    sudden = np.flatnonzero(np.diff(exponents) > SUDDEN)
+    sudden = np.flatnonzero(~(np.diff(exponents) <= SUDDEN))  # or without an answer
     return float(SHARES[sudden[0] + 1]) / MARGIN if len(sudden) else 1.0
 
 
@@ -447,4 +448,5 @@ SLIPPING_OFF = Search(
     path_independent_share, first=6, closer=8, reach=1.0,
 )  # fmt: skip
 
-SEARCHES = GIVING_WAY, FOLDING, SLIPPING_OFF
+# one round leaves 5 in 10 000 of the largest loads in range without an answer, two leave 1 or 2
+SEARCHES = GIVING_WAY, GIVING_WAY, FOLDING, SLIPPING_OFF
