@@ -347,10 +347,23 @@ def path_independent_share(model: ReducedModel, x: Array, turn: float = 0.0) -> 
 
     ``turn`` is the angle (rad) of the ways about the normal.
     """
-    for share in DEPTH_SHARES:
+    deepest = _pressed_in(model, x)
+    for share in [share for share in DEPTH_SHARES if share <= deepest]:
         if not _depends_on_way(model, x, share, turn):
             return float(share) if share == 1.0 else float(share) / MARGIN
     return float(DEPTH_SHARES[-1]) / MARGIN
+
+
+def _pressed_in(model: ReducedModel, x: Array) -> float:
+    """Share up to which a tip pressed in at once is where one pressed further and further in is."""
+    place, state, share = Place.at(model, x), model.new_warm(), DEPTH_SHARES[-1]
+    for deeper in DEPTH_SHARES[::-1]:
+        position = place.touch(deeper).position
+        at_once = model.touch(position)
+        if not at_once.converged or _apart(at_once, model.touch(position, warm=state)):
+            break
+        share = deeper
+    return float(share)
 
 
 def _depends_on_way(model: ReducedModel, x: Array, share: float, turn: float) -> bool:

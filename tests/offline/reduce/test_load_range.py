@@ -245,6 +245,9 @@ class Edge(Plate):
     blind = False
     """Whether no way leads to an answer on the near side."""
 
+    loose = np.inf
+    """Depth from which on a tip that is pressed in at once slips off."""
+
     def __init__(self, slip):
         super().__init__(np.inf)
         self.limits[:, TIP_DEPTH] = 1.0
@@ -262,6 +265,8 @@ class Edge(Plate):
         if warm is not None:
             carried = warm.side is not None and depth > self.slip and abs(beyond) < 1.0
             side = warm.side = warm.side if carried else side
+        elif depth > self.loose:
+            side = 0.0
         return SimpleNamespace(converged=True, parts=((3, 1.0, np.array([depth, side])),))
 
 
@@ -280,6 +285,14 @@ def test_the_range_ends_before_loads_without_an_answer():
     plate, down = Plate(np.inf), np.array([0.0, 0.0, -1.0])
     plate.lost = 0.9 * LIMIT, 0.97 * LIMIT
     assert 0.8 / MARGIN <= limit_load_share(plate, np.zeros(3), down, LIMIT) <= 0.9 / MARGIN
+
+
+@pytest.mark.parametrize("loose", [0.35, 0.75, 0.9])
+def test_the_depth_ends_where_a_tip_pressed_in_at_once_is_elsewhere(loose):
+    edge = Edge(slip=np.inf)
+    edge.loose = loose
+    share = path_independent_share(edge, np.array([EDGE + 0.1, 5.0, 0.0]))
+    assert 0.7 * loose < share * MARGIN <= loose
 
 
 def test_a_way_without_an_answer_tells_nothing():
