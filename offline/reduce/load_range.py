@@ -20,7 +20,8 @@ model's tangent at the reduced model's answer is not positive definite.
 Under the rigid tip a free edge can lie on either side of it, and slips off to the other as the tip
 slides on.  There one position has several answers, and which is the right one hangs on the way that
 the tip came: reduced and full model need not part from the same one at the same step.  The reduced
-model is asked everywhere whether its answers depend on the way, and depths are lowered likewise.
+model is asked everywhere whether its answers depend on the way, straight in or aslant, and depths
+are lowered likewise.
 """
 
 import pickle
