@@ -310,18 +310,17 @@ class Pipeline:
 
     def _mesh_part(self, model: ReducedModel, training: dict[str, Any]) -> dict[str, Array]:
         """Fit the mesh's part of the error estimates of loads and of the tip; tell of it."""
+        rng = partial(stream, self.scene.seed, Stage.MESH_PART)
         # those under the tip first: where tissue gives way sideways one takes minutes
-        kinds = {"mesh_tip": "mesh_errors_tip"} if model.has_tip else {}
-        kinds["mesh"] = "mesh_errors"
-        tasks, fitted = dict[str, Any](), dict[str, Array]()
-        for name in kinds:
-            rng = stream(self.scene.seed, Stage.MESH_PART)
-            for i, levels in enumerate(mesh_part.places(model, rng, tip=name == "mesh_tip")):
-                tasks[f"{name}-{i}"] = mesh_part.mesh_errors, levels
-        found = dict(zip(tasks, self._stage("errors of the mesh", tasks), strict=True))
-        for name, document in kinds.items():
-            own = [rows for task, rows in found.items() if task.startswith(f"{name}-")]
-            fitted[name], training[document] = mesh_part.fit(own, tip=name == "mesh_tip")
+        touched = mesh_part.places(model, rng(), tip=True) if model.has_tip else []
+        places = [*touched, *mesh_part.places(model, rng())]
+        tasks = {f"mesh-{i}": (mesh_part.mesh_errors, own) for i, own in enumerate(places)}
+        found, fitted = self._stage("errors of the mesh", tasks), dict[str, Array]()
+        pressed = found[len(touched) :]
+        fitted["mesh"], training["mesh_errors"] = mesh_part.fit(pressed)
+        if touched:
+            under_tip = found[: len(touched)]
+            fitted["mesh_tip"], training["mesh_errors_tip"] = mesh_part.fit(under_tip, tip=True)
         return fitted
 
     # --- pieces --------------------------------------------------------------------------------

@@ -349,8 +349,8 @@ def path_independent_share(model: ReducedModel, x: Array, turn: float = 0.0) -> 
     ``turn`` is the angle (rad) of the ways about the normal.
     """
     deepest = _pressed_in(model, x)
-    for share in [share for share in DEPTH_SHARES if share <= deepest]:
-        if not _depends_on_way(model, x, share, turn):
+    for share in DEPTH_SHARES:
+        if share <= deepest and not _depends_on_way(model, x, share, turn):
             return float(share) if share == 1.0 else float(share) / MARGIN
     return float(DEPTH_SHARES[-1]) / MARGIN
 
@@ -462,5 +462,5 @@ SLIPPING_OFF = Search(
     path_independent_share, first=6, closer=8, reach=1.0,
 )  # fmt: skip
 
-# one round leaves 5 in 10 000 of the largest loads in range without an answer, two leave 1 or 2
+# of 20 000 largest loads one round left 23 that give way before the margin ends, two left 15
 SEARCHES = GIVING_WAY, GIVING_WAY, FOLDING, SLIPPING_OFF
