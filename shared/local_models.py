@@ -75,14 +75,16 @@ class Body(Mesh):
 
     def contact_fields(self, surface: Surface) -> Array:
         """What the law of a tip needs to know of the body at vertices, (v, CONTACT_FIELDS)."""
-        bent = surface.curvature(CURVED_WITHIN * self.tip.radius)
+        other = surface_quadrature(self.nodes, self.faces[~self.accessible])
+        beyond = np.hstack([other.points, other.normals])
+        bent = surface.curvature(CURVED_WITHIN * self.tip.radius, beyond)
         points, sharpness = sharp_points(self.nodes, self.faces, self.clamped)
         away = np.full(len(bent), NO_EDGE)
         for share in np.unique(sharpness.round(1)):
             tree = cKDTree(points[sharpness.round(1) == share])
             image = self.tip.image_distance(tree.query(surface.vertices)[0], share)
             away = np.minimum(away, image)
-        return np.column_stack([bent, away])
+        return np.column_stack([bent, away, surface.gradient(away)])
 
     @cached_property
     def boundary(self) -> SurfaceQuadrature:

@@ -170,7 +170,7 @@ class FullProblem:
         law = *tip.local_law(sharpness, at[EDGE_FIELD]), *(time or (0.0, 0.0))
         nodal = np.empty((MEANS, len(self.mesh.nodes)))
         means(self.body.boundary, x, out, tangents, bent, tip.radius, nodal)
-        return TipLoad(tip, nodal, tangents, bent, centre - x, normal, law), x
+        return TipLoad(tip, nodal, tangents, bent, centre - x, normal, law, at[EDGE_FIELD:]), x
 
     @cached_property
     def contact(self) -> SphereContact:

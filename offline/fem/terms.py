@@ -102,6 +102,7 @@ class TipLoad:
     away: Array  # (3,) mm, from there to the tip's centre
     normal: Array  # (3,)
     law: tuple[float, float, float, float]  # beta, relief, loss, held
+    edge: Array  # (4,) mm, distance from a sharp edge, and its gradient
     lower: ClassVar[str] = "depth"
 
     @property
@@ -154,11 +155,13 @@ class TipLoad:
         """See ``tip.settle``."""
         found, u = self.touch(displacement), displacement.reshape(-1, 3)
         one, both, two = self.nodal[3:] @ u @ self.normal
-        g, H = np.empty(SEEN), np.empty((SEEN, SEEN))
+        g, H, fading = np.empty(SEEN), np.empty((SEEN, SEEN)), np.empty(3)
+        self.tip.fading(self.edge[0], np.array(self.law), force, stiffness, fading)
+        fading *= stiffness > 0.0
         settle(
             compliance, force, stiffness, found.gap, self.normal, found.towards,
             self.tangents + self.nodal[1:3] @ u, np.array([[one, both], [both, two]]) - self.bent,
-            g, H,
+            self.tangents @ self.edge[1:], fading, g, H,
         )  # fmt: skip
         return g, H
 

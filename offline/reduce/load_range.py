@@ -361,7 +361,9 @@ def _pressed_in(model: ReducedModel, x: Array) -> float:
     for deeper in DEPTH_SHARES[::-1]:
         position = place.touch(deeper).position
         at_once = model.touch(position)
-        if not at_once.converged or _apart(at_once, model.touch(position, warm=state)):
+        if not (at_once.converged and at_once.in_range) or _apart(
+            at_once, model.touch(position, warm=state)
+        ):
             break
         share = deeper
     return float(share)

@@ -10,6 +10,9 @@ from palpate.shared.geometry.elements import quadrilateral, shape
 BLUNT = np.radians(15.0)
 """Angle of normals up to which faces are parts of one smooth surface."""
 
+FAINTEST = 0.2
+"""Least share of a right angle that an edge has."""
+
 ALONG = np.linspace(0.0, 1.0, 9)
 """Where points of an edge lie, over its length."""
 
@@ -46,7 +49,9 @@ def shared_edges(nodes: Array, faces: Numbers) -> Edges:
 def sharp_points(nodes: Array, faces: Numbers, clamped: Flags) -> tuple[Array, Array]:
     """Points (k, 3) mm close together along sharp edges, and how sharp: 1 is a right angle, (k,).
 
-    Of edges that are free to move: nodes (n,) may be clamped.
+    Of edges that are free to move: nodes (n,) may be clamped.  Sharpness is the share of the image
+    of a contact there (``mechanics.tip``) that spheres integrated at edges have: .6 at 75 degrees,
+    .36 at 60 and .27 at 48 are nearly squares of the angle, .1 to .2 at 20 to 35 are more.
     """
     edges = shared_edges(nodes, faces)
     sharp = (edges.turn > BLUNT) & ~clamped[edges.nodes].any(axis=1)
@@ -54,5 +59,5 @@ def sharp_points(nodes: Array, faces: Numbers, clamped: Flags) -> tuple[Array, A
     N = np.array([1.0 - t, t])
     if ends.shape[1] == 3:
         N = np.array([(1.0 - t) * (1.0 - 2.0 * t), t * (2.0 * t - 1.0), 4.0 * t * (1.0 - t)])
-    sharpness = np.minimum(edges.turn[sharp] / (np.pi / 2), 1.0)
+    sharpness = np.clip((edges.turn[sharp] / (np.pi / 2)) ** 2, FAINTEST, 1.0)
     return np.einsum("ka,pki->pai", N, ends).reshape(-1, 3), np.repeat(sharpness, len(t))

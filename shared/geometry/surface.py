@@ -58,8 +58,8 @@ UPRIGHT = 0.7
 rim, rather than above or below."""
 
 
-FACING = 0.5
-"""Cosine between the normals of two points of one side of a body."""
+FACING = 0.7
+"""Cosine between the normals of two points of one smooth side of a body."""
 
 
 class SurfaceIndex(NamedTuple):
@@ -186,20 +186,20 @@ class Surface:
         """For compiled code, with fields (v, k) given at the vertices."""
         return self._index._replace(values=np.ascontiguousarray(values))
 
-    def curvature(self, radius: float) -> Array:
+    def curvature(self, radius: float, beyond: Array) -> Array:
         """Curvature (v, 6) 1/mm at the vertices: xx, yy, zz, xy, xz, yz; positive where convex.
 
-        It is the change of the normal with the place, fitted to vertices within a radius (mm) that
-        face the same way.
+        It is the change of the normal with the place, fitted to what faces the same way within a
+        radius (mm): vertices, and points ``beyond`` the rim with normals (k, 6).
         """
-        own, other = cKDTree(self.vertices).query_pairs(radius, output_type="ndarray").T
-        facing = np.sum(self.normals[own] * self.normals[other], axis=1) > FACING
-        own, other = own[facing], other[facing]
-        one, two = np.concatenate([own, other]), np.concatenate([other, own])
-        away, turned = (
-            self.vertices[two] - self.vertices[one],
-            self.normals[two] - self.normals[one],
+        known = np.vstack([np.hstack([self.vertices, self.normals]), beyond])
+        pairs = cKDTree(self.vertices).sparse_distance_matrix(
+            cKDTree(known[:, :3]), radius, output_type="ndarray"
         )
+        one, two = pairs["i"], pairs["j"]
+        facing = np.sum(self.normals[one] * known[two, 3:], axis=1) > FACING
+        one, two = one[facing], two[facing]
+        away, turned = known[two, :3] - self.vertices[one], known[two, 3:] - self.normals[one]
         frames = tangent_frames(self.normals)
         s = np.einsum("nai,ni->na", frames[one], away)
         t = np.einsum("nai,ni->na", frames[one], turned)
@@ -213,6 +213,17 @@ class Surface:
         bent = fitted[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
         tensor = np.einsum("vai,vab,vbj->vij", frames, bent, frames)
         return np.asarray(tensor[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
+
+    def gradient(self, values: Array) -> Array:
+        """Gradient (v, 3) at the vertices of a field (v,) given there: the mean of triangles'."""
+        corners, own = self.vertices[self.triangles], values[self.triangles]
+        sides = np.roll(corners, 1, axis=1) - np.roll(corners, -1, axis=1)  # opposite the corners
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        areas = np.linalg.norm(normals, axis=1, keepdims=True)  # twice
+        slopes = np.cross(normals / areas, np.einsum("ta,tai->ti", own, sides))  # times these
+        total = np.zeros((len(values), 4))
+        np.add.at(total, self.triangles, np.column_stack([slopes, areas])[:, None])
+        return np.asarray(total[:, :3] / total[:, 3:])
 
     def rim(self) -> Ints:
         """Vertices on the border of the surface: ends of edges that belong to one triangle."""

@@ -244,9 +244,13 @@ def _look(solver, k, slot):
     tip.curved[1, 0] = tip.curved[0, 1]
     for s in range(len(seen)):
         superpose(solver.warm.inverse[slot], seen[s], tip.answered[s])
+    law, found, edge = contact.law, contact.found, outcome.limits[LIMIT_FIELDS + EDGE_FIELD :]
+    solver.tip.fading(edge[0], law, found[0], found[1], contact.fading)
+    for a in range(2):
+        tip.inwards[a] = np.dot(tip.tangents[a], edge[1:4])
     settle(
-        np.dot(tip.answered, seen.T), contact.found[0], contact.found[1], gap, normal, tip.towards,
-        tip.slopes, tip.curved, tip.gradient, tip.hessian,
+        np.dot(tip.answered, seen.T), found[0], found[1], gap, normal, tip.towards, tip.slopes,
+        tip.curved, tip.inwards, contact.fading, tip.gradient, tip.hessian,
     )  # fmt: skip
     tip.g[:] += share * tip.gradient
     tip.H[:] += share * tip.hessian

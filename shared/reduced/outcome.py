@@ -32,6 +32,7 @@ class Outcome(NamedTuple):
     departure: Number  # from the linear response, relative to it
     residual: Number  # of an answer at once: relative residual of such in the full model
     penetration: Number  # mm, of the tip in the smoothed deformed surface
+    barred: Number  # force with which the rim holds the tip's place back, over the tip's force
     touched: Number  # number of local models that the tip touches
     foot: Vector  # mm, on the surface, nearest to the position
     upward: Vector  # outward normal there

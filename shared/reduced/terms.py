@@ -32,6 +32,7 @@ class Contact(NamedTuple):
     away: Annotated[Array, "3"]  # mm, from the place at rest to the tip's centre
     law: Annotated[Array, "5"]  # beta, relief, loss, held; penetration (mm) of tissue at rest
     found: Annotated[Array, "3"]  # force, stiffness, penetration of the last state
+    fading: Annotated[Array, "3"]  # see ``Tip.fading``
 
 
 class TipWarm(NamedTuple):
@@ -59,6 +60,7 @@ class TipScratch(NamedTuple):
     answered: Annotated[Array, "5, r"]
     slopes: Annotated[Array, "2, 3"]
     curved: Annotated[Array, "2, 2"]
+    inwards: Annotated[Array, "2"]  # change of the distance from an edge along the tangents
     towards: Annotated[Array, "3"]  # from the smoothed surface to the centre
     gradient: Annotated[Array, "5"]  # of the energy of one model, see ``tip.settle``
     hessian: Annotated[Array, "5, 5"]

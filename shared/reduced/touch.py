@@ -184,6 +184,7 @@ def _settle(solver, x):
             outcome.status[0] = newton.EXHAUSTED
             break
     outcome.tangent[:] = 0.0
+    outcome.barred[0] = 0.0
     if outcome.status[0] == newton.CONVERGED and outcome.touched[0] > 0.0:
         _react(solver)
     else:
@@ -286,6 +287,8 @@ def _react(solver):
     )  # fmt: skip
     follows = solver.warm.tip.follows
     follow(tip.H, tip.barred, tip.turned, outcome.tangent)
+    pressed = math.sqrt(np.dot(outcome.force, outcome.force))
+    outcome.barred[0] = np.dot(tip.g[:2], tip.barred) / max(pressed, 1e-300)
     weight_gradients(models.centres, models.blend, outcome.foot, active)
     for i in range(3):
         for j in range(3):

@@ -52,7 +52,7 @@ def test_with_a_footprint_on_a_half_space_it_is_hertzs_law():
 
 def test_an_edge_dents_as_twice_the_force_does_and_more_and_further_away_it_is_not_felt():
     psi = 1.29 - (0.08 - 0.5 * TISSUE.poisson) / (1.0 - TISSUE.poisson)
-    softer = 1.0 + tip.EXCESS * (psi - 1.0) / 2.0
+    softer = (1.0 + psi) / 2.0
     at_edge, away = (TIP.local_law(1.0 / TIP.radius, edge) for edge in (0.0, 4.0 * TIP.radius))
     for force in (0.01, 1.0):
         assert tip.approach(*at_edge, force) == pytest.approx(
@@ -61,6 +61,35 @@ def test_an_edge_dents_as_twice_the_force_does_and_more_and_further_away_it_is_n
         assert tip.approach(*away, force) == pytest.approx(tip.approach(*LAW, force), rel=1e-8)
     blunt = TIP.local_law(1.0 / TIP.radius, TIP.image_distance(0.0, 0.3))
     assert LAW[0] < blunt[0] < at_edge[0]
+
+
+@pytest.mark.parametrize("past", [(0.0, 0.0), (0.2, 0.4)], ids=["at once", "in time"])
+def test_how_the_law_fades_from_an_edge_is_a_derivative(past):
+    edge, depth, found, h = 0.2, 0.3, np.empty(3), 1e-3
+
+    def law(edge):
+        return *TIP.local_law(1.0 / TIP.radius, edge), *past
+
+    # in time the energy is that beyond where contact begins, which its place does not change
+    began = past[1] / (1.0 - past[0])
+
+    def energy(edge):
+        beta, relief = law(edge)[:2]
+        begins = tip.approach(beta, relief, began)
+        return (
+            tip.push(*law(edge), depth)[2]
+            + (1.0 - past[0]) * tip.squeeze(beta, relief, begins)[2]
+            - past[1] * begins
+        )
+
+    force, stiffness, _ = tip.push(*law(edge), depth)
+    TIP.fading(edge, np.array(law(edge)), force, stiffness, found)
+    assert found[0] == pytest.approx(slope(energy, edge, h), rel=1e-8)
+    assert found[1] == pytest.approx(
+        slope(lambda s: tip.push(*law(s), depth)[0], edge, h), rel=1e-8
+    )
+    second = (energy(edge + h) - 2 * energy(edge) + energy(edge - h)) / h**2
+    assert found[2] == pytest.approx(second, rel=1e-4)
 
 
 def test_the_relief_is_the_mean_displacement_of_a_half_space_under_its_footprint():
@@ -102,9 +131,13 @@ def test_a_held_law_remembers_and_forgets():
 
 
 class Bumpy:
-    """A small linear body whose contact sees a curved surface, of which all is known."""
+    """A small linear body whose contact sees a curved surface, of which all is known.
 
-    def __init__(self, rng):
+    It may have an edge, ``away`` mm from the origin.
+    """
+
+    def __init__(self, rng, away):
+        self.away, self.inwards = away, np.array([0.8, 0.6]) * np.isfinite(away)
         A = rng.standard_normal((8, 8))
         self.K = 20.0 * (A @ A.T / 8 + np.eye(8))
         self.U = 0.4 * rng.standard_normal((6, 3, 8))  # mean, and its derivatives 1, 2, 11, 12, 22
@@ -130,27 +163,57 @@ class Bumpy:
             m, slopes, _, mean, _ = self.surface(X, u)
             d = c - m
             gap = np.linalg.norm(d)
-            force = tip.squeeze(*LAW, TIP.radius - gap)[0]
-            return np.concatenate([self.K @ u + force * mean.T @ d / gap, slopes @ d])
+            force = tip.squeeze(*self.law(X)[:2], TIP.radius - gap)[0]
+            fading = self.fading(X, TIP.radius - gap)[0] * self.inwards
+            return np.concatenate(
+                [self.K @ u + force * mean.T @ d / gap, slopes @ d * force / gap + fading]
+            )
 
         z = root(gradient, np.zeros(10), tol=1e-13).x
         u, X = z[:8], z[8:]
         gap = np.linalg.norm(c - self.surface(X, u)[0])
-        return u, X, 0.5 * u @ self.K @ u + tip.squeeze(*LAW, TIP.radius - gap)[2]
+        return u, X, 0.5 * u @ self.K @ u + tip.squeeze(*self.law(X)[:2], TIP.radius - gap)[2]
+
+    def law(self, X):
+        return *TIP.local_law(1.0 / TIP.radius, self.away + self.inwards @ X), 0.0, 0.0
+
+    def fading(self, X, depth):
+        law, changes = np.array(self.law(X)), np.empty(3)
+        force, stiffness, _ = tip.squeeze(*law[:2], depth)
+        TIP.fading(self.away + self.inwards @ X, law, force, stiffness, changes)
+        return changes
 
 
-def test_place_and_force_follow_the_centre(rng):
+FROM_AN_EDGE = pytest.mark.parametrize("away", [np.inf, 0.3], ids=["inside", "near an edge"])
+
+
+@FROM_AN_EDGE
+def test_place_and_force_follow_the_centre(away, rng):
     """Beside differences of the energy, and of the place where it is stationary."""
-    body, c = Bumpy(rng), np.array([0.1, -0.2, TIP.radius - 0.5])
+    body, c = Bumpy(rng, away), np.array([0.1, -0.2, TIP.radius - 0.5])
     u, X, _ = body.solve(c)
     m, slopes, curved, mean, turned = body.surface(X, u)
     gap = float(np.linalg.norm(c - m))
     normal = (c - m) / gap
     seen = np.vstack([mean, normal @ turned[0], normal @ turned[1]])
-    force, stiffness, _ = tip.squeeze(*LAW, TIP.radius - gap)
+    force, stiffness, _ = tip.squeeze(*body.law(X)[:2], TIP.radius - gap)
+    fading = body.fading(X, TIP.radius - gap)
     g, H = np.empty(tip.SEEN), np.empty((tip.SEEN, tip.SEEN))
     M = np.ascontiguousarray(seen @ np.linalg.solve(body.K, seen.T))
-    tip.settle(M, force, stiffness, gap, normal, normal, slopes, curved @ normal, g, H)
+    tip.settle(
+        M,
+        force,
+        stiffness,
+        gap,
+        normal,
+        normal,
+        slopes,
+        curved @ normal,
+        body.inwards,
+        fading,
+        g,
+        H,
+    )
     follows, tangent = np.empty((2, 3)), np.empty((3, 3))
     tip.follow(H, np.zeros(2), follows, tangent)
     np.testing.assert_allclose(g[:2], 0.0, atol=1e-9)
@@ -168,30 +231,35 @@ def test_place_and_force_follow_the_centre(rng):
         assert tangent[i, j] == pytest.approx(-second, abs=2e-4 * np.abs(tangent).max())
 
 
-def test_a_step_leads_to_the_place(rng):
+@FROM_AN_EDGE
+def test_a_step_leads_to_the_place(away, rng):
     """From a place and a normal beside the right ones, the error falls quadratically."""
-    body, c = Bumpy(rng), np.array([0.1, -0.2, TIP.radius - 0.5])
+    body, c = Bumpy(rng, away), np.array([0.1, -0.2, TIP.radius - 0.5])
     known, exact, _ = body.solve(c)
     right, errors = c - body.surface(exact, known)[0], []
-    for away in (0.04, 0.02):
-        X = exact + away * np.array([0.6, -0.8])
-        normal = right / np.linalg.norm(right) + away * np.array([0.5, 0.5, 0.0])
+    for beside in (0.04, 0.02):
+        X = exact + beside * np.array([0.6, -0.8])
+        normal = right / np.linalg.norm(right) + beside * np.array([0.5, 0.5, 0.0])
         normal /= np.linalg.norm(normal)
 
         def gradient(u, X=X, normal=normal):
             m, *_, mean, _ = body.surface(X, u)
             depth = TIP.radius - normal @ (c - m)
-            return body.K @ u + tip.squeeze(*LAW, depth)[0] * mean.T @ normal
+            return body.K @ u + tip.squeeze(*body.law(X)[:2], depth)[0] * mean.T @ normal
 
         u = root(gradient, known, tol=1e-13).x
         m, slopes, curved, mean, turned = body.surface(X, u)
         gap = float(np.linalg.norm(c - m))
         seen = np.vstack([mean, normal @ turned[0], normal @ turned[1]])
-        force, stiffness, _ = tip.squeeze(*LAW, TIP.radius - normal @ (c - m))
+        depth = TIP.radius - normal @ (c - m)
+        force, stiffness, _ = tip.squeeze(*body.law(X)[:2], depth)
+        fading = body.fading(X, depth)
         g, H, moved = np.empty(tip.SEEN), np.empty((tip.SEEN, tip.SEEN)), np.empty(2)
         M = np.ascontiguousarray(seen @ np.linalg.solve(body.K, seen.T))
         towards, bent = (c - m) / gap, curved @ normal
-        tip.settle(M, force, stiffness, gap, normal, towards, slopes, bent, g, H)
+        tip.settle(
+            M, force, stiffness, gap, normal, towards, slopes, bent, body.inwards, fading, g, H
+        )
         tip.next_place(g, H, np.zeros(2), moved)
         errors.append(np.linalg.norm(X + moved - exact))
     assert errors[1] < 0.3 * errors[0] < 0.3 * 0.001

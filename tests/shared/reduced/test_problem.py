@@ -193,11 +193,12 @@ class Touched(Pressed):
     def full_load(self, share):
         nodal = np.zeros((MEANS, len(self.mean)))
         nodal[0] = self.mean
+        inside = np.array([np.inf, 0.0, 0.0, 0.0])
         law, away = (
             (*self.tip.local_law(1.0 / RADIUS, np.inf), 0.0, 0.0),
             (RADIUS - share * DEPTH) * NORMAL,
         )
-        return TipLoad(self.tip, nodal, np.eye(3)[:2], np.zeros((2, 2)), away, NORMAL, law)
+        return TipLoad(self.tip, nodal, np.eye(3)[:2], np.zeros((2, 2)), away, NORMAL, law, inside)
 
 
 def assert_close(found, expected, tolerance=ACCURATE):

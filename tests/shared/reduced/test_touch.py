@@ -1,12 +1,15 @@
 """The rigid tip on the reduced model: what is answered, what is flagged, what is refused."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from palpate.offline.fem.problem import TipPosition
 from palpate.shared.errors import QueryError
+from palpate.shared.geometry.surface import Surface
+from palpate.shared.model import ReducedModel
 
 
 def above(atlas, depth, at=(0.5, 0.5)):
@@ -56,7 +59,7 @@ def path(atlas, depth, points):
 
 def test_the_tangent_is_the_derivative_of_the_force(atlas):
     h = 0.005
-    for at in ((0.5, 0.5), (0.31, 0.62), (0.7, 0.44)):
+    for at in ((0.5, 0.5), (0.31, 0.62), (0.7, 0.44), (0.02, 0.52)):
         x = above(atlas, 0.6, at)
         tangent = atlas.touch(x).tangent
         for axis in range(3):
@@ -138,6 +141,27 @@ def test_what_is_outside_the_range_is_flagged(atlas):
     assert deep.error_displacement == deep.error_von_mises == deep.error_force == np.inf
     beside = np.add(above(atlas, 1.9, (1.0, 0.5)), [0.5, 0, 0])
     assert "position" in atlas.touch(beside).out_of_range
+
+
+def test_a_tip_that_would_go_on_over_the_rim_is_out_of_range(atlas):
+    """Half of the top is accessible: beside it the tip presses the other half."""
+    whole, (x, y, z) = atlas.surface, above(atlas, 0.4)
+    inside = whole.vertices[:, 0] < x + 1e-9
+    number = np.cumsum(inside) - 1
+    triangles = whole.triangles[inside[whole.triangles].all(axis=1)]
+    half = Surface(
+        whole.vertices[inside], number[triangles].astype(np.int32), whole.normals[inside]
+    )
+    centres = atlas.body.nodes[atlas.body.faces].mean(axis=1)
+    body = replace(atlas.body, accessible=atlas.body.accessible & (centres[:, 0] < x))
+    known = atlas.limits[inside], atlas.models, atlas.estimators
+    model = ReducedModel("half", atlas.scene, {}, body, half, *known)
+    for beside, flags in ((-0.5, ()), (0.1, ()), (0.5, ("position",))):
+        found = model.touch([x + beside, y, z])
+        assert found.converged
+        assert found.out_of_range == flags
+    sideways = abs(found.force[0]), abs(atlas.touch([x + 0.5, y, z]).force[0])
+    assert sideways[0] > 0.1 * found.force[2] > sideways[1]
 
 
 @pytest.mark.parametrize("depth", [1e-6, 1e-4, 5e-3, 9e-3, 0.02])
