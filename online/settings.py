@@ -7,6 +7,8 @@ from typing import Any
 
 import click
 
+from palpate.shared.cli import Finite
+
 
 def _option(default: Any, help: str | None = None, type: Any = None, **more: Any) -> Any:
     """Make a field that is an option as well; its `flag` is by default the field's name."""
@@ -52,16 +54,20 @@ class Settings:
         multiple=True,
         envvar="PALPATE_ORIGINS",
     )
+    proxy: str | None = _option(
+        None,
+        "Address of a proxy that is believed who its clients are (X-Forwarded-For); none is.",
+    )
     rate_limit: float = _option(
         2000.0,
         "Requests per second and client address; more are refused. As many may come at once after "
         "a pause; of a session only the opening counts. 0: no limit.",
-        click.FloatRange(0),
+        Finite(0),
     )
     max_wait: float = _option(
         0.1,
         "Seconds after which a waiting request is refused rather than answered late.",
-        click.FloatRange(0.001),
+        Finite(0.001),
     )
     max_body: int = _option(
         64 * 1024, "Most bytes of a request; a query needs some hundred.", click.IntRange(1024)
@@ -76,7 +82,7 @@ class Settings:
         16, "Most sessions at a time; further ones are refused.", click.IntRange(0)
     )
     session_idle: float = _option(
-        60.0, "Seconds after which a session that sends nothing is closed.", click.FloatRange(0.1)
+        60.0, "Seconds after which a session that sends nothing is closed.", Finite(0.1)
     )
     echo: bool = _option(False, "Answer /echo, for palpate loadtest --echo.")
     log_format: str = _option("json", type=click.Choice(["json", "text"]))
@@ -92,9 +98,7 @@ class Plan:
     url: str
     scene: str
     sessions: int = _option(1, "Tools at once.", click.IntRange(0))
-    rate: float = _option(
-        1000.0, "Frames per second of each session.", click.FloatRange(1, 100_000)
-    )
+    rate: float = _option(1000.0, "Frames per second of each session.", Finite(1, 100_000))
     outputs: tuple[str, ...] = _option(
         (),
         "What frames ask for beyond force and tangent; may be repeated.",
@@ -105,21 +109,21 @@ class Plan:
     queries: float = _option(
         0.0,
         "Solves over HTTP, in all, with fields in binary.",
-        click.FloatRange(0, 100_000),
+        Finite(0, 100_000),
         flag="--queries-per-second",
     )
     region: str = _option(
         "all", "Nodes that queries ask fields for.", click.Choice(["none", "surface", "all"])
     )
     connections: int = _option(4, "Connections that queries share.", click.IntRange(1, 1000))
-    duration: float = _option(10.0, "s", click.FloatRange(0.5))
+    duration: float = _option(10.0, "s", Finite(0.5))
     overload: float = _option(
         1.0,
         "Multiply the rates for a second DURATION, go back to them for a third, and say how soon "
         "all is as before.",
-        click.FloatRange(1),
+        Finite(1),
     )
-    depth: float = _option(1.0, "How deep the tools press, mm.", click.FloatRange(0))
+    depth: float = _option(1.0, "How deep the tools press, mm.", Finite(0))
     echo: bool = _option(
         False,
         "Measure what the service adds to a solve, too: send as many frames again that are only "

@@ -4,8 +4,10 @@ Its subcommands are the entry points of the group ``palpate.commands``; each is 
 asked for, so that this module needs neither side of the house.
 """
 
+import math
 import os
 from importlib.metadata import entry_points
+from typing import Any
 
 import click
 
@@ -19,6 +21,19 @@ Example, from a scene to an answer:
   palpate solve quick --at 5 5 8 --pressure 1.5
   palpate serve --artifacts artifacts
 """
+
+
+class Finite(click.FloatRange):
+    """A finite number in a range."""
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """Read it."""
+        number: float = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value} is not a finite number.", param, ctx)
+        return number
 
 
 class _UserError(click.ClickException):

@@ -15,8 +15,10 @@ import orjson
 from fastapi import APIRouter, FastAPI, Path, Request, Response
 from fastapi.responses import PlainTextResponse
 from fastapi.routing import APIRoute
+from starlette.exceptions import HTTPException
 from starlette.middleware.cors import CORSMiddleware
 from starlette.routing import WebSocketRoute
+from starlette.websockets import WebSocket
 
 from palpate.online.serve import errors, guard, schemas, wire
 from palpate.online.serve.answer import answer
@@ -76,10 +78,17 @@ def create_app(here: Service, on_ready: Callable[[], None] = lambda: None) -> Fa
         )
     # FastAPI's own inclusion of a router makes a request 20 µs slower
     app.router.routes += [*queries.routes, *scenes.routes, *service.routes]
-    app.router.routes.append(WebSocketRoute("/scenes/{name}/session", sessions))
+    sockets: dict[str, Any] = {"/scenes/{name}/session": sessions, "/{path:path}": _nothing_here}
     if settings.echo:
-        app.router.routes.append(WebSocketRoute(websocket.ECHO, websocket.echo))
+        sockets = {websocket.ECHO: websocket.echo, **sockets}
+    app.router.routes += [WebSocketRoute(path, answers) for path, answers in sockets.items()]
     return app
+
+
+async def _nothing_here(client: WebSocket) -> None:
+    """Refuse a handshake at a path that has no session, as any request there."""
+    response = errors.as_refusal(HTTPException(404)).response()
+    await response(client.scope, client.receive, client.send)
 
 
 def _prepare(here: Service, sessions: Sessions, on_ready: Callable[[], None]) -> None:
@@ -227,8 +236,7 @@ async def ready(request: Request) -> dict[str, str]:
     here: Service = request.app.state.service
     here.require_ready()
     if not here.models:
-        reasons = "; ".join(refused["reason"] for refused in here.refused)
-        raise Refusal("not_ready", "", f"No artifact could be loaded: {reasons}")
+        raise Refusal("not_ready", "", "No artifact could be loaded; /scenes and the log say why")
     return {"status": "ready"}
 
 

@@ -21,11 +21,13 @@ _CODES = {
     405: "method_not_allowed",
     406: "not_acceptable",
     413: "body_too_large",
+    414: "url_too_long",
     415: "unsupported_media_type",
     421: "foreign_host",
     422: "invalid_json invalid_value unanswerable_query no_equilibrium too_large_for_json",
     426: "upgrade_required",
     429: "too_many_requests",
+    431: "headers_too_large",
     500: "internal",
     503: "overloaded not_ready too_many_sessions",
 }

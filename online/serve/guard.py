@@ -6,11 +6,11 @@ Pure ASGI: Starlette's BaseHTTPMiddleware would cost a query more than its solve
 import hmac
 import ipaddress
 import math
+import re
 from collections.abc import Mapping
 from contextlib import suppress
 from functools import lru_cache
 from time import perf_counter
-from urllib.parse import urlsplit
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -29,6 +29,9 @@ METRICS = "/metrics"
 
 LOCAL = "localhost"
 """Name of this machine for itself."""
+
+_HOST = re.compile(rb"(?:\[([0-9A-Fa-f:.]+)\]|([A-Za-z0-9._-]+))(?::[0-9]*)?")
+"""A Host header: an address in brackets or a name, and maybe a port (RFC 9110, 7.2)."""
 
 BURST = 1.0
 """Seconds of the rate limit that may come at once, but always one request."""
@@ -113,9 +116,8 @@ def machine_name(name: str) -> str:
 @lru_cache(64)
 def _host(header: bytes) -> str:
     """Read the name or address in a Host header."""
-    with suppress(ValueError):
-        return machine_name(urlsplit(f"//{header.decode('latin-1')}").hostname or "")
-    return ""
+    read = _HOST.fullmatch(header)
+    return machine_name((read[1] or read[2]).decode()) if read else ""
 
 
 class RateLimit:

@@ -19,11 +19,16 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from time import perf_counter
+from typing import ClassVar
 
 import click
 import uvicorn
 from fastapi import FastAPI
-from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
+from uvicorn.protocols.http.httptools_impl import (
+    STATUS_LINE,
+    HttpToolsProtocol,
+    RequestResponseCycle,
+)
 from uvicorn.supervisors.multiprocess import Multiprocess
 
 from palpate.online.serve.errors import Refusal
@@ -31,7 +36,7 @@ from palpate.online.serve.guard import LOCAL, RECEIVED, machine_name
 from palpate.online.serve.metrics import Metrics, make_table
 from palpate.online.session.websocket import OPTIONS
 from palpate.online.settings import Settings
-from palpate.shared.errors import PalpateError
+from palpate.shared.errors import PalpateError, printable
 
 logger = logging.getLogger(__name__)
 
@@ -40,6 +45,20 @@ MOST_CONNECTIONS = 900
 
 PATIENCE = 10.0
 """Seconds that a client gets to send a request, or to begin its first one."""
+
+MOST_HEAD = 16 * 1024
+"""Bytes of a request up to its body, about: they are read before anybody knows who asks."""
+
+MOST_PIPELINED = 16
+"""Requests of a connection that wait for the answer to the one before."""
+
+MOST_UNREAD = 64 * 1024**2
+"""Bytes of answers that clients have not read yet, of one worker."""
+
+UNREAD = 5.0
+"""Seconds that a client gets to read more of an answer."""
+
+_OF_BODIES = b"content-length", b"transfer-encoding"
 
 LAST_WAIT = 4.0
 """Seconds that workers get to end."""
@@ -50,33 +69,81 @@ PRIORITY = 10
 _MCL_CURRENT, _MCL_ONFAULT = 1, 4  # Linux: what is in memory, not all that could be
 
 
-def _full() -> bytes:
-    """Write the response to a client for whom there is no place, as it goes over the wire."""
-    message, allowed = "The service has no place for another connection", MOST_CONNECTIONS
-    later = {"Retry-After": "1", "Connection": "close"}
-    full = Refusal("overloaded", "", message, {"max_connections": allowed}, later).response()
-    head = b"".join(name + b": " + value + b"\r\n" for name, value in full.raw_headers)
-    return STATUS_LINE[full.status_code] + head + b"\r\n" + bytes(full.body)
-
-
 class HttpProtocol(HttpToolsProtocol):
     """Uvicorn's HTTP, which notes when it read a request, and bounds what connections cost.
 
-    One beyond `MOST_CONNECTIONS` is refused, one whose request takes longer than `PATIENCE` closed.
+    One beyond `MOST_CONNECTIONS` is refused, as is a request with more than `MOST_HEAD` before its
+    body; one whose request takes longer than `PATIENCE`, that asks on and on without waiting for
+    answers, or that does not read them, is closed.
     """
+
+    unread: ClassVar[dict["HttpProtocol", int]] = {}  # bytes, of connections that do not read
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Take over a connection."""
         super().connection_made(transport)
-        self.patience = self.loop.call_later(PATIENCE, transport.abort)
+        self.patience = self.reading = self.loop.call_later(PATIENCE, transport.abort)
+        self.head: int | None = 0  # bytes of it read; None where a body is read
+        self.url = b""
+        self.asked: list[RequestResponseCycle] = []  # not answered yet
         if len(self.connections) > MOST_CONNECTIONS:
-            transport.write(_full())
-            transport.close()
+            allowed = {"max_connections": MOST_CONNECTIONS}
+            message = "The service has no place for another connection"
+            self.refuse(Refusal("overloaded", "", message, allowed, {"Retry-After": "1"}))
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Forget a connection."""
         self.patience.cancel()
+        for cycle in self.asked:  # uvicorn tells the last only
+            cycle.disconnected = True
+            cycle.message_event.set()
+        self.resume_writing()
         super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Read on, little by little so that heads of requests can be counted."""
+        for start in range(0, len(data), MOST_HEAD):
+            part = data[start : start + MOST_HEAD]
+            super().data_received(part)
+            if self.transport.is_closing() or self.transport.get_protocol() is not self:
+                return
+            if self.head is not None:
+                self.head += len(part)
+                if self.head > MOST_HEAD:
+                    self.refuse_head()
+                    return
+
+    def refuse_head(self) -> None:
+        """Refuse a request whose head is too long."""
+        allowed = {"max_bytes": MOST_HEAD}
+        if len(self.url) > MOST_HEAD // 2:
+            self.refuse(Refusal("url_too_long", "url", "The address is too long", allowed))
+        else:
+            message = "The headers are too long"
+            self.refuse(Refusal("headers_too_large", "headers", message, allowed))
+
+    def refuse(self, refusal: Refusal) -> None:
+        """Answer to nothing that could be read, and close."""
+        response = refusal.response()
+        head = b"".join(name + b": " + value + b"\r\n" for name, value in response.raw_headers)
+        line = STATUS_LINE[response.status_code]
+        close = b"connection: close\r\n\r\n"
+        self.transport.write(line + head + close + bytes(response.body))
+        self.transport.close()
+
+    def pause_writing(self) -> None:
+        """Wait for a client that does not read, but not for ever, and not for too many."""
+        super().pause_writing()
+        self.reading = self.loop.call_later(UNREAD, self.transport.abort)
+        self.unread[self] = self.transport.get_write_buffer_size()
+        if sum(self.unread.values()) > MOST_UNREAD:
+            self.transport.abort()
+
+    def resume_writing(self) -> None:
+        """Go on with a client that reads."""
+        self.reading.cancel()
+        self.unread.pop(self, None)
+        super().resume_writing()
 
     def on_message_begin(self) -> None:
         """Begin a request."""
@@ -84,11 +151,35 @@ class HttpProtocol(HttpToolsProtocol):
         self.patience.cancel()
         self.patience = self.loop.call_later(PATIENCE, self.transport.abort)
         self.scope[RECEIVED] = perf_counter()  # type: ignore[literal-required]
+        self.head = 0
+
+    def on_header(self, name: bytes, value: bytes) -> None:
+        """Take a header, but none that comes after a body."""
+        if self.head is not None:
+            super().on_header(name, value)
+
+    def on_headers_complete(self) -> None:
+        """Know what is asked."""
+        last = self.cycle
+        super().on_headers_complete()
+        self.head = None
+        if self.cycle is not last:
+            self.asked.append(self.cycle)
+        elif any(name in _OF_BODIES for name, _ in self.headers):
+            self.refuse(Refusal("invalid_value", "headers", "A handshake has no body"))
+        if len(self.pipeline) > MOST_PIPELINED:
+            self.transport.abort()
+
+    def on_response_complete(self) -> None:
+        """Go on to the next request."""
+        del self.asked[0]
+        super().on_response_complete()
 
     def on_message_complete(self) -> None:
         """End a request; a handshake also ends here."""
         super().on_message_complete()
         self.patience.cancel()
+        self.head = 0
 
 
 class Supervisor(Multiprocess):
@@ -132,7 +223,8 @@ def serve(settings: Settings) -> None:
         http=HttpProtocol,
         log_config=None,
         access_log=settings.access_log,
-        **OPTIONS,
+        forwarded_allow_ips=settings.proxy,
+        **OPTIONS | {"proxy_headers": settings.proxy is not None},
     )
     try:
         bound = config.bind_socket()
@@ -210,9 +302,18 @@ class JsonFormatter(logging.Formatter):
         return json.dumps(document, default=str)
 
 
+class TextFormatter(logging.Formatter):
+    """Writes a record of the log as text, its message on one line."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        """Return the line, without what would begin another or move a terminal's cursor."""
+        record.message = printable(record.message)
+        return super().formatMessage(record)
+
+
 def set_up_log(settings: Settings) -> None:
     """Send every record of at least the level of `settings` to stderr, in their format."""
-    text = logging.Formatter("%(levelname)s: %(message)s")
+    text = TextFormatter("%(levelname)s: %(message)s")
     handler = logging.StreamHandler()
     handler.setFormatter(JsonFormatter() if settings.log_format == "json" else text)
     logging.basicConfig(level=settings.log_level.upper(), handlers=[handler], force=True)

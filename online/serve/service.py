@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from palpate.online.serve.errors import Refusal
 from palpate.online.serve.metrics import Metrics
 from palpate.online.settings import Settings
-from palpate.shared.errors import PalpateError
+from palpate.shared.errors import PalpateError, printable
 from palpate.shared.model import ReducedModel
 
 logger = logging.getLogger(__name__)
@@ -32,8 +32,12 @@ class Service:
         self.ready = asyncio.Event()
 
     def open(self, warm: Callable[[ServedModel], Any]) -> None:
-        """Load and warm the model of every ``*.h5``; refuse those that fail, serve the others."""
-        for path in sorted(self.settings.artifacts.glob("*.h5")):
+        """Load and warm the model of every ``*.h5``; refuse those that fail, serve the others.
+
+        Hidden files are none of them.  Clients learn names of files and not where they are.
+        """
+        found = sorted(self.settings.artifacts.glob("*.h5"))
+        for path in (path for path in found if not path.name.startswith(".")):
             try:
                 served = _served(ReducedModel.load(path))
                 name = served.model.name
@@ -46,7 +50,8 @@ class Service:
                     logger.exception("failed on %s", path)
                     reason = f"{path}: cannot be used: {type(error).__name__}"
                 logger.error("refused %s", reason)
-                self.refused.append({"file": path.name, "reason": reason})
+                told = {"file": path.name, "reason": reason.replace(str(path), path.name)}
+                self.refused.append({key: printable(text) for key, text in told.items()})
             else:
                 self.models[name] = served
                 logger.info("serving %s from %s", name, path)

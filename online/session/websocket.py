@@ -8,7 +8,7 @@ from typing import Any
 
 from starlette.websockets import WebSocket
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
-from websockets.frames import Frame
+from websockets.frames import CloseCode, Frame
 from websockets.http11 import Request
 
 from palpate.online.session.frames import REPLY
@@ -73,6 +73,24 @@ class SessionProtocol(WebSocketsSansIOProtocol):
         if self.response.status_code == 101:
             extensions: dict[str, Any] = self.scope["extensions"]
             extensions[CONNECTION] = self
+
+    def send_receive_event_to_app(self) -> None:
+        """Pass on a message, unless it says that it is text and is none."""
+        if self.curr_msg_data_type == "text":
+            try:
+                b"".join(self.frames).decode()
+            except UnicodeDecodeError:
+                self.conn.fail(CloseCode.INVALID_DATA, "not UTF-8")
+                self.handle_parser_exception()
+                return
+        super().send_receive_event_to_app()
+
+    def handle_parser_exception(self) -> None:
+        """End a connection whose bytes mean nothing; before a handshake nobody is told."""
+        if self.conn.close_sent is None:
+            self.transport.close()
+        else:
+            super().handle_parser_exception()
 
     def handle_ping(self) -> None:
         """Answer a ping, unless the answers to those before pile up here."""
@@ -146,5 +164,7 @@ OPTIONS: dict[str, Any] = {
     "ws_max_size": 4096,
     # what is not over then is cut; the whole shutdown must fit into five seconds
     "timeout_graceful_shutdown": 3,
+    # who a client is only its connection tells
+    "proxy_headers": False,
 }
-"""Options of `uvicorn.Config` that sessions rely on."""
+"""Options of `uvicorn.Config` that sessions and limits rely on."""

@@ -53,8 +53,8 @@ def test_a_service_that_is_told_to_stop_does_not_wait_for_its_models(slow):
 
 def test_a_service_without_any_model_is_not_ready(serve):
     with serve(PalpateError("broken.h5: truncated")) as client:
-        assert "broken.h5: truncated" in error_of(client.get("/ready"), 503)["message"]
-        assert client.get("/scenes").json()["refused"]
+        assert "/scenes" in error_of(client.get("/ready"), 503)["message"]
+        assert client.get("/scenes").json()["refused"][0]["reason"] == "broken.h5: truncated"
 
 
 def test_openapi_tells_units_ranges_and_examples(client):

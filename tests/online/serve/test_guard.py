@@ -50,6 +50,7 @@ def test_pages_of_other_sites_are_refused(serve):
 
 LOCAL = {"hosts": ("localhost", "Trainer")}
 FOREIGN = "evil.example", "evil.example:8000", "10.0.0.1", "localhost.evil.example", "", "[", "[::"
+FOREIGN += "localhost#.evil.example", "localhost?x", "localhost/x", "x@localhost", "localhost:80:80"
 OWN = "localhost", "LOCALHOST:80", "127.0.0.1:8000", "127.9.8.7", "[::1]:8000", "trainer:1"
 
 
