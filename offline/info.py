@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from palpate.shared.artifact import ArtifactError, read_artifact
+from palpate.shared.geometry.surface import Surface
+from palpate.shared.local_models import LoadRange, Mesh
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.reduced.press import TOLERANCE
 from palpate.shared.scene import Patch, Scene, SceneError, parse_scene
@@ -26,7 +28,7 @@ def info(artifact: Path) -> dict[str, Any]:
     ArtifactError
     """
     names = "nodes", "elements", "load_range", "surface_vertices"
-    found = read_artifact(artifact, names)
+    found = read_artifact(artifact, Mesh, Surface, LoadRange)
     try:
         scene = parse_scene(found.scene)
     except SceneError as error:

@@ -21,7 +21,6 @@ from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.shared.answer import describe
 from palpate.shared.arrays import Array
-from palpate.shared.artifact import read_artifact
 from palpate.shared.model import ReducedModel
 
 CELL_TYPES = {8: 12, 20: 25}  # VTK_HEXAHEDRON and VTK_QUADRATIC_HEXAHEDRON, by nodes per element
@@ -78,7 +77,7 @@ def solve(
     report["timing"] = {"solve_us": solve_us, "recover_us": recover_us}
     if not (full_model or vtu):
         return report
-    problem = FullProblem.of_artifact(read_artifact(artifact))
+    problem = FullProblem.of_artifact(artifact)
     load = Load(solution.contact_point, solution.direction, pressure)
     if full_model:
         exact, full_us = _timed(lambda: problem.solve(load))

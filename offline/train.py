@@ -64,7 +64,7 @@ from palpate.offline.validate.compare import (
 from palpate.offline.validate.queries import KINDS, Kind
 from palpate.shared import artifact
 from palpate.shared.arrays import Array, Numbers
-from palpate.shared.local_models import Estimators, LocalModels
+from palpate.shared.local_models import Estimators, LoadRange, LocalModels
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.model import ReducedModel
 from palpate.shared.scene import Scene, Size, divisions_of
@@ -110,23 +110,26 @@ def train(
     if not force and is_of(path, key):
         tqdm.write(f"{path}: up to date; --force trains it again", file=sys.stderr)
         return path
-    trained, mesh_choice = with_mesh(untrained)
     path.parent.mkdir(parents=True, exist_ok=True)
-    pool = worker_pool(open_scene, trained.text, str(trained.folder), count=workers)
     checkpoint = Checkpoint(path.parent / f".{path.stem}.training", key)
-    with pool:
-        pipeline = Pipeline(trained, pool, checkpoint, started)
-        count = workers or os.cpu_count() or 1
-        tqdm.write(forecast(pipeline.problem, count), file=sys.stderr)
-        pipeline.run(path, mesh_choice)
-    checkpoint.remove()
+    try:
+        trained, mesh_choice = with_mesh(untrained)
+        pool = worker_pool(open_scene, trained.text, str(trained.folder), count=workers)
+        with pool:
+            pipeline = Pipeline(trained, pool, checkpoint, started)
+            count = workers or os.cpu_count() or 1
+            tqdm.write(forecast(pipeline.problem, count), file=sys.stderr)
+            pipeline.run(path, mesh_choice)
+        checkpoint.remove()
+    finally:
+        checkpoint.leave()
     return path
 
 
 def is_of(path: Path, key: str) -> bool:
     """Whether an artifact is of the scene and code that ``content_key`` stands for."""
     try:
-        return bool(artifact.read_artifact(path, ()).documents["provenance"]["content_key"] == key)
+        return bool(artifact.read_artifact(path).documents["provenance"]["content_key"] == key)
     except artifact.ArtifactError:
         return False
 
@@ -197,9 +200,9 @@ class Pipeline:
         training["cubature_errors"] = {"displacement": statistics(known)}
         training |= {"seconds": self.seconds, "layout": self._describe(layout, models)}
         self.provenance["wall_seconds"] = round(time.perf_counter() - self.started, 1)
-        where = "at vertices: limit along the normal, compliance, depth of the tip"
-        datasets = {"load_range": artifact.Dataset(model.limits, "kPa, mm/kPa, mm", where)}
-        for part in (model.body, model.models, model.surface, Estimators(**estimators)):
+        datasets: dict[str, artifact.Dataset] = {}
+        kept = model.body, model.models, model.surface, LoadRange(model.limits)
+        for part in (*kept, Estimators(**estimators)):
             datasets |= artifact.datasets_of(part)
         artifact.write_artifact(path, self.scene.text, documents, datasets)
         for kind, rows in tables.items():

@@ -11,22 +11,28 @@ bit in HDF5's own structures can keep its library busy for ever.
 
 import hashlib
 import json
+import math
 import os
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from io import BufferedRandom, BufferedReader
 from pathlib import Path
-from typing import Any, NamedTuple, get_type_hints
+from types import UnionType
+from typing import Any, NamedTuple, get_args, get_type_hints
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.shared.errors import PalpateError
+from palpate.shared.files import open_regular
 
 FORMAT = "palpate-artifact"
 FORMAT_VERSION = 10
+
+MOST_INFLATED = 100
+"""Bytes of a dataset over those that it takes in the file."""
 
 SEAL_BYTES = 512
 """The smallest user block that HDF5 offers."""
@@ -56,19 +62,88 @@ class Artifact:
 
 
 class Stored(NamedTuple):
-    """How a dataclass's field is stored, which is what it is ``Annotated`` with."""
+    """How a dataclass's field is stored, which is what it is ``Annotated`` with.
+
+    ``shape`` has numbers and names of sizes, products of them, or so many more: ``"p + 1, 3 n"``.
+    ``values`` says which ones a reader can do with, beside finite ones: ``"< n"``, numbers from 0
+    on of that many things; ``"rising to n"``, from 0; ``"> 0"``; ``"nan"``, which may be among
+    them.
+    """
 
     name: str  # of the dataset; a field that may be None has one only if it is not
     units: str
+    shape: str
     description: str
+    values: str = ""
     how: str = ""  # "compress", worth while for integers, or "half": in half precision
+    type: Any = None  # of its numbers in memory, if it must be one
+
+    @property
+    def dtype(self) -> Any:
+        """Type of its numbers in a file."""
+        return np.float16 if self.how == "half" else self.type
+
+    def check(self, found: NDArray[Any] | h5py.Dataset, sizes: dict[str, int]) -> None:
+        """Raise ``ValueError`` unless type and shape are right; learns sizes not known so far."""
+        right = self.dtype is None or found.dtype == self.dtype
+        axes = self.shape.split(", ") if self.shape else []
+        if not right or len(axes) != found.ndim or not all(map(_fits(sizes), axes, found.shape)):
+            at = ", ".join(f"{name} = {size}" for name, size in sizes.items())
+            is_, wanted = f"{found.shape} {found.dtype}", f"({self.shape}) {np.dtype(self.dtype)}"
+            raise ValueError(f"dataset {self.name!r} is {is_} and not {wanted}, {at}")
+
+    def check_values(self, values: NDArray[Any], sizes: dict[str, int]) -> None:
+        """Raise ``ValueError`` unless all values are such as a reader can do with."""
+        usable = bool(np.isfinite(values).all())
+        match self.values.rpartition(" "):
+            case "<", _, size:
+                top = _extent(size, sizes)
+                usable = not values.size or 0 <= values.min() <= values.max() < top
+            case "rising to", _, size:
+                usable = values[0] == 0 <= np.diff(values).min() and values[-1] == sizes[size]
+            case ">", _, _:
+                usable = usable and bool((values > 0).all())
+            case _, _, "nan":
+                usable = not np.isinf(values).any()
+        if not usable:
+            raise ValueError(f"dataset {self.name!r} has values not {self.values or 'finite'}")
+
+
+def _extent(product: str, sizes: Mapping[str, int]) -> int:
+    """Value of a product of numbers and names of sizes."""
+    return math.prod(int(part) if part.isdigit() else sizes[part] for part in product.split())
+
+
+def _fits(sizes: dict[str, int]) -> Callable[[str, int], bool]:
+    """Whether an axis is as long as a shape says; learns the one size that is not known."""
+
+    def fits(axis: str, length: int) -> bool:
+        product, _, more = axis.partition(" + ")
+        parts, length = product.split(), length - int(more or 0)
+        for name in (part for part in parts if not part.isdigit() and part not in sizes):
+            parts.remove(name)
+            sizes[name] = length // (_extent(" ".join(parts), sizes) or 1)
+            break
+        return length == _extent(product, sizes)
+
+    return fits
 
 
 def _stored_fields(kind: type) -> dict[str, Stored]:
     """Stored fields of a dataclass, by their names."""
-    annotations = get_type_hints(kind, include_extras=True)
-    notes = {name: getattr(hint, "__metadata__", ()) for name, hint in annotations.items()}
-    return {name: Stored(*note) for name, note in notes.items() if note}
+    found = {}
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        if note := getattr(hint, "__metadata__", ()):
+            found[name] = Stored(*note)._replace(type=_number_type(get_args(hint)[0]))
+    return found
+
+
+def _number_type(kind: Any) -> Any:
+    """Type of the numbers of an annotated array, which may be absent; None if it may be any."""
+    if isinstance(kind, UnionType):
+        kind = get_args(kind)[0]
+    dtype = get_args(get_args(kind)[1])[0] if get_args(kind) else np.float64
+    return None if dtype is Any else dtype
 
 
 def datasets_of(record: Any) -> dict[str, Dataset]:
@@ -78,9 +153,8 @@ def datasets_of(record: Any) -> dict[str, Dataset]:
         value = getattr(record, name)
         if value is not None:
             values = np.asarray(value, np.float16 if stored.how == "half" else None)
-            datasets[stored.name] = Dataset(
-                values, stored.units, stored.description, stored.how == "compress"
-            )
+            what = f"{stored.description} ({stored.shape})"
+            datasets[stored.name] = Dataset(values, stored.units, what, stored.how == "compress")
     for item in fields(record):
         value = getattr(record, item.name)
         if is_dataclass(value):
@@ -140,19 +214,20 @@ def write_artifact(
         temporary.unlink(missing_ok=True)
 
 
-def read_artifact(path: Path, names: Collection[str] | None = None) -> Artifact:
-    """Read and verify an artifact, with all of its arrays or only those named.
+def read_artifact(path: Path, *kinds: type) -> Artifact:
+    """Read and verify an artifact, with the stored fields of dataclasses as far as it has them.
 
     Raises
     ------
     ArtifactError
-        If the file is missing, truncated, altered, of another format or of another version.
+        If the file is missing, truncated, altered, of another format or of another version, or has
+        what these fields cannot hold.
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             _check_seal(file, path)
         with h5py.File(path, "r") as opened:
-            return _read(opened, path, names)
+            return _read(opened, path, kinds)
     except ArtifactError:
         raise
     except OSError as error:
@@ -181,11 +256,20 @@ def _digest_of_rest(file: BufferedReader | BufferedRandom) -> str:
     return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _read(file: h5py.File, path: Path, names: Collection[str] | None) -> Artifact:
-    arrays = {}
-    for key in file if names is None else names:
-        stored = file[key]
-        arrays[key] = stored[()]
-        if digest(arrays[key]) != stored.attrs["sha256"]:
-            raise ArtifactError(f"{path}: altered: dataset {key!r} does not match its checksum")
+def _read(file: h5py.File, path: Path, kinds: Sequence[type]) -> Artifact:
+    arrays, sizes = {}, dict[str, int]()
+    declared = [stored for kind in kinds for stored in _stored_fields(kind).values()]
+    present = [stored for stored in declared if stored.name in file]
+    for stored in present:
+        found = file[stored.name]
+        stored.check(found, sizes)
+        if found.nbytes > MOST_INFLATED * found.id.get_storage_size():
+            raise ValueError(f"dataset {stored.name!r} has {found.nbytes} bytes, which is too much")
+        arrays[stored.name] = found[()]
+        if digest(arrays[stored.name]) != found.attrs["sha256"]:
+            raise ArtifactError(
+                f"{path}: altered: dataset {stored.name!r} does not match its checksum"
+            )
+    for stored in present:
+        stored.check_values(arrays[stored.name], sizes)
     return Artifact(str(file.attrs["scene"]), json.loads(str(file.attrs["documents"])), arrays)

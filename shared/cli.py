@@ -12,6 +12,7 @@ from typing import Any
 import click
 
 from palpate.shared.errors import PalpateError
+from palpate.shared.files import printable
 
 EXAMPLE = """\b
 Example, from a scene to an answer:
@@ -57,10 +58,12 @@ class _Commands(click.Group):
     def invoke(self, ctx: click.Context) -> object:
         try:
             return super().invoke(ctx)
-        except PalpateError as error:
-            if os.environ.get("PALPATE_DEBUG"):
+        except (PalpateError, OSError) as error:
+            said = error.strerror if isinstance(error, OSError) else str(error)
+            if said is None or os.environ.get("PALPATE_DEBUG"):
                 raise
-            raise _UserError(str(error)) from error
+            name = getattr(error, "filename", None)
+            raise _UserError(printable(f"{name}: {said}" if name else said)) from error
 
 
 @click.group(

@@ -5,13 +5,6 @@ class PalpateError(Exception):
     """Base of every error whose message is meant for the user."""
 
 
-def printable(text: str) -> str:
-    """Escape what of a text, such as a file's name, cannot be shown on one line anywhere."""
-    return "".join(
-        c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text
-    )
-
-
 class QueryError(PalpateError):
     """A query that cannot be answered as asked.
 

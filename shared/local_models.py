@@ -1,8 +1,9 @@
 """What training finds out about a scene: body, local models, error estimates.
 
-A ``Stored`` field is a dataset of the artifact, with its unit and a description that gives its
-shape: n nodes, p local models of r modes in a basis of M modes of their region, N nodes of the
-windows of all regions, G modes of the whole body.
+A ``Stored`` field is a dataset of the artifact: its name, unit, shape and description.  There are n
+nodes, e elements, f faces of the boundary, v vertices and t triangles of the accessible surface; p
+local models of r modes in a basis of M modes of their region, R regions, N nodes of all their
+windows, G modes of the whole body; c points of all cubatures.
 """
 
 from collections.abc import Mapping
@@ -19,10 +20,17 @@ from palpate.shared.artifact import values_of
 from palpate.shared.geometry.edges import sharp_points
 from palpate.shared.geometry.quadrature import surface_quadrature, volume_quadrature
 from palpate.shared.geometry.surface import Surface
-from palpate.shared.mechanics.footprint import SurfaceQuadrature
+from palpate.shared.mechanics.footprint import LIMIT_FIELDS, SurfaceQuadrature
 from palpate.shared.mechanics.laws import law_of
 from palpate.shared.mechanics.tip import CURVED_WITHIN, Tip, tip_of
 from palpate.shared.mechanics.tissue import Law
+from palpate.shared.reduced.features import (
+    CHANGES,
+    CHANGING,
+    LOAD_FEATURES,
+    RESIDUAL_FEATURES,
+    TANGENT_FEATURES,
+)
 from palpate.shared.reduced.outcome import HISTORY_FEATURES, PRESS_FEATURES, TOUCH_FEATURES
 from palpate.shared.scene import Scene
 
@@ -38,11 +46,11 @@ NO_EDGE = 1e6
 class Mesh:
     """A body of n nodes, e elements and f boundary faces, outward by the right-hand rule."""
 
-    nodes: Annotated[Array, "nodes", "mm", "nodes (n, 3), dof = 3 node + axis"]
-    elements: Annotated[Numbers, "elements", "1", "nodes of hexahedra (e, 8 or 20), VTK order"]
-    faces: Annotated[Numbers, "faces", "1", "nodes of boundary faces (f, 4 or 8), VTK"]
-    clamped: Annotated[Flags, "clamped", "1", "nodes held fixed (n,)"]
-    accessible: Annotated[Flags, "accessible", "1", "faces an endoscope can touch (f,)"]
+    nodes: Annotated[Array, "nodes", "mm", "n, 3", "nodes; dof = 3 node + axis"]
+    elements: Annotated[Numbers, "elements", "1", "e, k", "nodes of hexahedra, VTK order", "< n"]
+    faces: Annotated[Numbers, "faces", "1", "f, h", "nodes of boundary faces, VTK order", "< n"]
+    clamped: Annotated[Flags, "clamped", "1", "n", "nodes held fixed"]
+    accessible: Annotated[Flags, "accessible", "1", "f", "faces an endoscope can touch"]
 
 
 @dataclass(frozen=True)
@@ -93,17 +101,30 @@ class Body(Mesh):
 
 
 @dataclass(frozen=True)
+class LoadRange:
+    """What an endoscope may do at the vertices of the accessible surface."""
+
+    limits: Annotated[
+        Array,
+        "load_range",
+        "kPa, mm/kPa, mm",
+        f"v, {LIMIT_FIELDS}",
+        "limit along the normal, compliance, depth of the tip",
+    ]
+
+
+@dataclass(frozen=True)
 class ViscousModels:
     """What steps in time need beyond elastic local models; n pairs of neighbours."""
 
     deviatoric: Annotated[
-        Field, "viscous_deviatoric", "1", "deviatoric rest stiffness in the modes (p, r, r)"
+        Field, "viscous_deviatoric", "1", "p, r, r", "deviatoric rest stiffness in the modes"
     ]
     pairs: Annotated[
-        Numbers, "viscous_pairs", "1", "local models whose spaces meet (n, 2), ascending"
+        Numbers, "viscous_pairs", "1", "m, 2", "local models whose spaces meet, ascending", "< p"
     ]
     overlap: Annotated[
-        Field, "viscous_overlap", "1", "their modes' products at rest (n, r, r)", "half"
+        Field, "viscous_overlap", "1", "m, r, r", "their modes' products at rest", "", "half"
     ]
 
 
@@ -116,45 +137,82 @@ class LocalModels:
     """
 
     body: Annotated[
-        NDArray[np.int16], "body_modes", "body_steps", "modes of the body (G, 3 n)", "compress"
+        NDArray[np.int16], "body_modes", "body_steps", "G, 3 n", "modes of the body", "", "compress"
     ]
-    body_steps: Annotated[Field, "body_steps", "mm", "value of one step of a mode (G,)"]
-    far: Annotated[Field, "basis_far", "1", "body modes in regions' (regions, M, G)", "half"]
-    node_from: Annotated[Ints, "window_from", "1", "first node of each window (regions + 1,)"]
-    nodes: Annotated[Numbers, "window_nodes", "1", "nodes of all windows (N,)"]
+    body_steps: Annotated[Field, "body_steps", "mm", "G", "value of one step of a mode"]
+    far: Annotated[Field, "basis_far", "1", "R, M, G", "body modes in regions'", "", "half"]
+    node_from: Annotated[
+        Ints, "window_from", "1", "R + 1", "first node of each window", "rising to N"
+    ]
+    nodes: Annotated[Numbers, "window_nodes", "1", "N", "nodes of all windows", "< n"]
     basis: Annotated[
-        NDArray[Any], "basis", "basis_steps", "more modes there, by region (M 3 N,)", "compress"
+        NDArray[Any], "basis", "basis_steps", "3 M N", "more modes there, by region", "", "compress"
     ]
-    steps: Annotated[Field, "basis_steps", "mm", "value of one step of a mode (regions, M)"]
-    region: Annotated[Numbers, "patch_region", "1", "region of each local model (p,)"]
-    centres: Annotated[Array, "patch_centres", "mm", "centres of local models (p, 3)"]
-    frames: Annotated[Array, "patch_frames", "1", "rows: normal and two tangents (p, 3, 3)"]
-    pressures: Annotated[Array, "patch_pressures", "kPa", "load scale of local models (p,)"]
-    whole: Annotated[NDArray[np.int16], "patch_modes", "patch_mix", "modes in the basis (p, M, r)"]
-    mix: Annotated[Field, "patch_mix", "1", "makes them orthonormal (p, r, r)", "compress"]
-    point_from: Annotated[Ints, "cubature_from", "1", "first point of each local model (p + 1,)"]
-    points: Annotated[Numbers, "cubature_points", "1", "quadrature point by element (c,)"]
-    weights: Annotated[Array, "cubature_weights", "mm^3", "weight of each point (c,)"]
+    steps: Annotated[Field, "basis_steps", "mm", "R, M", "value of one step of a mode"]
+    region: Annotated[Numbers, "patch_region", "1", "p", "region of each local model", "< R"]
+    centres: Annotated[Array, "patch_centres", "mm", "p, 3", "centres of local models"]
+    frames: Annotated[Array, "patch_frames", "1", "p, 3, 3", "rows: normal and two tangents"]
+    pressures: Annotated[Array, "patch_pressures", "kPa", "p", "load scale of local models", "> 0"]
+    whole: Annotated[NDArray[np.int16], "patch_modes", "patch_mix", "p, M, r", "modes in the basis"]
+    mix: Annotated[Field, "patch_mix", "1", "p, r, r", "makes them orthonormal", "", "compress"]
+    point_from: Annotated[
+        Ints, "cubature_from", "1", "p + 1", "first point of each local model", "rising to c"
+    ]
+    points: Annotated[Numbers, "cubature_points", "1", "c", "quadrature point by element", "< 8 e"]
+    weights: Annotated[Array, "cubature_weights", "mm^3", "c", "weight of each point"]
     defect: Annotated[
-        Field, "patch_defect", "mN", "force that cubature misses (p, LOAD_FEATURES, r)", "half"
+        Field,
+        "patch_defect",
+        "mN",
+        f"p, {LOAD_FEATURES}, r",
+        "force that cubature misses",
+        "",
+        "half",
     ]
     guess: Annotated[
-        Field, "patch_guess", "1", "answer beyond the linear one (p, LOAD_FEATURES, r)", "half"
+        Field,
+        "patch_guess",
+        "1",
+        f"p, {LOAD_FEATURES}, r",
+        "answer beyond the linear one",
+        "",
+        "half",
     ]
     directions: Annotated[
-        Field, "patch_directions", "1", "of most change of the tangent (p, CHANGING, r)", "half"
+        Field,
+        "patch_directions",
+        "1",
+        f"p, {CHANGING}, r",
+        "of most change of the tangent",
+        "",
+        "half",
     ]
     change: Annotated[
-        Field, "patch_change", "1", "that change there (p, TANGENT_FEATURES, CHANGES)", "half"
+        Field,
+        "patch_change",
+        "1",
+        f"p, {TANGENT_FEATURES}, {CHANGES}",
+        "that change there",
+        "",
+        "half",
     ]
     residuals: Annotated[
-        Array, "patch_residuals", "1", "log of the residual in the full model (p, k)"
+        Array,
+        "patch_residuals",
+        "1",
+        f"p, {RESIDUAL_FEATURES}",
+        "log of the residual in the full model",
     ]
     cubature_errors: Annotated[
-        Array, "patch_cubature_errors", "1", "of displacement beside every point; nan: none (p, k)"
+        Array,
+        "patch_cubature_errors",
+        "1",
+        "p, s",
+        "of displacement beside every point; nan: none",
+        "nan",
     ]
-    extent: Annotated[float, "patch_extent", "mm", "largest distance of a contact"]
-    blend: Annotated[float, "patch_blend", "mm", "width of blending"]
+    extent: Annotated[float, "patch_extent", "mm", "", "largest distance of a contact", "> 0"]
+    blend: Annotated[float, "patch_blend", "mm", "", "width of blending", "> 0"]
     viscous: ViscousModels | None = None
 
     @classmethod
@@ -186,20 +244,30 @@ _FITTED = "log error = c . features; rows: displacement, von Mises, under the ti
 class Estimators:
     """Calibrated error estimates of loads and of the tip, at once and over histories."""
 
-    loads: Annotated[Array | None, "error_coefficients", "1", _FITTED] = None
-    touches: Annotated[Array | None, "tip_error_coefficients", "1", _FITTED] = None
-    histories: Annotated[Array | None, "history_error_coefficients", "1", _FITTED] = None
-    courses: Annotated[Array | None, "tip_history_error_coefficients", "1", _FITTED] = None
+    loads: Annotated[Array | None, "error_coefficients", "1", f"2, {PRESS_FEATURES}", _FITTED] = (
+        None
+    )
+    touches: Annotated[
+        Array | None, "tip_error_coefficients", "1", f"3, {TOUCH_FEATURES}", _FITTED
+    ] = None
+    histories: Annotated[
+        Array | None, "history_error_coefficients", "1", f"2, {HISTORY_FEATURES}", _FITTED
+    ] = None
+    courses: Annotated[
+        Array | None, "tip_history_error_coefficients", "1", f"3, {HISTORY_FEATURES}", _FITTED
+    ] = None
     mesh: Annotated[
         Array | None,
         "mesh_error_coefficients",
         "1",
+        "3, 3",
         "same for the mesh; 1, load / limit, near the rim",
     ] = None
     mesh_tip: Annotated[
         Array | None,
         "tip_mesh_error_coefficients",
         "1",
+        "3, 3",
         "same under the tip; 1, depth / limit, near the rim",
     ] = None
 

@@ -14,10 +14,17 @@ from numpy.typing import ArrayLike
 from palpate.shared.answer import Answer
 from palpate.shared.arrays import Array, Field, Flags
 from palpate.shared.artifact import Artifact, ArtifactError, read_artifact, values_of
-from palpate.shared.errors import QueryError
+from palpate.shared.errors import PalpateError, QueryError
 from palpate.shared.fields import FieldRecovery
 from palpate.shared.geometry.surface import Surface, SurfaceIndex, boundary_triangles
-from palpate.shared.local_models import Body, Estimators, LocalModels
+from palpate.shared.local_models import (
+    Body,
+    Estimators,
+    LoadRange,
+    LocalModels,
+    Mesh,
+    ViscousModels,
+)
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH
 from palpate.shared.mechanics.tip import EDGE_FIELD, dented, held
@@ -29,7 +36,7 @@ from palpate.shared.reduced.outcome import Outcome
 from palpate.shared.reduced.past import Elastic, Remembering
 from palpate.shared.reduced.transfer import LeftBehind, Local, Past, Transfer, estimate_history
 from palpate.shared.reduced.workspace import Warm, Workspace
-from palpate.shared.scene import Scene, SceneError, parse_scene
+from palpate.shared.scene import Scene, parse_scene
 from palpate.shared.tables import press_models
 
 Region = Literal["surface", "all"]
@@ -37,6 +44,9 @@ Region = Literal["surface", "all"]
 Active = tuple[tuple[int, float, Local], ...]
 Answering = list[tuple[int, int, float]]
 Moves = dict[int, tuple[Mapping[int, LeftBehind], ...]]
+
+STORED = Mesh, Surface, LoadRange, LocalModels, ViscousModels, Estimators
+"""What an artifact holds."""
 
 BARRED = 0.1
 """Share of the tip's force with which the rim may hold back its place: with more, it presses what
@@ -109,25 +119,29 @@ class ReducedModel:
         ArtifactError
         """
         path = Path(path)
-        artifact = read_artifact(path)
+        artifact = read_artifact(path, *STORED)
         try:
             return cls.from_artifact(artifact)
-        except (KeyError, SceneError, ValueError, IndexError) as error:
-            raise ArtifactError(f"{path}: incomplete or inconsistent: {error}") from error
+        except Exception as error:  # whatever its contents lead to
+            what = error if isinstance(error, PalpateError) else repr(error)
+            raise ArtifactError(f"{path}: incomplete or inconsistent: {what}") from error
 
     @classmethod
     def from_artifact(cls, artifact: Artifact) -> Self:
         """Build from the contents of an artifact."""
         arrays, scene = artifact.arrays, parse_scene(artifact.scene)
+        estimators = Estimators(**values_of(Estimators, arrays))
+        if estimators.loads is None or (scene.endoscope.tip and estimators.touches is None):
+            raise PalpateError("it has no error estimates")
         return cls(
             name=scene.name,
             scene=scene,
             info=artifact.documents,
             body=Body.of(arrays, scene),
             surface=Surface(**values_of(Surface, arrays)),
-            limits=arrays["load_range"],
+            limits=values_of(LoadRange, arrays)["limits"],
             models=LocalModels.of(arrays, scene),
-            estimators=Estimators(**values_of(Estimators, arrays)),
+            estimators=estimators,
         )
 
     @property

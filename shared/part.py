@@ -4,7 +4,8 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-Positive = Annotated[float, Field(gt=0)]
+Positive = Annotated[float, Field(ge=1e-9, le=1e9)]
+Length = Annotated[float, Field(ge=0.01, le=10_000.0)]  # mm
 Fraction = Annotated[float, Field(gt=0, lt=1)]
 
 

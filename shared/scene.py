@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
 
 from pydantic import (
+    AfterValidator,
     Field,
     PrivateAttr,
     ValidationError,
@@ -30,13 +31,24 @@ from pydantic_core import PydanticCustomError
 
 from palpate.shared.errors import PalpateError
 from palpate.shared.mechanics.laws import AnyTissue
-from palpate.shared.part import Fraction, Part, Positive
+from palpate.shared.part import Fraction, Length, Part, Positive
 
 ElementName = Literal["hex8", "hex20"]
 Element = Annotated[ElementName, Field(description="hex20, or hex8, which locks")]
 
 Division = Annotated[int, Field(ge=1, le=500)]
-Divisions = tuple[Division, Division, Division]
+MOST_ELEMENTS = 200_000
+
+
+def _not_too_many(divisions: tuple[int, int, int]) -> tuple[int, int, int]:
+    if math.prod(divisions) > MOST_ELEMENTS:
+        raise PydanticCustomError(
+            "elements", "more than {most} elements in all", {"most": MOST_ELEMENTS}
+        )
+    return divisions
+
+
+Divisions = Annotated[tuple[Division, Division, Division], AfterValidator(_not_too_many)]
 CHOSEN = "the coarsest mesh whose errors leave the reduction its share of the tolerance"
 Point2 = tuple[float, float]
 Range = tuple[float, float]
@@ -75,7 +87,7 @@ class Extrusion(Part):
     corners: tuple[Point2, Point2, Point2, Point2] = Field(
         description="(x, z), mm: lip-outer, outer-tip, tip-inner, inner-lip corner"
     )
-    length: Positive = Field(description="length along y, mm")
+    length: Length = Field(description="length along y, mm")
     element: Element = "hex20"
     divisions: Divisions | None = _chosen(
         CHOSEN, "elements [along the section, through it, along y]"
@@ -102,7 +114,7 @@ class Block(Part):
     """Low and high end of each axis of the mesh's lattice."""
 
     kind: Literal["block"] = Field(description="box; sides: left, right, front, back, bottom, top")
-    size: tuple[Positive, Positive, Positive] = Field(description="lengths along [x, y, z], mm")
+    size: tuple[Length, Length, Length] = Field(description="lengths along [x, y, z], mm")
     element: Element = "hex20"
     divisions: Divisions | None = _chosen(CHOSEN, "elements along [x, y, z]")
 
@@ -138,11 +150,11 @@ class Patch(Part):
 class Endoscope(Part):
     """The instrument that presses."""
 
-    radius: Positive = Field(description="radius of the pressed footprint, and of the tip, mm")
+    radius: Length = Field(description="radius of the pressed footprint, and of the tip, mm")
     max_tilt: float = Field(
         ge=0, lt=90, description="largest angle of a load to the inward normal, degrees"
     )
-    reach: Positive = _in_radii(1.5, "largest distance of a queried position from the body, mm")
+    reach: Length = _in_radii(1.5, "largest distance of a queried position from the body, mm")
     tip: bool = Field(
         False, description="whether a rigid spherical tip may press too, for sessions"
     )
@@ -216,7 +228,7 @@ class Budget(Part):
 class Size(Part):
     """How large a reduced model is."""
 
-    patch_spacing: Positive = Field(description="distance of the centres of local models, mm")
+    patch_spacing: Length = Field(description="distance of the centres of local models, mm")
     modes: int = Field(ge=20, le=400, multiple_of=4, description="number of modes of a local model")
     cubature_points: int = Field(
         ge=16, le=5000, multiple_of=16, description="number of points of a local model"
@@ -237,10 +249,10 @@ class Size(Part):
 class Training(Part):
     """How the reduced model is trained."""
 
-    limit_spacing: Positive = _in_radii(
+    limit_spacing: Length = _in_radii(
         2.0, "distance of points where the largest pressure is found, mm"
     )
-    region_spacing: Positive = _in_radii(3.75, "distance of the regions that share a basis, mm")
+    region_spacing: Length = _in_radii(3.75, "distance of the regions that share a basis, mm")
     blend: Positive = _in_radii(0.1, "width over which neighbouring local models blend, mm")
     samples: int = Field(
         300, ge=60, description="full solutions to validate by; fewer for a looser tolerance"
@@ -383,7 +395,7 @@ def parse_scene(text: str, folder: Path | None = None, source: str = "scene") ->
     """
     try:
         scene = Scene.model_validate_json(json.dumps(_derived(tomllib.loads(text)), default=str))
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise SceneError(f"{source}: not TOML: {error}") from error
     except ValidationError as error:
         faults = [_explain(dict(detail)) for detail in error.errors(include_url=False)]

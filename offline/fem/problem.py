@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from palpate.offline.fem.model import Equilibrium, FullModel, NoEquilibrium
 from palpate.offline.fem.sphere import sphere_of, sphere_surface
 from palpate.offline.fem.terms import Past, TipLoad
 from palpate.shared.arrays import Array, Field, Flags, Numbers
-from palpate.shared.artifact import Artifact, values_of
+from palpate.shared.artifact import read_artifact, values_of
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.local_models import Body, Mesh
 from palpate.shared.mechanics.footprint import MEANS, footprint, means
@@ -96,8 +97,9 @@ class FullProblem:
         self._nodal = np.zeros(len(self.mesh.nodes))
 
     @classmethod
-    def of_artifact(cls, artifact: Artifact) -> FullProblem:
+    def of_artifact(cls, path: Path) -> FullProblem:
         """Full model on the very mesh and surface that an artifact was trained on."""
+        artifact = read_artifact(path, Mesh, Surface)
         arrays = artifact.arrays
         mesh, surface = Mesh(**values_of(Mesh, arrays)), Surface(**values_of(Surface, arrays))
         return cls(parse_scene(artifact.scene), mesh, surface)

@@ -7,6 +7,7 @@ leave the boundary as squarely as the shape allows. Every mesh of a section, coa
 sampling of the same map.
 """
 
+import io
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from scipy.interpolate import CubicSpline, RectBivariateSpline
 from scipy.optimize import minimize
 
 from palpate.shared.arrays import Array
+from palpate.shared.files import open_regular
 from palpate.shared.scene import SceneError
 
 # Grids on which the map is found. The last is fine enough that its cubic interpolation error
@@ -32,6 +34,17 @@ Section = Callable[[ArrayLike, ArrayLike], Array]
 inner (0) to the outer side (1)."""
 
 
+def read_section(path: Path) -> bytes:
+    """Content of the file of an outline; raise ``SceneError`` if it cannot be read."""
+    try:
+        with open_regular(path) as file:
+            return file.read()
+    except OSError as error:
+        raise SceneError(
+            f"geometry.section: {path} cannot be read: {error.strerror or error}"
+        ) from error
+
+
 def read_outline(path: Path) -> Array:
     """Read a closed outline (n, 2) mm, clockwise when x points right and z up.
 
@@ -43,9 +56,10 @@ def read_outline(path: Path) -> Array:
     SceneError
         If the file cannot be read, has fewer than 8 points, repeats one or crosses itself.
     """
+    content = io.BytesIO(read_section(path))
     try:
-        points = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
-    except (OSError, ValueError) as error:
+        points = np.loadtxt(content, delimiter=",", skiprows=1, ndmin=2)
+    except ValueError as error:
         raise SceneError(f"geometry.section: {path} cannot be read: {error}") from error
     if points.ndim != 2 or points.shape[1] != 2 or len(points) < 8 or not np.isfinite(points).all():
         raise SceneError(f"geometry.section: {path} must hold at least 8 rows of finite x, z")

@@ -24,7 +24,6 @@ model is asked everywhere whether its answers depend on the way, straight in or 
 are lowered likewise.
 """
 
-import pickle
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import lru_cache
@@ -43,6 +42,7 @@ from palpate.offline.reduce.ritz import energy_pod, ritz_vectors
 from palpate.offline.reduce.sampling import cone, farthest, random_points_and_rim, tangents
 from palpate.offline.reduce.window import WHOLE, part_of
 from palpate.offline.run.streams import Stage
+from palpate.offline.run.workers import read_result
 from palpate.offline.validate.queries import Place
 from palpate.shared.answer import Answer
 from palpate.shared.arrays import Array, Numbers
@@ -297,7 +297,7 @@ def untested(
 
 @lru_cache(maxsize=1)
 def _pickled(problem: FullProblem, path: Path) -> ReducedModel:
-    return untested(problem, *pickle.loads(path.read_bytes()))
+    return untested(problem, *read_result(path))
 
 
 def ask(

@@ -6,8 +6,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from palpate.shared.arrays import Array
+from palpate.shared.errors import PalpateError
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.scene import Tolerance
+
+MOST_POINTS = 20_000
+"""Local models, or points of the load range, of one scene."""
 
 CANDIDATES = 20
 """Random candidates per point wanted, from which the farthest are taken."""
@@ -66,8 +70,19 @@ def fewer(count: int, tolerance: Tolerance) -> int:
 
 
 def spacing_count(surface: Surface, spacing: float) -> int:
-    """How many points have the given mean spacing (mm) on the surface (hexagonal packing)."""
-    return max(1, round(triangle_areas(surface).sum() * 2 / (math.sqrt(3) * spacing**2)))
+    """How many points have the given mean spacing (mm) on the surface (hexagonal packing).
+
+    Raises ``PalpateError`` if they are more than anybody waits for.
+    """
+    area = float(triangle_areas(surface).sum())
+    count = max(1, round(area * 2 / (math.sqrt(3) * spacing**2)))
+    if count > MOST_POINTS:
+        raise PalpateError(
+            f"the accessible surface, {area:.3g} mm^2, would take {count} points {spacing:.3g} mm "
+            f"apart, and at most {MOST_POINTS} are worked with: a larger endoscope.radius, a "
+            "training.size.patch_spacing in proportion to it or a smaller surface lowers that"
+        )
+    return count
 
 
 def cone(

@@ -10,7 +10,6 @@ That is a space of finite element functions, and everything is Galerkin's method
 eliminated, energy and force of the modes ``b`` outside are one small matrix.
 """
 
-import pickle
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -27,6 +26,7 @@ from palpate.offline.fem.model import FullModel
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.ritz import Footprint
 from palpate.offline.reduce.sampling import farthest
+from palpate.offline.run.workers import read_result
 from palpate.shared.arrays import Array, Field, Flags, Numbers
 from palpate.shared.local_models import Mesh
 
@@ -227,7 +227,7 @@ def window_elements(problem: FullProblem, footprints: Sequence[Footprint]) -> Nu
 @lru_cache(maxsize=1)
 def window(problem: FullProblem, path: Path, region: int) -> FullProblem:
     """Window of a region; ``path`` is a pickle of the body modes and all windows' elements."""
-    body, elements = pickle.loads(path.read_bytes())
+    body, elements = read_result(path)
     if len(elements[region]) == len(problem.mesh.elements):
         return problem
     return WindowProblem(problem, elements[region], body)

@@ -5,8 +5,9 @@ executor with the ``concurrent.futures`` interface can run it, if ``open_scene``
 ``open_artifact`` initializes its workers.
 
 Each result is a file of its own, written aside and moved into place: whatever the moment of
-a kill, a result is there or it is not.  The folder is named by a hash of everything the results
-depend on, so stale ones are never read.
+a kill, a result is there or it is not.  It begins with a hash of the rest, so a damaged one is seen
+and made anew.  The folder is named by a hash of everything the results depend on, so stale ones are
+never read, and belongs to one process at a time.
 """
 
 import hashlib
@@ -15,7 +16,9 @@ import os
 import pickle
 import shutil
 import signal
+import sys
 import threading
+import weakref
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -24,7 +27,8 @@ from typing import Any
 from tqdm import tqdm
 
 from palpate.offline.fem.problem import FullProblem
-from palpate.shared.artifact import read_artifact
+from palpate.offline.fem.section import read_section
+from palpate.shared.errors import PalpateError
 from palpate.shared.scene import Extrusion, Scene, parse_scene
 
 Tasks = Mapping[str, tuple[Any, ...]]
@@ -59,7 +63,7 @@ def open_artifact(path: Path) -> None:
     """Initialize a worker process on the mesh of an artifact."""
     global _problem
     _end_with_parent()
-    _problem = FullProblem.of_artifact(read_artifact(path))
+    _problem = FullProblem.of_artifact(path)
 
 
 def run(task: Callable[..., object], *args: object) -> object:
@@ -95,7 +99,7 @@ def content_key(scene: Scene) -> str:
     root = Path(__file__).parents[2]
     sha = hashlib.sha256(scene.text.encode())
     if isinstance(scene.geometry, Extrusion) and scene.folder is not None:
-        sha.update((scene.folder / scene.geometry.section).read_bytes())
+        sha.update(read_section(scene.folder / scene.geometry.section))
     for package in CODE:
         for source in sorted((root / package).rglob("*.py")):
             sha.update(source.read_bytes())
@@ -105,35 +109,48 @@ def content_key(scene: Scene) -> str:
 class Checkpoint:
     """Named results of one training run, in the folder where runs of this artifact keep theirs.
 
-    The key is from ``content_key``; results of other keys are removed.
+    The key is from ``content_key``; results of other keys are removed.  Raises ``PalpateError`` if
+    another process works there.
     """
 
     def __init__(self, folder: Path, key: str) -> None:
         self.key = key
         self._parent = folder
         self._folder = folder / key
-        if folder.is_dir():
-            for other in folder.iterdir():
-                if other != self._folder:
-                    shutil.rmtree(other)
         self._folder.mkdir(parents=True, exist_ok=True)
+        self._unlock = weakref.finalize(self, os.close, _locked(folder / "lock"))
+        for other in folder.iterdir():
+            if other.is_dir() and other != self._folder:
+                shutil.rmtree(other)
+        for left in self._folder.glob("*.part"):  # by a process that was killed
+            left.unlink()
 
     def _path(self, name: str) -> Path:
         return self._folder / f"{name}.pickle"
 
     def __contains__(self, name: str) -> bool:
-        return self._path(name).is_file()
+        path = self._path(name)
+        try:
+            _checked(path)
+        except FileNotFoundError:
+            return False
+        except PalpateError as damaged:
+            tqdm.write(f"{damaged}; it is made anew", file=sys.stderr)
+            path.unlink()
+            return False
+        return True
 
     def load(self, name: str) -> Any:
         """Read a result that is there."""
-        return pickle.loads(self._path(name).read_bytes())
+        return read_result(self._path(name))
 
     def store(self, name: str, result: object) -> Path:
-        """Keep a result; return where, for workers to read it with ``pickle``."""
+        """Keep a result; return where, for workers to read it with ``read_result``."""
         path = self._path(name)
-        temporary = path.with_suffix(".part")
+        temporary, pickled = path.with_suffix(".part"), pickle.dumps(result)
         with temporary.open("wb") as file:
-            pickle.dump(result, file)
+            file.write(hashlib.sha256(pickled).digest())
+            file.write(pickled)
             file.flush()
             os.fsync(file.fileno())
         return temporary.replace(path)
@@ -155,3 +172,43 @@ class Checkpoint:
     def remove(self) -> None:
         """Forget everything: the artifact is written."""
         shutil.rmtree(self._parent)
+        self._unlock()
+
+    def leave(self) -> None:
+        """Let others work here; what nobody can go on from goes."""
+        if self._folder.is_dir() and not any(self._folder.iterdir()):
+            shutil.rmtree(self._parent)
+        self._unlock()
+
+
+def read_result(path: Path) -> Any:
+    """Result that a ``Checkpoint`` stored; raise ``PalpateError`` if it is damaged."""
+    return pickle.loads(_checked(path))
+
+
+def _checked(path: Path) -> memoryview:
+    """What is pickled in a file, if it is as it was written."""
+    content = memoryview(path.read_bytes())
+    if hashlib.sha256(content[32:]).digest() != content[:32]:
+        raise PalpateError(f"{path} is damaged")
+    return content[32:]
+
+
+def _locked(path: Path) -> int:
+    """Descriptor of a file that is this process's until it is closed, as when the process ends."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    try:
+        import fcntl
+    except ImportError:  # no POSIX
+        return descriptor
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        other = os.read(descriptor, 1000).decode(errors="replace").strip() or "another process"
+        os.close(descriptor)
+        raise PalpateError(
+            f"{path.parent} is in use by {other}; wait for it to end, or choose another --out"
+        ) from None
+    os.truncate(descriptor, 0)
+    os.write(descriptor, f"process {os.getpid()}: {' '.join(sys.argv)}\n".encode())
+    return descriptor

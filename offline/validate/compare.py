@@ -22,7 +22,6 @@ from palpate.offline.run.workers import open_artifact, run, worker_pool
 from palpate.offline.validate.queries import LOADS, Kind, held_out
 from palpate.shared.answer import Answer
 from palpate.shared.arrays import Array
-from palpate.shared.artifact import read_artifact
 from palpate.shared.errors import PalpateError, QueryError
 from palpate.shared.model import ReducedModel
 from palpate.shared.reduced.transfer import REST
@@ -253,7 +252,7 @@ def opened(artifact: Path, *kinds: Kind) -> tuple[ReducedModel, FullProblem]:
     for kind in kinds:
         if lack := kind.lacks(model.scene):
             raise QueryError("scene", f"{model.name!r} {lack}")
-    return model, FullProblem.of_artifact(read_artifact(artifact))
+    return model, FullProblem.of_artifact(artifact)
 
 
 def against_full(

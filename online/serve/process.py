@@ -36,7 +36,8 @@ from palpate.online.serve.guard import LOCAL, RECEIVED, machine_name
 from palpate.online.serve.metrics import Metrics, make_table
 from palpate.online.session.websocket import OPTIONS
 from palpate.online.settings import Settings
-from palpate.shared.errors import PalpateError, printable
+from palpate.shared.errors import PalpateError
+from palpate.shared.files import printable
 
 logger = logging.getLogger(__name__)
 

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 from palpate.online.serve.errors import Refusal
 from palpate.online.serve.metrics import Metrics
 from palpate.online.settings import Settings
-from palpate.shared.errors import PalpateError, printable
+from palpate.shared.errors import PalpateError
+from palpate.shared.files import printable
 from palpate.shared.model import ReducedModel
 
 logger = logging.getLogger(__name__)

@@ -140,9 +140,11 @@ class Surface:
         Outward unit normals, interpolated over the triangles.
     """
 
-    vertices: Annotated[Array, "surface_vertices", "mm", "accessible surface"]
-    triangles: Annotated[Numbers, "surface_triangles", "1", "triangles of it, outward"]
-    normals: Annotated[Array, "surface_normals", "1", "outward unit normals at vertices"]
+    vertices: Annotated[Array, "surface_vertices", "mm", "v, 3", "accessible surface"]
+    triangles: Annotated[
+        Numbers, "surface_triangles", "1", "t, 3", "triangles of it, outward", "< v"
+    ]
+    normals: Annotated[Array, "surface_normals", "1", "v, 3", "outward unit normals at vertices"]
 
     @cached_property
     def _index(self) -> SurfaceIndex:

@@ -104,6 +104,12 @@ REFUSED = {
     "study chart-in-time A": "is elastic",
     "study stability-in-time A": "is elastic",
     "validate A --histories 2": "is elastic",
+    "train lost.toml": "geometry.section: lost.csv cannot be read: No such file",
+    "train nested.toml": "nested.toml: not TOML: maximum recursion depth",
+    "train many.toml": "more than 200000 elements in all",
+    "train tiny.toml": "endoscope.radius = 1e-09: Input should be greater than or equal to 0.01",
+    f"solve A {AT} 1 --vtu /dev/full": "No space left on device",
+    "validate A --queries 2 --csv /dev/full": "No space left on device",
     "validate A --tip --histories 2": "is elastic",
 }
 
@@ -114,6 +120,15 @@ def test_what_makes_no_sense_is_told_in_a_line(
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "text.h5").write_text("not an artifact")
+    quick, turbinate = (find_scene(name).text for name in ("quick", "turbinate"))
+    scenes = {
+        "lost": turbinate.replace("inferior_turbinate_section.csv", "lost.csv"),
+        "nested": "a = " + 5000 * "[" + 5000 * "]",
+        "many": quick.replace("[4, 4, 3]", "[500, 500, 500]"),
+        "tiny": quick.replace("radius = 2.0 ", "radius = 1e-9 "),
+    }
+    for name, text in scenes.items():
+        (tmp_path / f"{name}.toml").write_text(text)
     result = run(*(artifact if word == "A" else word for word in command.split()))
     assert result.exit_code == 2
     told = result.stderr.splitlines()[-1]

@@ -14,7 +14,7 @@ from palpate.offline.run.workers import content_key
 from palpate.offline.scenes import find_scene
 from palpate.offline.train import is_of, train
 from palpate.shared.artifact import read_artifact
-from palpate.shared.model import ReducedModel
+from palpate.shared.model import STORED, ReducedModel
 from palpate.shared.reduced import press
 
 from ..conftest import PALPATE
@@ -91,7 +91,7 @@ def test_a_resumed_run_makes_the_artifact_of_an_undisturbed_one(scene, resumed, 
     _, log = undisturbed.communicate(timeout=300)
     assert undisturbed.returncode == 0, log
     paths = resumed[0], tmp_path / "tiny.h5"
-    found, expected = (read_artifact(path).arrays for path in paths)
+    found, expected = (read_artifact(path, *STORED).arrays for path in paths)
     assert found.keys() == expected.keys()
     for name in ("nodes", "elements", "clamped", "patch_centres", "patch_region"):
         np.testing.assert_array_equal(found[name], expected[name], err_msg=name)

@@ -7,7 +7,6 @@ from palpate.offline.fem.graded import Grading
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.scenes import find_scene
 from palpate.offline.studies import truth
-from palpate.shared.artifact import read_artifact
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +17,7 @@ def rows(artifact):
         patch.setattr(truth, "GRADINGS", dict.fromkeys(truth.KINDS, coarse))
         patch.setattr(truth, "LEVELS", (0.3,))
         patch.setattr(truth, "DEPTHS", (0.2,))
-        problem = FullProblem.of_artifact(read_artifact(artifact))
+        problem = FullProblem.of_artifact(artifact)
         at = problem.surface.project(np.array([5.6, 4.7, 8.0]))[0]
         return truth.at_place(problem, artifact, find_scene("quick").folder, at)
 

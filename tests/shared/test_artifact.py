@@ -1,10 +1,15 @@
 import os
 import time
+from dataclasses import dataclass
+from typing import Annotated
 
 import h5py
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from palpate.shared import artifact as artifact_file
+from palpate.shared.arrays import Array, Flags
 from palpate.shared.artifact import (
     FORMAT_VERSION,
     SEAL_BYTES,
@@ -13,6 +18,17 @@ from palpate.shared.artifact import (
     read_artifact,
     write_artifact,
 )
+
+
+@dataclass
+class Things:
+    """What the file of these tests holds."""
+
+    modes: Annotated[Array, "modes", "mm", "n, 30", "modes of the body"]
+    basis: Annotated[NDArray[np.int16], "basis", "1", "9, 25 n", "steps", "", "compress"]
+    clamped: Annotated[Flags, "clamped", "1", "2", "nodes held fixed"]
+    extent: Annotated[float, "extent", "mm", "", "reach of a local model", "> 0"]
+
 
 SCENE = 'name = "x"\n' * 20
 DOCUMENTS = {"training": {"patches": 3}, "validation": {"displacement": {"mean": 0.01}}}
@@ -35,14 +51,14 @@ def refusal(path):
     """Return why a file is refused, and insist that this takes no time."""
     started = time.perf_counter()
     with pytest.raises(ArtifactError) as refused:
-        read_artifact(path)
+        read_artifact(path, Things)
     assert time.perf_counter() - started < 2.0
     assert str(refused.value).startswith(f"{path}: ")
     return str(refused.value)
 
 
 def test_what_is_written_is_read(path):
-    artifact = read_artifact(path)
+    artifact = read_artifact(path, Things)
     assert artifact.scene == SCENE
     assert artifact.documents == DOCUMENTS
     assert artifact.arrays.keys() == DATASETS.keys()
@@ -104,6 +120,42 @@ def test_foreign_files_are_told(tmp_path, content):
         with h5py.File(path, "w", userblock_size=content) as file:
             file["temperature"] = [36.6, 37.1]
     assert "not an artifact" in refusal(path)
+
+
+STRANGE = {
+    "nan": ("modes", np.full((40, 30), np.nan), "values not finite"),
+    "infinite": ("extent", np.array(np.inf), "values not > 0"),
+    "negative": ("extent", np.array(-1.0), "values not > 0"),
+    "shorter": ("basis", np.zeros((9, 999), np.int16), "is (9, 999) int16 and not (9, 25 n) int16"),
+    "flat": ("modes", np.zeros(1200), "is (1200,) float64 and not (n, 30) float64"),
+    "type": ("clamped", np.array([1, 0]), "is (2,) int64 and not (2) bool"),
+    "text": ("clamped", np.array([b"a", b"b"]), "is (2,) |S1 and not (2) bool"),
+}
+
+
+@pytest.mark.parametrize(("name", "values", "reason"), STRANGE.values(), ids=STRANGE)
+def test_what_its_fields_cannot_hold_is_refused_with_a_right_seal(tmp_path, name, values, reason):
+    path = tmp_path / "x.h5"
+    write_artifact(path, SCENE, DOCUMENTS, {**DATASETS, name: Dataset(values, "1", "strange")})
+    assert reason in refusal(path)
+
+
+def test_what_would_swell_in_memory_is_refused(path, monkeypatch):
+    monkeypatch.setattr(artifact_file, "MOST_INFLATED", 1.5)  # the basis is compressed to less
+    assert "dataset 'basis' has 18000 bytes, which is too much" in refusal(path)
+
+
+def test_what_is_not_declared_is_not_read(tmp_path):
+    path = tmp_path / "x.h5"
+    more = Dataset(np.zeros((1000, 1000)), "1", "nobody asked for it", compress=True)
+    write_artifact(path, SCENE, DOCUMENTS, {**DATASETS, "more": more})
+    assert read_artifact(path, Things).arrays.keys() == DATASETS.keys()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="not known to this system")
+def test_a_pipe_is_no_artifact(tmp_path):
+    os.mkfifo(tmp_path / "pipe.h5")
+    assert "not a regular file" in refusal(tmp_path / "pipe.h5")
 
 
 def test_what_is_no_file_is_told(tmp_path):

@@ -1,0 +1,85 @@
+"""Results on disk: whole ones only, of one process at a time."""
+
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from palpate.offline.run.workers import Checkpoint, content_key, read_result
+from palpate.offline.scenes import find_scene
+from palpate.shared.errors import PalpateError
+from palpate.shared.scene import SceneError, load_scene
+
+
+def double(_problem, number):
+    return 2 * number
+
+
+TASKS = {f"task-{i}": (double, i) for i in range(4)}
+
+
+DAMAGE = {
+    "cut": lambda content: content[:-1],
+    "altered": lambda content: content[:40] + b"x" + content[41:],
+    "empty": lambda content: b"",
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
+def test_a_damaged_result_is_made_anew(tmp_path, capsys, damage):
+    with ThreadPoolExecutor(1) as executor:
+        first = Checkpoint(tmp_path / "folder", "key")
+        expected = first.resume("tasks", executor, TASKS)
+        first.leave()
+        path = tmp_path / "folder" / "key" / "task-2.pickle"
+        path.write_bytes(damage(path.read_bytes()))
+        with pytest.raises(PalpateError, match="is damaged"):
+            read_result(path)
+        again = Checkpoint(tmp_path / "folder", "key").resume("tasks", executor, TASKS)
+    assert again == expected == {f"task-{i}": 2 * i for i in range(4)}
+    assert f"{path} is damaged; it is made anew" in capsys.readouterr().err
+
+
+HOLD = """
+import sys
+from pathlib import Path
+from palpate.offline.run.workers import Checkpoint
+held = Checkpoint(Path(sys.argv[1]), "other")
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_folder_belongs_to_one_process_until_it_ends(tmp_path):
+    folder = tmp_path / "folder"
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, folder, "words"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as other:
+        assert other.stdout.readline() == "held\n"
+        (folder / "other" / "a.pickle").write_bytes(b"")
+        with pytest.raises(PalpateError) as refused:
+            Checkpoint(folder, "key")
+        assert f"process {other.pid}" in str(refused.value)
+        assert "words" in str(refused.value)
+        assert (folder / "other" / "a.pickle").exists()
+        other.kill()
+    (folder / "key").mkdir(exist_ok=True)
+    (folder / "key" / "left.part").touch()
+    checkpoint = Checkpoint(folder, "key")
+    assert sorted(path.name for path in folder.iterdir()) == ["key", "lock"]
+    checkpoint.leave()
+    assert not folder.exists()
+
+
+def test_a_section_that_cannot_be_read_is_told(tmp_path):
+    scene = tmp_path / "own.toml"
+    scene.write_text(find_scene("turbinate").text)
+    section = tmp_path / "inferior_turbinate_section.csv"
+    for make in (lambda: None, section.mkdir):
+        make()
+        with pytest.raises(SceneError, match=rf"geometry\.section: {section} cannot be read"):
+            content_key(load_scene(scene))
