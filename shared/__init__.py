@@ -1,9 +1,12 @@
 """What both sides need: scenes, tissue, loads, equilibrium, reduced models, artifacts."""
 
+import atexit
 import hashlib
 import os
 import re
+import shutil
 import sys
+import tempfile
 from pathlib import Path
 
 PACKAGES = Path(__file__).parents[1]
@@ -38,15 +41,36 @@ def _kernel_cache() -> None:
     Numba renews a cached kernel when the file that defines it changes, but not when a kernel of
     another file that was compiled into it does: after an update it would go on running old physics.
     """
-    digest = hashlib.sha256()
-    for source in kernel_sources():
-        digest.update(source.read_bytes())
-    cache = Path(__file__).parent / "__pycache__"
+    if "NUMBA_CACHE_DIR" not in os.environ:
+        digest = hashlib.sha256()
+        for source in kernel_sources():
+            digest.update(source.read_bytes())
+        folder = _writable(Path(__file__).parent / "__pycache__", digest.hexdigest()[:16])
+        os.environ["NUMBA_CACHE_DIR"] = str(folder)
+    if "numba" in sys.modules:  # it has read its environment already
+        sys.modules["numba"].config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"]
+
+
+def _writable(cache: Path, key: str) -> Path:
+    """Folder of kernels in a cache, or where that cannot be written in the user's.
+
+    The latter begins with links to what the former has.  Without either kernels are for once.
+    """
+    own = cache / f"kernels-{key}"
     if os.access(cache if cache.exists() else cache.parent, os.W_OK):
-        folder = cache / f"kernels-{digest.hexdigest()[:16]}"
-        os.environ.setdefault("NUMBA_CACHE_DIR", str(folder))
-        if "numba" in sys.modules:  # it has read its environment already
-            sys.modules["numba"].config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"]
+        return own
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "palpate" / own.name
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        if own.is_dir() and not folder.exists():
+            shutil.copytree(own, folder, copy_function=os.symlink, dirs_exist_ok=True)
+        folder.mkdir(exist_ok=True)
+    except OSError:
+        folder = Path(tempfile.mkdtemp(prefix="palpate-"))
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        said = "no folder for compiled kernels can be written; set NUMBA_CACHE_DIR to one, or they"
+        print(f"palpate: {said} are compiled each time", file=sys.stderr)
+    return folder
 
 
 def _one_thread_of_blas() -> None:

@@ -31,3 +31,31 @@ def test_sources_with_kernels_and_what_they_import_make_that_state_and_no_others
             assert source.relative_to(PACKAGES).as_posix() in names
     assert "shared/errors.py" in names  # imported by modules with kernels
     assert not names & {"online/serve/app.py", "offline/commands.py"}
+
+
+READ_ONLY = """
+import os, sys
+os.access = lambda *_: False  # as in an image that is mounted to be read
+import palpate.shared
+from palpate.shared.mechanics import laws
+print(os.environ["NUMBA_CACHE_DIR"])
+"""
+
+
+@pytest.mark.parametrize("home", [True, False])
+def test_an_installation_that_cannot_be_written_has_its_kernels_elsewhere(tmp_path, home):
+    environment = {k: v for k, v in os.environ.items() if k not in ("NUMBA_CACHE_DIR", "HOME")}
+    if not home:
+        (tmp_path / "file").touch()
+    environment["XDG_CACHE_HOME"] = str(tmp_path / ("cache" if home else "file"))
+    run = subprocess.run(
+        [sys.executable, "-c", READ_ONLY], env=environment, capture_output=True, text=True
+    )
+    assert run.returncode == 0, run.stderr
+    folder = run.stdout.strip()
+    if home:
+        assert folder.startswith(str(tmp_path / "cache" / "palpate" / "kernels-"))
+        assert run.stderr == ""
+    else:
+        assert not os.path.exists(folder)
+        assert "set NUMBA_CACHE_DIR" in run.stderr
