@@ -8,17 +8,34 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from palpate.online.client.http import Client
-    from palpate.online.client.session import Session
+    from palpate.online.client.session import ServiceError, Session, SessionClosed
+    from palpate.online.session.frames import Flag, Output
+    from palpate.shared.errors import PalpateError
     from palpate.shared.model import ReducedModel
     from palpate.shared.reduced.transfer import REST
 
-__all__ = ["REST", "Client", "ReducedModel", "Session"]
+__all__ = [
+    "REST",
+    "Client",
+    "Flag",
+    "Output",
+    "PalpateError",
+    "ReducedModel",
+    "ServiceError",
+    "Session",
+    "SessionClosed",
+]
 
 _WHERE = {
     "REST": "palpate.shared.reduced.transfer",
     "Client": "palpate.online.client.http",
     "ReducedModel": "palpate.shared.model",
     "Session": "palpate.online.client.session",
+    "SessionClosed": "palpate.online.client.session",
+    "ServiceError": "palpate.online.client.session",
+    "Flag": "palpate.online.session.frames",
+    "Output": "palpate.online.session.frames",
+    "PalpateError": "palpate.shared.errors",
 }
 
 if not (Path(__file__).parent / "shared").is_dir():  # a checkout without symbolic links

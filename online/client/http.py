@@ -2,7 +2,8 @@
 
 import http.client
 import json
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 from urllib.parse import quote
@@ -10,24 +11,59 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.online.client.session import ServiceError, Session, scene_path, split_address
-from palpate.online.serve import wire
-from palpate.online.serve.schemas import Accessible, Mesh
-from palpate.online.serve.wire import BINARY, JSON
+from palpate.online.client.session import (
+    Session,
+    no_service,
+    refusal,
+    scene_path,
+    secure,
+    split_address,
+)
+from palpate.online.serve import layout
+from palpate.online.serve.layout import BINARY, JSON, Accessible, Mesh
 from palpate.shared.arrays import Array, Field
 from palpate.shared.errors import PalpateError
 
 
 class Answer(NamedTuple):
-    """How the tissue answers a load; fields are None if they were not asked for."""
+    """How the tissue answers a load; names are those of ``shared.answer.Answer``."""
 
-    contact: dict[str, Any]  # this, trust and timing are described by the service's /docs
-    trust: dict[str, Any]
-    timing: dict[str, float]
-    force: Array  # (3,), mN, on the tool
-    contact_displacement: Array  # (3,), mm
-    displacement: Field | None  # (k, 3), mm
-    von_mises: Field | None  # (k,), kPa
+    contact_point: Array  # (3,) mm, on the surface
+    normal: Array  # (3,) outward there
+    distance: float  # mm, of the queried position from the surface
+    direction: Array  # (3,) of the load
+    pressure: float  # kPa
+    radius: float  # mm
+    force: Array  # (3,) mN, on the tool
+    contact_displacement: Array  # (3,) mm
+    converged: bool
+    iterations: int
+    in_range: bool
+    out_of_range: tuple[str, ...]
+    error_displacement: float  # estimated, relative; infinite beyond the range
+    error_von_mises: float
+    min_jacobian: float
+    pressure_limit: float  # kPa
+    depth_limit: float  # mm; 0 in a scene without a tip
+    time: float = 0.0  # s, since rest, of a history's step
+    displacement: Field | None = None  # (k, 3) mm; this and stress are None if not asked for
+    von_mises: Field | None = None  # (k,) kPa
+    timing: Mapping[str, float] = {}  # µs, where the service's time went
+
+
+def _answer(head: Mapping[str, Any], **more: Any) -> Answer:
+    """An answer of what a document says of it."""
+    contact, trust = head["contact"], head["trust"]
+    errors = {
+        f"error_{name}": math.inf if error is None else error
+        for name, error in trust["error_estimate"].items()
+    }
+    told = {**contact, **trust, **head, **errors, **more}
+    told |= {"contact_point": contact["position"], "out_of_range": tuple(trust["out_of_range"])}
+    told["depth_limit"] = contact["depth_limit"] or 0.0
+    vectors = "contact_point", "normal", "direction", "force", "contact_displacement"
+    told |= {name: np.array(told[name]) for name in vectors}
+    return Answer(**{name: told[name] for name in Answer._fields if name in told})
 
 
 class Client:
@@ -47,6 +83,10 @@ class Client:
         if token is not None:
             self._headers["Authorization"] = f"Bearer {token}"
         self._connection = http.client.HTTPConnection(parts.netloc, timeout=timeout)
+        if parts.scheme == "https":
+            self._connection = http.client.HTTPSConnection(
+                parts.netloc, timeout=timeout, context=secure()
+            )
 
     def __enter__(self) -> Self:
         return self
@@ -86,16 +126,33 @@ class Client:
         the fields to return, for the nodes of `region`: ``none``, ``surface`` or ``all``.
         Raises `ServiceError` if the service refuses.
         """
-        contact = {
-            "position": list(position),
-            "pressure": pressure,
-            "direction": None if direction is None else list(direction),
-            "radius": radius,
+        contact = _contact(position, pressure, direction, radius)
+        asked = {"contacts": [contact], "outputs": list(outputs), "region": region}
+        head, fields = self._document("POST", name, "/solve", json.dumps(asked).encode())
+        return _answer(head, **fields)
+
+    def history(
+        self,
+        name: str,
+        steps: Sequence[tuple[float, Sequence[float] | None, float]],
+        outputs: Sequence[str] = ("displacement", "von_mises"),
+        region: str = "none",
+    ) -> list[Answer]:
+        """Press visco-elastic tissue over time: times (s), positions (mm) and pressures (kPa).
+
+        Without a position nothing presses. Fields are those at the end, in the last answer.
+        """
+        asked = {
+            "steps": [
+                {"time": time, "contact": None if at is None else _contact(at, pressure)}
+                for time, at, pressure in steps
+            ],
+            "outputs": list(outputs),
+            "region": region,
         }
-        body = json.dumps({"contacts": [contact], "outputs": list(outputs), "region": region})
-        head, fields = self._document("POST", name, "/solve", body.encode())
-        vectors = {name: np.array(head[name]) for name in ("force", "contact_displacement")}
-        return Answer._make(map({**head, **vectors, **fields}.get, Answer._fields))
+        head, fields = self._document("POST", name, "/history", json.dumps(asked).encode())
+        *before, last = head["steps"]
+        return [*map(_answer, before), _answer(last, timing=head["timing"], **fields)]
 
     def session(self, name: str, record: Path | None = None) -> Session:
         """Open a session of a scene, on a connection of its own; see `Session`."""
@@ -103,16 +160,37 @@ class Client:
 
     def _document(
         self, method: str, name: str, rest: str, body: bytes | None = None
-    ) -> tuple[wire.Head, dict[str, NDArray[Any]]]:
-        return wire.decode(self._request(method, scene_path(name, rest), BINARY, body))
+    ) -> tuple[layout.Head, dict[str, NDArray[Any]]]:
+        return layout.decode(self._request(method, scene_path(name, rest), BINARY, body))
 
     def _request(self, method: str, path: str, accept: str, body: bytes | None = None) -> bytes:
-        try:
-            self._connection.request(method, path, body, {"Accept": accept, **self._headers})
-            response = self._connection.getresponse()
-        except ConnectionRefusedError:
-            raise PalpateError(f"{self._url}: no service answers there") from None
-        content = response.read()
+        headers = {"Accept": accept, **self._headers}
+        for kept in (self._connection.sock is not None, False):
+            try:
+                self._connection.request(method, path, body, headers)
+                response = self._connection.getresponse()
+                content = response.read()
+                break
+            except TimeoutError:
+                self._connection.close()
+                raise PalpateError(f"{self._url}: no answer in {self._timeout} s") from None
+            except (OSError, http.client.HTTPException) as error:
+                self._connection.close()
+                if not kept:  # else it may only have been closed meanwhile
+                    raise no_service(self._url, error) from error
         if response.status != 200:
-            raise ServiceError(response.status, json.loads(content)["error"])
+            raise refusal(response.status, content)
         return content
+
+
+def _contact(
+    position: Sequence[float],
+    pressure: float,
+    direction: Sequence[float] | None = None,
+    radius: float | None = None,
+) -> dict[str, Any]:
+    """A contact of a request, without what is left to the service."""
+    asked: dict[str, Any] = {"position": list(map(float, position)), "pressure": pressure}
+    if direction is not None:
+        asked["direction"] = list(map(float, direction))
+    return asked if radius is None else {**asked, "radius": radius}

@@ -6,12 +6,14 @@ On one thread and one socket, for loops that wait or spin.
 import json
 import select
 import socket
+import ssl
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 from urllib.parse import SplitResult, quote, urlsplit
 
 from websockets.client import ClientProtocol
@@ -22,8 +24,10 @@ from websockets.uri import parse_uri
 
 from palpate.online.session import frames
 from palpate.online.session.frames import Reply, Request
-from palpate.online.session.recording import Recorder
 from palpate.shared.errors import PalpateError
+
+if TYPE_CHECKING:
+    from palpate.online.session.recording import Recorder
 
 
 class ServiceError(PalpateError):
@@ -53,7 +57,8 @@ class Connection:
     """An open WebSocket at a path of a service; `ServiceError` if the handshake is refused."""
 
     def __init__(self, url: str, path: str, token: str | None, timeout: float) -> None:
-        address = f"ws://{split_address(url).netloc}{path}"
+        parts = split_address(url)
+        address = f"{'wss' if parts.scheme == 'https' else 'ws'}://{parts.netloc}{path}"
         self._received: deque[str | bytes] = deque()
         self.protocol = ClientProtocol(parse_uri(address), max_size=None)
         self.socket = connect(url, timeout)
@@ -99,8 +104,10 @@ class Connection:
 
     def poll(self) -> bool:
         """Tell whether there is a message, without waiting for one."""
-        if not self._received and select.select([self.socket], [], [], 0)[0]:
-            self._take()
+        if not self._received:
+            decrypted = isinstance(self.socket, ssl.SSLSocket) and self.socket.pending() > 0
+            if decrypted or select.select([self.socket], [], [], 0)[0]:
+                self._take()
         return bool(self._received)
 
     def flush(self) -> None:
@@ -134,9 +141,30 @@ class Connection:
 def connect(url: str, timeout: float) -> socket.socket:
     """Open a connection to a service that sends at once whatever it is given."""
     parts = split_address(url)
-    connection = socket.create_connection((parts.hostname, parts.port or 80), timeout)
-    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    safe = parts.scheme == "https"
+    try:
+        connection = socket.create_connection(
+            (parts.hostname, parts.port or (443 if safe else 80)), timeout
+        )
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        if safe:
+            return secure().wrap_socket(connection, server_hostname=parts.hostname)
+    except OSError as error:
+        raise no_service(url, error) from error
     return connection
+
+
+@cache
+def secure() -> ssl.SSLContext:
+    """What is believed of services by https: the system's authorities, or ``SSL_CERT_FILE``'s."""
+    return ssl.create_default_context()
+
+
+def no_service(url: str, error: Exception) -> PalpateError:
+    """Make the error of a service that cannot be reached."""
+    if isinstance(error, ConnectionRefusedError):
+        return PalpateError(f"{url}: no service answers there")
+    return PalpateError(f"{url}: {error or type(error).__name__}")
 
 
 def scene_path(scene: str, rest: str = "") -> str:
@@ -146,19 +174,32 @@ def scene_path(scene: str, rest: str = "") -> str:
 
 def split_address(url: str) -> SplitResult:
     """Split the address of a service; raise `PalpateError` for what is none."""
-    parts = urlsplit(url)
-    if parts.scheme != "http" or parts.hostname is None:
-        raise PalpateError(f"{url}: not an address like http://127.0.0.1:8000")
-    return parts
+    with suppress(ValueError):  # of a port that is none
+        parts = urlsplit(url)
+        usable = parts.scheme in ("http", "https") and parts.port != 0
+        if usable and parts.hostname and parts.hostname.isascii() and parts.hostname.isprintable():
+            return parts
+    raise PalpateError(f"{url}: not an address like http://127.0.0.1:8000")
+
+
+def refusal(status: int, body: bytes) -> PalpateError:
+    """Make the error of a response other than the one asked for."""
+    with suppress(ValueError, KeyError, TypeError):
+        return ServiceError(status, json.loads(body)["error"])
+    return PalpateError(f"the service says {status}, which is none of its own refusals")
 
 
 def _refusal(error: Exception) -> PalpateError:
     """Make an error of a handshake that failed."""
-    if isinstance(error, InvalidStatus) and error.response.body:
-        with suppress(ValueError, KeyError):
-            body = json.loads(error.response.body)
-            return ServiceError(error.response.status_code, body["error"])
+    if isinstance(error, InvalidStatus):
+        return refusal(error.response.status_code, bytes(error.response.body or b""))
     return PalpateError(f"no session: {error}")
+
+
+def _recorder(path: Path, greeting: dict[str, Any]) -> "Recorder":
+    from palpate.online.session.recording import Recorder  # HDF5 is for those who record
+
+    return Recorder(path, greeting)
 
 
 class Session:
@@ -188,7 +229,7 @@ class Session:
         self._connection = Connection(url, scene_path(scene, "/session"), token, timeout)
         try:
             self.greeting: dict[str, Any] = json.loads(self._connection.receive())
-            self._recorder = None if record is None else Recorder(record, self.greeting)
+            self._recorder = None if record is None else _recorder(record, self.greeting)
         except BaseException:
             self._connection.socket.close()
             raise

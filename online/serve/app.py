@@ -20,7 +20,7 @@ from starlette.middleware.cors import CORSMiddleware
 from starlette.routing import WebSocketRoute
 from starlette.websockets import WebSocket
 
-from palpate.online.serve import errors, guard, schemas, wire
+from palpate.online.serve import errors, guard, layout, schemas, wire
 from palpate.online.serve.answer import answer
 from palpate.online.serve.errors import Refusal
 from palpate.online.serve.metrics import CONTENT_TYPE, Metrics
@@ -166,7 +166,7 @@ def _problems(*codes: int) -> dict[int | str, dict[str, Any]]:
 
 def _document(model: type, what: str, *codes: int) -> dict[str, Any]:
     """Describe an answer that comes in three formats, and the refusals of its endpoint."""
-    described = {BINARY: wire.__doc__, MSGPACK: "The JSON document, but for arrays."}
+    described = {BINARY: layout.__doc__, MSGPACK: "The JSON document, but for arrays."}
     schema = {"type": "string", "format": "binary"}
     formats = {name: {"schema": {**schema, "description": d}} for name, d in described.items()}
     answer = {200: {"model": model, "description": what, "content": formats}}
@@ -295,7 +295,7 @@ async def mesh(name: SceneName, request: Request, region: MeshRegion = "surface"
     surface = np.ascontiguousarray(model.surface_nodes, np.int32)
     triangles = np.ascontiguousarray(model.surface_triangles, np.int32)
     chosen: Any = slice(None) if region == "all" else surface
-    found = schemas.Mesh(
+    found = layout.Mesh(
         nodes=model.nodes[chosen].astype(np.float32),
         triangles=surface[triangles] if region == "all" else triangles,
         surface_nodes=surface,
@@ -311,7 +311,7 @@ async def mesh(name: SceneName, request: Request, region: MeshRegion = "surface"
 async def accessible(name: SceneName, request: Request) -> Response:
     """Get the undeformed surface that the endoscope can touch, finer than the fields' mesh."""
     model = request.app.state.service.model(name).model
-    found = schemas.Accessible(
+    found = layout.Accessible(
         vertices=model.surface.vertices.astype(np.float32),
         normals=model.surface.normals.astype(np.float32),
         pressure_limit=model.limits[:, 0].astype(np.float32),
@@ -321,7 +321,7 @@ async def accessible(name: SceneName, request: Request) -> Response:
     return _arrays(request, {"scene": name}, found)
 
 
-def _arrays(request: Request, head: wire.Head, arrays: Any) -> Response:
+def _arrays(request: Request, head: layout.Head, arrays: Any) -> Response:
     media_type = _media_type(request)
     present = {name: array for name, array in arrays._asdict().items() if array is not None}
     return Response(wire.encode(media_type, head, present), media_type=media_type)

@@ -4,15 +4,14 @@ Answers are written straight from arrays; their models below describe them to th
 OpenAPI page. Beside an array of a document stand the type of its rows in JSON and its meaning.
 """
 
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, get_type_hints
 
-import numpy as np
 import pydantic
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, field_validator
 from pydantic_core import PydanticCustomError
 
 from palpate.online.serve.errors import invalid
+from palpate.online.serve.layout import Accessible, Mesh
 
 CONVENTIONS = "Units are mm, mN, kPa and s throughout; forces are those of the tissue on the tool."
 """Of every endpoint and of sessions."""
@@ -26,8 +25,6 @@ Position = Annotated[list[Annotated[float, Field(ge=-1e4, le=1e4)]], _THREE]
 Direction = Annotated[list[Annotated[float, Field(ge=-1e3, le=1e3)]], _THREE]
 Vector = Annotated[list[float], _THREE]
 Triangle = Annotated[list[int], _THREE]
-Floats = NDArray[np.float32]
-Integers = NDArray[np.int32]
 
 MOST_STEPS = 200
 """Largest number of steps of a history: so many keep others waiting for some 50 ms."""
@@ -219,25 +216,13 @@ class HistoryAnswer(BaseModel):
     timing: Timing
 
 
-class Mesh(NamedTuple):
-    """The undeformed mesh of a region."""
-
-    nodes: Annotated[Floats, Vector, "(k, 3), mm; the order of every field of this region"]
-    triangles: Annotated[Integers, Triangle, "(t, 3), nodes counter-clockwise from outside"]
-    surface_nodes: Annotated[Integers, int, "(s,), region surface's nodes among those of all"]
-    clamped: Annotated[NDArray[np.uint8], Literal[0, 1], "(k,), 1 if held fixed"]
-
-
-class Accessible(NamedTuple):
-    """The surface that the endoscope can touch; its normal varies linearly over each triangle."""
-
-    vertices: Annotated[Floats, Vector, "(v, 3), mm"]
-    normals: Annotated[Floats, Vector, "(v, 3), outward unit normals at the vertices"]
-    pressure_limit: Annotated[Floats, float, "(v,), kPa, largest trained along the inward normal"]
-    triangles: Annotated[Integers, Triangle, "(t, 3), vertices counter-clockwise from outside"]
-    depth_limit: Annotated[
-        Floats | None, float, "(v,), mm, largest trained of the tip; absent without one"
-    ] = None
+_ROWS: dict[str, Any] = {
+    "vector": list[Vector],
+    "triangle": list[Triangle],
+    "number": list[int],
+    "value": list[float],
+    "bit": list[Literal[0, 1]],
+}
 
 
 def _document(arrays: Any, **head: Any) -> type[BaseModel]:
@@ -246,7 +231,7 @@ def _document(arrays: Any, **head: Any) -> type[BaseModel]:
     for name, hint in get_type_hints(arrays, include_extras=True).items():
         row, meaning = hint.__metadata__
         default = arrays._field_defaults.get(name, ...)
-        fields[name] = list[row], Field(default, description=meaning)  # type: ignore[valid-type]
+        fields[name] = _ROWS[row], Field(default, description=meaning)
     name, told = arrays.__name__, arrays.__doc__
     described = pydantic.create_model(f"{name}Fields", __doc__=told, **fields)
     return pydantic.create_model(name, __doc__=told, scene=str, **head, fields=described)

@@ -56,6 +56,9 @@ class _Bits(IntFlag):
         bit._value_, bit.meaning = value, meaning
         return bit
 
+    def __str__(self) -> str:
+        return ", ".join(str(bit.name).lower() for bit in self) or "none"
+
 
 class Output(_Bits):
     """What a request wants beyond the fields of every reply."""

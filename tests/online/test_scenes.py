@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from palpate.online.serve import wire
+from palpate.online.serve import layout
 from palpate.online.serve.wire import BINARY
 
 from .fake_model import FakeModel
@@ -31,7 +31,7 @@ def test_a_scene_tells_what_may_be_asked_with_an_example(client):
 def test_the_accessible_surface_has_its_limits(serve):
     with serve(FakeModel(), FakeModel("other", has_tip=False)) as client:
         response = client.get("/scenes/toy/accessible", headers={"accept": BINARY})
-        _, arrays = wire.decode(response.content)
+        _, arrays = layout.decode(response.content)
         other = client.get("/scenes/other/accessible").json()["fields"]
         assert client.get("/scenes/other").json()["ranges"]["depth"] is None
     limits = [set(arrays[name].ravel()) for name in ("pressure_limit", "depth_limit")]
@@ -44,7 +44,7 @@ def test_the_accessible_surface_has_its_limits(serve):
 @pytest.mark.parametrize("region", ["surface", "all"])
 def test_the_mesh_of_a_region(client, region):
     path = f"/scenes/toy/mesh?region={region}"
-    _, arrays = wire.decode(client.get(path, headers={"accept": BINARY}).content)
+    _, arrays = layout.decode(client.get(path, headers={"accept": BINARY}).content)
     model = FakeModel()
     ids = model.surface_nodes if region == "surface" else np.arange(len(model.nodes))
     np.testing.assert_allclose(arrays["nodes"], model.nodes[ids], atol=1e-6)

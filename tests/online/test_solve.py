@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from palpate.online.serve import wire
+from palpate.online.serve import layout
 from palpate.online.serve.wire import BINARY, MSGPACK
 
 from .conftest import error_of
@@ -63,7 +63,7 @@ def test_the_answer_tells_contact_force_and_trust_and_where_the_time_went(client
 @pytest.mark.parametrize("region", ["surface", "all"])
 def test_all_formats_hold_the_same_fields_in_the_order_of_the_mesh(client, region):
     from_json = solve(client, region=region).json()["fields"]
-    _, from_binary = wire.decode(solve(client, BINARY, region=region).content)
+    _, from_binary = layout.decode(solve(client, BINARY, region=region).content)
     packed = msgpack.unpackb(solve(client, MSGPACK, region=region).content)["fields"]
     assert {entry["dtype"] for entry in packed.values()} == {"float32"}
     from_msgpack = {

@@ -95,7 +95,7 @@ def test_damaged_artifacts_are_refused_and_named_and_the_others_are_served(
         with Client(server.url) as client:
             found = client.scenes()
             example = client.scene("quick")["example"]["contacts"][0]
-            assert client.solve("quick", **example).trust["converged"]
+            assert client.solve("quick", **example).converged
         assert server.stop() == 0
     assert [scene["name"] for scene in found["scenes"]] == ["quick"]
     reasons = {entry["file"]: entry["reason"] for entry in found["refused"]}

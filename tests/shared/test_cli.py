@@ -84,8 +84,12 @@ def test_whatever_imports_the_software_runs_on_one_blas_thread():
             "import palpate.online.serve.app",
             ["felupe", "matplotlib", "palpate.offline", "pyvista", "scipy.sparse.linalg", "tqdm"],
         ),
+        (
+            "from palpate import Client, Session",
+            ["fastapi", "pydantic", "h5py", "numba", "starlette", "orjson", "msgpack"],
+        ),
     ],
-    ids=["help", "server"],
+    ids=["help", "server", "client"],
 )
 def test_nothing_is_imported_that_is_not_needed(script, heavy):
     assert printed(f"{script}\nimport sys; print(*set({heavy}) & sys.modules.keys())") == []

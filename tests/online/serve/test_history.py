@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from palpate.online.serve import wire
+from palpate.online.serve import layout
 from palpate.online.serve.schemas import MOST_STEPS
 from palpate.online.serve.wire import BINARY
 from palpate.shared.reduced.transfer import REST
@@ -53,7 +53,7 @@ def test_steps_are_those_of_the_atlas(ask, visco_atlas):
         assert step["time"] == pytest.approx(moment.time)
     pressed, held, released, rested = (s["contact_displacement"][2] for s in answered["steps"])
     assert held < pressed < released < rested < 0.0
-    _, fields = wire.decode(ask(accept=BINARY, region="all").content)  # of the end
+    _, fields = layout.decode(ask(accept=BINARY, region="all").content)  # of the end
     np.testing.assert_allclose(fields["displacement"], visco_atlas.displacement(moment), atol=1e-6)
     assert fields["von_mises"].shape == (len(visco_atlas.nodes),)
 

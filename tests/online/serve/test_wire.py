@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from palpate.online.serve import wire
+from palpate.online.serve import layout, wire
 from palpate.online.serve.errors import Refusal
 from palpate.online.serve.wire import BINARY, JSON, MSGPACK, OFFERED, negotiate
 from palpate.shared.errors import PalpateError
@@ -40,7 +40,7 @@ def test_binary_is_laid_out_as_documented():
 )
 def test_binary_comes_back_as_it_went(floats, integers, octets, text):
     sent = {"floats": floats, "integers": integers, "octets": octets}
-    head, received = wire.decode(wire.encode(BINARY, {"text": text}, sent))
+    head, received = layout.decode(wire.encode(BINARY, {"text": text}, sent))
     assert head == {"text": text}
     for name, array in sent.items():
         assert received[name].dtype == array.dtype
@@ -60,7 +60,7 @@ def test_binary_comes_back_as_it_went(floats, integers, octets, text):
 )
 def test_damaged_documents_are_refused(damage, message):
     with pytest.raises(PalpateError, match=message):
-        wire.decode(damage(wire.encode(BINARY, HEAD, FIELDS)))
+        layout.decode(damage(wire.encode(BINARY, HEAD, FIELDS)))
 
 
 @pytest.mark.parametrize(

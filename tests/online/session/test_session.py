@@ -188,7 +188,7 @@ def test_a_scene_without_a_tip_has_no_session(serving):
             Session(url, "toy")
         assert (refused.value.status, refused.value.code) == (404, "no_tip")
         with Client(url) as client:
-            assert client.solve("toy", (5.0, 5.0, 5.0), 4.0).trust["converged"]
+            assert client.solve("toy", (5.0, 5.0, 5.0), 4.0).converged
         with Session(url, "other") as session:
             assert session.step(PRESSED).good
 
