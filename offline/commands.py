@@ -115,19 +115,46 @@ def scene(name: str | None, keys: bool) -> None:
 
 
 @click.command()
+@click.argument("path", metavar="NAME.toml", type=click.Path(dir_okay=False, path_type=Path))
+@click.option(
+    "--shape",
+    type=click.Choice(["block", "section"]),
+    default="block",
+    show_default=True,
+    help="A box, or a cross-section along y, whose outline NAME.csv is written as well.",
+)
+def new(path: Path, shape: str) -> None:
+    """Write a first scene of your own.
+
+    It holds the keys that a scene must have, each with its unit and meaning: change them to what
+    you press. A rigid spherical tip may press it, for sessions.
+    """
+    from palpate.offline.scenes.new import new_scene
+
+    if path.suffix != ".toml":
+        raise click.UsageError(f"{path}: the name of a scene file ends in .toml")
+    written = " and ".join(map(str, new_scene(path, shape)))
+    click.echo(f"{written} written\nnext: palpate train {path} --check")
+
+
+@click.command()
 @click.argument("scene")
 @click.option("--out", type=OUTPUT, help="The artifact to write.  [default: artifacts/NAME.h5]")
 @count_option("--workers", None, "Worker processes.  [default: one for each core]")
 @click.option("--force", is_flag=True, help="Train even if the artifact is up to date.")
-def train(scene: str, out: Path | None, workers: int | None, force: bool) -> None:
+@click.option("--check", "only_check", is_flag=True, help="Only say what is wrong with SCENE.")
+def train(scene: str, out: Path | None, workers: int | None, force: bool, only_check: bool) -> None:
     """Train the artifact of a scene.
 
-    SCENE is the name of one that comes along, such as quick or turbinate, or a TOML file. A run
-    that was stopped continues where it was.
+    SCENE is the name of one that comes along, such as quick or turbinate, or a TOML file, which
+    palpate new writes. A run that was stopped continues where it was.
     """
     from palpate.offline.info import closing
-    from palpate.offline.train import train
+    from palpate.offline.train import check, train
 
+    if only_check:
+        click.echo(f"{check(scene, workers)}\nnothing is wrong; next: palpate train {scene}")
+        return
     try:
         artifact = train(scene, out, workers, force)
     except KeyboardInterrupt:

@@ -29,7 +29,7 @@ from scipy.interpolate import RBFInterpolator
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
-from palpate.offline.choose.mesh import with_mesh
+from palpate.offline.choose.mesh import candidates, divided, with_mesh
 from palpate.offline.choose.size import Trial, choose, first_place, ladder, try_patch
 from palpate.offline.fem.mesh import mesh_quality
 from palpate.offline.fem.norms import statistics
@@ -124,6 +124,23 @@ def train(
     finally:
         checkpoint.leave()
     return path
+
+
+def check(scene: str | Path, workers: int | None = None) -> str:
+    """Say what training a scene would make, once all that can be wrong with it is looked at.
+
+    Raises
+    ------
+    SceneError
+        With every field that is wrong; or else what is wrong with its files, or its mesh.
+    """
+    found = find_scene(scene)
+    content_key(found)
+    if found.geometry.divisions is None:
+        found = divided(found, candidates(found)[0])
+    problem = FullProblem(found)
+    spacing_count(problem.surface, found.training.limit_spacing)
+    return forecast(problem, workers or os.cpu_count() or 1)
 
 
 def is_of(path: Path, key: str) -> bool:

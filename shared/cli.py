@@ -17,6 +17,7 @@ from palpate.shared.files import printable
 EXAMPLE = """\b
 Example, from a scene to an answer:
   palpate scene quick                                   every key of the scene, explained
+  palpate new own.toml                                  a first scene of your own
   palpate train quick                                   writes artifacts/quick.h5
   palpate info quick
   palpate solve quick --at 5 5 8 --pressure 1.5

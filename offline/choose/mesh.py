@@ -71,8 +71,8 @@ def with_mesh(scene: Scene) -> tuple[Scene, dict[str, Any] | None]:
         return scene, None
     allowed, tried = scene.tolerance.mesh, list[dict[str, Any]]()
     references: list[Reference] = []
-    for divisions in tqdm(_candidates(scene), "choosing the mesh"):
-        chosen = _divided(scene, divisions)
+    for divisions in tqdm(candidates(scene), "choosing the mesh"):
+        chosen = divided(scene, divisions)
         problem = FullProblem(chosen)
         references = references or _references(scene, problem)
         errors = _errors(problem, references)
@@ -94,7 +94,7 @@ def with_mesh(scene: Scene) -> tuple[Scene, dict[str, Any] | None]:
     return chosen, {"why": why, "tried": tried}
 
 
-def _divided(scene: Scene, divisions: Divisions) -> Scene:
+def divided(scene: Scene, divisions: Divisions) -> Scene:
     """The same scene with divisions, in its text as well."""
     table = re.search(r"^\[geometry\].*\n", scene.text, flags=re.M)
     start, key = (table.end(), "divisions") if table else (0, "geometry.divisions")
@@ -107,7 +107,7 @@ def _divided(scene: Scene, divisions: Divisions) -> Scene:
         raise SceneError("geometry.divisions: needed where geometry is an inline table") from error
 
 
-def _candidates(scene: Scene) -> list[Divisions]:
+def candidates(scene: Scene) -> list[Divisions]:
     """Divisions whose elements are about as long as wide, from coarse to fine."""
     even = np.linspace(0, 1, PROBE + 1)
     grid = shape_of(scene).grid(even, even, even)

@@ -1,9 +1,10 @@
 """The scenes that come with the software, how to name one, and what the keys of a scene say."""
 
 import json
-from collections.abc import Iterator
+import tomllib
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Literal, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 from pydantic.fields import FieldInfo
 
@@ -48,22 +49,29 @@ def filled(scene: Scene) -> str:
     return "\n".join(_lines(scene, "")) + "\n"
 
 
-def _lines(part: Part, path: str) -> Iterator[str]:
+def given(scene: Scene) -> str:
+    """The same of the keys alone that its text gives."""
+    return "\n".join(_lines(scene, "", tomllib.loads(scene.text))) + "\n"
+
+
+def _lines(part: Part, path: str, said: Mapping[str, Any] | None = None) -> Iterator[str]:
     tables = []
     for key, field in type(part).model_fields.items():
+        if said is not None and key not in said:
+            continue
         value, meaning = getattr(part, key), f"# {field.description}"
         if isinstance(value, Part):
-            tables.append((f"{path}{key}", meaning, value))
+            tables.append((key, meaning, value))
             continue
-        said = f"{key} = {_toml(value)}"
+        line = f"{key} = {_toml(value)}"
         if value is None:
-            said, meaning = f"# {key} =", f"{meaning} (if absent: {absent(field)})"
-        if len(said) > MEANINGS:
+            line, meaning = f"# {key} =", f"{meaning} (if absent: {absent(field)})"
+        if len(line) > MEANINGS:
             yield meaning
-        yield said if len(said) > MEANINGS else f"{said:<{MEANINGS}} {meaning}"
-    for name, meaning, table in tables:
-        yield f"\n{f'[{name}]':<{MEANINGS}} {meaning}"
-        yield from _lines(table, f"{name}.")
+        yield line if len(line) > MEANINGS else f"{line:<{MEANINGS}} {meaning}"
+    for key, meaning, table in tables:
+        yield f"\n{f'[{path}{key}]':<{MEANINGS}} {meaning}"
+        yield from _lines(table, f"{path}{key}.", None if said is None else said[key])
 
 
 def _toml(value: object) -> str:

@@ -49,6 +49,18 @@ SHARE = 0.15
 ON_TIME = 100.0
 """Latest that a message may be sent in a clean window, µs after it was due."""
 
+KEPT = 0.99
+"""Share of messages that are answered where a service keeps what is asked."""
+
+_KEPT = {True: "kept", False: "not kept"}
+_LESS = "ask for fewer sessions or a lower rate, leave it a core, or give it more with --workers"
+_ADVICE = {
+    "superseded": _LESS,
+    "dropped": _LESS,
+    "lost": "look at the service's log for why it ended connections",
+    "refused": "look at --rate-limit, --max-sessions and --max-wait of the service",
+}
+
 QUANTILES = {"p50_us": 50.0, "p90_us": 90.0, "p99_us": 99.0, "p999_us": 99.9, "max_us": 100.0}
 
 
@@ -169,7 +181,56 @@ def _judge(plan: Plan, machine: Machine, streams: Sequence[Stream]) -> Outcome:
         start, end = LEAD + plan.duration, LEAD + 2.0 * plan.duration
         first = messages.get("frames", every)
         summary["overload"] = summarize_overload(first, machine, start, end)
+    summary["verdict"] = verdict(plan, summary)
     return Outcome(summary, machine, clean, messages)
+
+
+def verdict(plan: Plan, summary: dict[str, Any]) -> dict[str, str]:
+    """Say whether a service ``kept`` what a plan asked, ``not kept`` or ``void``; why, what to do.
+
+    It is kept if ``KEPT`` of all messages are answered, frames within the time of one in 99 of 100;
+    of an overload, if all is as before soon after.  It is void if the generator or the machine was
+    at fault.
+    """
+    machine, parts = summary["machine"], []
+    parts += [f"{plan.sessions} sessions at {plan.rate:g} frames/s"] if plan.sessions else []
+    parts += [f"{plan.queries:g} queries/s"] if plan.queries else []
+    asked = f"{plan.scene}: {' and '.join(parts)} for {plan.duration:g} s"
+    late = machine["lateness_us"]["p99_us"]
+    if late is None or late > ON_TIME or 2 * machine["clean_windows"] < machine["windows"]:
+        why = f"the load test was late itself, by {late or 0:.0f} µs (p99), or the machine's host "
+        why += f"took time ({machine['steal_s']} s): {machine['clean_windows']} of "
+        why += f"{machine['windows']} windows are clean"
+        do = "run it where it has a core of its own, or ask for less"
+        return {"verdict": "void", "asked": asked, "why": why, "do": do}
+    if "overload" in summary:
+        recovered = summary["overload"]["recovered_s"]
+        why = f"{plan.overload:g} times that; " + (
+            "it has not recovered" if recovered is None else f"recovered after {recovered} s"
+        )
+        do = "look at the picture (--out) for what stays late" if recovered is None else ""
+        return {"verdict": _KEPT[recovered is not None], "asked": asked, "why": why, "do": do}
+    kinds = {"frames" if plan.sessions else "queries": summary}
+    kinds |= {"queries": summary["queries"]} if "queries" in summary else {}
+    said, advice = [], ""
+    for name, kind in kinds.items():
+        missed = {what: kind[what] for what in ("superseded", "lost", "dropped")}
+        missed["refused"] = sum(kind["refused"].values())
+        most = max(missed, key=lambda what: missed[what])
+        if kind["answered"] < KEPT * kind["due"]:
+            said.append(f"{missed[most]} of {kind['due']} {name} were {most}")
+            advice = advice or _ADVICE[most]
+        slowest, frame = kind["clean"]["p99_us"], 1e6 / plan.rate
+        if name == "frames" and slowest is not None and slowest > frame:
+            said.append(f"99 of 100 frames took up to {slowest:.0f} µs, and one lasts {frame:.0f}")
+            advice = advice or _ADVICE["superseded"]
+    if said:
+        return {"verdict": _KEPT[False], "asked": asked, "why": "; ".join(said), "do": advice}
+    latest = {name: kind["clean"]["p99_us"] for name, kind in kinds.items()}
+    why = "99 of 100 within " + " and ".join(
+        f"{value or 0:.0f} µs ({name})" for name, value in latest.items()
+    )
+    return {"verdict": _KEPT[True], "asked": asked, "why": why, "do": ""}
 
 
 def gather(streams: Sequence[Stream], machine: Machine) -> Messages:
@@ -266,8 +327,13 @@ def _worst(messages: Messages, window: int) -> float:
 
 def table(summary: dict[str, Any]) -> str:
     """Write a summary for people: rows of Markdown per kind of message and of windows."""
+    said, flags = summary["verdict"], summary["flags"]
     rows = [
-        "| | answered | lost | superseded | refused | p50 µs | p99 µs | p99.9 µs | max µs |",
+        f"{said['verdict']}: {said['asked']}: {said['why']}",
+        *([f"what to do: {said['do']}"] if said["do"] else []),
+        "",
+        "| | answered | lost | superseded | refused, dropped "
+        "| p50 µs | p99 µs | p99.9 µs | max µs |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     kinds = {"frames" if summary["plan"]["sessions"] else "queries": summary}
@@ -281,6 +347,9 @@ def table(summary: dict[str, Any]) -> str:
             f"| {name}, all windows | {counts} | {_row(kind['all'])} |",
             f"| {name}, solve alone | | | | | {_row(kind['solve_us'])} |",
         ]
+    if summary["plan"]["sessions"] and summary["answered"]:
+        beyond = 1.0 - flags["IN_RANGE"] / summary["answered"]
+        rows += ["", f"{beyond:.1%} of frames out of range, {flags['FALLBACK']} fallbacks"]
     rows += [
         "",
         "{clean_windows} of {windows} windows clean; steal {steal_s} s; load average "

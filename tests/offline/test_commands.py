@@ -136,6 +136,25 @@ def test_what_makes_no_sense_is_told_in_a_line(
     assert reason in told
 
 
+@pytest.mark.parametrize("shape", ["block", "section"])
+def test_a_new_scene_can_be_trained_and_is_not_overwritten(run, tmp_path, monkeypatch, shape):
+    monkeypatch.chdir(tmp_path)
+    made = run("new", "own.toml", "--shape", shape)
+    assert made.exit_code == 0, made.output
+    assert made.stdout.splitlines()[-1] == "next: palpate train own.toml --check"
+    text = (tmp_path / "own.toml").read_text()
+    checked = run("train", "own.toml", "--check")
+    assert checked.exit_code == 0, checked.output
+    assert re.search(r"DOFs; about \d+ or more local models", checked.stdout)
+    assert checked.stdout.splitlines()[-1] == "nothing is wrong; next: palpate train own.toml"
+    assert run("scene", "own.toml").exit_code == 0
+    again = run("new", "own.toml", "--shape", shape)
+    assert again.exit_code == 2
+    assert "is there already" in again.stderr
+    assert (tmp_path / "own.toml").read_text() == text
+    assert not list(tmp_path.glob("artifacts*"))
+
+
 def test_help_is_plain_text(run):
     for command in main.list_commands(None):
         assert "\\b" not in run(command, "--help").output

@@ -10,6 +10,7 @@ from palpate.online.loadtest.run import (
     summarize,
     summarize_added,
     summarize_overload,
+    verdict,
 )
 from palpate.online.loadtest.streams import (
     ANSWERED,
@@ -20,6 +21,7 @@ from palpate.online.loadtest.streams import (
     Machine,
 )
 from palpate.online.session.frames import Flag
+from palpate.online.settings import Plan
 
 
 def log(due, latency_ms=0.2, late_ms=0.0, outcome=ANSWERED):
@@ -74,6 +76,55 @@ def test_what_became_of_messages_is_told_apart():
     assert found["flags"]["FALLBACK"] == 0
     assert found["clean"]["p50_us"] == pytest.approx(200.0, rel=1e-3)
     assert found["complaints"] == ["stop"]
+
+
+def judged(messages, late_ms=0.0, steal=(), **plan):
+    """The verdict on frames at 1 kHz of a session."""
+    messages.lateness[:] = 1e3 * late_ms
+    box = machine(10, steal)
+    clean = clean_windows(box, messages)
+    summary = summarize(messages, clean, [SimpleNamespace(complaint="")])
+    summary["machine"] = {
+        "windows": 10,
+        "clean_windows": int(clean.sum()),
+        "steal_s": float(box.steal.sum()),
+        "lateness_us": quantiles(messages.lateness),
+    }
+    asked = Plan("http://127.0.0.1:1", "toy", **plan)
+    if asked.overload > 1:
+        summary["overload"] = {"recovered_s": 0.5 if asked.overload < 5 else None}
+    return verdict(asked, summary)
+
+
+def test_the_verdict_says_whether_why_and_what_to_do():
+    due = np.arange(0.0, 10.0, 0.01)
+    kept = judged(log(due))
+    assert (kept["verdict"], kept["do"]) == ("kept", "")
+    assert kept["why"] == "99 of 100 within 200 µs (frames)"
+    assert kept["asked"] == "toy: 1 sessions at 1000 frames/s for 10 s"
+    for fate, word, advice in (
+        (SUPERSEDED, "superseded", "--workers"),
+        (LOST, "lost", "log"),
+        (503, "refused", "--max-sessions"),
+    ):
+        found = judged(log(due, outcome=np.where(due < 1.0, fate, ANSWERED)))
+        assert found["verdict"] == "not kept"
+        assert found["why"] == f"100 of 1000 frames were {word}"
+        assert advice in found["do"]
+    slow = judged(log(due, latency_ms=1.5))
+    assert slow["verdict"] == "not kept"
+    assert slow["why"] == "99 of 100 frames took up to 1500 µs, and one lasts 1000"
+    assert judged(log(due), overload=2.0)["verdict"] == "kept"
+    assert judged(log(due), overload=9.0)["verdict"] == "not kept"
+
+
+def test_a_load_test_that_was_late_itself_says_nothing_of_the_service():
+    due = np.arange(0.0, 10.0, 0.01)
+    superseded = np.where(due < 8.0, SUPERSEDED, ANSWERED)
+    assert judged(log(due, outcome=superseded), late_ms=1.6)["verdict"] == "void"
+    found = judged(log(due), steal=range(6))
+    assert found["verdict"] == "void"
+    assert "4 of 10 windows are clean" in found["why"]
 
 
 def test_what_the_service_adds_is_the_round_trip_less_its_work():
