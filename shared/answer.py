@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from palpate.shared.arrays import Array
+from palpate.shared.arrays import Array, Flags, Ints
 from palpate.shared.near_field import Contact
 from palpate.shared.reduced.transfer import Local, Past
 
@@ -55,6 +55,24 @@ class Answer(NamedTuple):
     time: float = 0.0  # s, since rest, of tissue with a past
     past: Past | None = None  # to go on from; the one before if this answer did not converge
     active: tuple[tuple[int, float, Local], ...] = ()  # with a past: local models and theirs
+
+
+class Answers(NamedTuple):
+    """Answers to n loads or positions of the tip, each from rest; see ``Answer``."""
+
+    contact_point: Array  # (n, 3) mm
+    normal: Array  # (n, 3)
+    distance: Array  # (n,) mm
+    force: Array  # (n, 3) mN, on the tool
+    converged: Flags  # (n,)
+    iterations: Ints  # (n,)
+    in_range: Flags  # (n,)
+    error_displacement: Array  # (n,) estimated; infinite beyond the range or without equilibrium
+    error_von_mises: Array  # (n,)
+    error_force: Array  # (n,)
+    min_jacobian: Array  # (n,)
+    limit: Array  # (n,) kPa, largest trained pressure, or mm, largest depth of the tip
+    contact_displacement: Array  # (n, 3) mm, mean under the footprint of a load
 
 
 def describe(answer: Answer) -> dict[str, Any]:

@@ -11,7 +11,8 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from palpate.shared.answer import Answer
+from palpate.shared import many
+from palpate.shared.answer import Answer, Answers
 from palpate.shared.arrays import Array, Field, Flags
 from palpate.shared.artifact import Artifact, ArtifactError, read_artifact, values_of
 from palpate.shared.errors import PalpateError, QueryError
@@ -29,9 +30,9 @@ from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH
 from palpate.shared.mechanics.tip import EDGE_FIELD, dented, held
 from palpate.shared.near_field import Contact
-from palpate.shared.query import check_place, checked_load, out_of_range, vector
+from palpate.shared.query import BARRED, check_place, checked_load, out_of_range, vector
 from palpate.shared.reduced import press, touch
-from palpate.shared.reduced.features import near_rim
+from palpate.shared.reduced.features import UNFITTED, near_rim, total_errors
 from palpate.shared.reduced.outcome import Outcome
 from palpate.shared.reduced.past import Elastic, Remembering
 from palpate.shared.reduced.transfer import LeftBehind, Local, Past, Transfer, estimate_history
@@ -48,16 +49,12 @@ Moves = dict[int, tuple[Mapping[int, LeftBehind], ...]]
 STORED = Mesh, Surface, LoadRange, LocalModels, ViscousModels, Estimators
 """What an artifact holds."""
 
-BARRED = 0.1
-"""Share of the tip's force with which the rim may hold back its place: with more, it presses what
-lies beyond the accessible surface.  Spheres integrated there have forces 25 % larger at a share of
-0.4, and within 6 % up to 0.15."""
-
 MOST_BEGINNINGS = 6
 """Times that a step under the tip is begun, each with the local models that the last ended at."""
 
 _NONE, _UNKNOWN = np.zeros(3), np.full(3, np.inf)
 """Estimated errors."""
+
 
 _BEYOND = 2.0
 """Share of its limit that stands for a load that is out of range in other ways: no error is known
@@ -413,6 +410,20 @@ class ReducedModel:
             solve_seconds=time.perf_counter() - started,
         )
 
+    def solve_many(
+        self,
+        positions: ArrayLike,
+        pressures: ArrayLike,
+        directions: ArrayLike | None = None,
+        threads: int | None = None,
+    ) -> Answers:
+        """Answer many loads, each as ``press`` does from rest, on many threads; see ``many``."""
+        return many.solve(self, positions, pressures, directions, threads)
+
+    def touch_many(self, positions: ArrayLike, threads: int | None = None) -> Answers:
+        """Answer many positions of the tip, each as ``touch`` does from rest; see ``many``."""
+        return many.touch(self, positions, threads)
+
     def doubts(self, answer: Answer) -> tuple[str, ...]:
         """Why not to trust an answer; nothing for one to be trusted.
 
@@ -466,11 +477,10 @@ def _total(
 
     At a pressure or depth, by its share of the limit and whether it is near the rim.
     """
-    if fitted is None:
-        return reduction.tolist(), _NONE
-    share, rim = min(max(level / found.limit.item(), 0.0), 1.0), near_rim(found.limits)
-    mesh = [math.exp(a + b * share + c * rim) for a, b, c in fitted.tolist()]
-    return list(map(math.hypot, reduction.tolist(), mesh)), np.array(mesh)
+    mesh, total, share = np.empty(3), np.empty(3), level / found.limit.item()
+    coefficients = UNFITTED if fitted is None else fitted
+    total_errors(reduction, coefficients, share, near_rim(found.limits), mesh, total)
+    return total.tolist(), mesh
 
 
 def _footprint(found: Outcome, radius: float, tip: bool) -> Contact:

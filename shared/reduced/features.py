@@ -121,3 +121,22 @@ def estimate_errors(coefficients, features, errors):
     """Estimated errors: ``log error = c . features``."""
     for i in range(len(coefficients)):
         errors[i] = math.exp(np.dot(coefficients[i], features))
+
+
+UNFITTED = np.empty((0, 3))
+"""Coefficients of the mesh's errors that are not known."""
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def total_errors(errors, fitted, share, rim, mesh, total):
+    """Write the mesh's errors (3,) and those of mesh and reduction together, (3,).
+
+    ``fitted`` (3, 3) are coefficients of their logs: 1, the share of the limit, near the rim; it
+    has no rows where they are not known.
+    """
+    inside = min(max(share, 0.0), 1.0)
+    for i in range(3):
+        mesh[i] = 0.0
+        if i < len(fitted):
+            mesh[i] = math.exp(fitted[i, 0] + fitted[i, 1] * inside + fitted[i, 2] * rim)
+        total[i] = math.hypot(errors[i], mesh[i]) if mesh[i] > 0.0 else errors[i]

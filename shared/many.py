@@ -1,0 +1,141 @@
+"""Many queries from rest on all cores, each answered to the same bits as by itself.
+
+What a thread does is compiled (``reduced.many``) and holds no lock; every thread has working memory
+of its own.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from palpate.shared.answer import Answers
+from palpate.shared.arrays import Array, Flags
+from palpate.shared.compiled import room
+from palpate.shared.geometry.surface import UPRIGHT
+from palpate.shared.mechanics import newton
+from palpate.shared.query import ABSURD, BARRED, BESIDE, refuse_rows, rows
+from palpate.shared.reduced.features import UNFITTED
+from palpate.shared.reduced.many import Found, press_many, touch_many
+
+if TYPE_CHECKING:
+    from palpate.shared.model import ReducedModel
+    from palpate.shared.reduced.workspace import Workspace
+
+SLIGHT = 1e-9
+"""Relative excess over a limit that is round-off."""
+
+
+def solve(
+    model: ReducedModel,
+    positions: ArrayLike,
+    pressures: ArrayLike,
+    directions: ArrayLike | None,
+    threads: int | None,
+) -> Answers:
+    """Answer pressed footprints.
+
+    Parameters
+    ----------
+    positions : array_like, shape (n, 3), mm
+    pressures : array_like, shape (n,), kPa
+    directions : array_like, shape (n, 3), or None
+        None for the inward normals.
+    threads : int or None
+        None for one on each core.
+
+    Raises
+    ------
+    QueryError
+        If a field is not finite, out of reach or makes no sense; it names the row, from 0.
+    """
+    at, endoscope = rows("positions", positions, 3), model.scene.endoscope
+    pressed = rows("pressures", pressures, 1, len(at))[:, 0]
+    most = ABSURD * model.pressure_max
+    refuse_rows("pressures", (pressed < 0) | (pressed > most), f"must be 0 to {most:.3g} kPa")
+    towards = np.zeros_like(at)
+    if directions is not None:
+        towards = rows("directions", directions, 3, len(at))
+        length = np.array([math.hypot(*row) for row in towards.tolist()])
+        refuse_rows("directions", length == 0.0, "must not be zero")
+        towards = towards / length[:, None]
+
+    def work(own: Workspace, found: Found, part: slice) -> None:
+        mesh, loads = _fitted(model.estimators.mesh), (at[part], towards[part], pressed[part])
+        press_many(own.solver, mesh, *loads, endoscope.radius, found)
+
+    found = _in_threads(model, False, len(at), threads, work)
+    reach = f"more than {endoscope.reach} mm from the accessible surface"
+    refuse_rows("positions", found.distance > endoscope.reach, reach)
+    refuse_rows("directions", ~(found.tilt < 90.0), "must point into the tissue")
+    above = np.abs(np.sum((at - found.point) * found.normal, axis=1))
+    outside = (found.distance > BESIDE) & (above < UPRIGHT * found.distance)
+    outside |= pressed > found.limit * (1 + SLIGHT)
+    outside |= found.tilt > endoscope.max_tilt + 1e-6
+    return _answers(found, outside)._replace(error_force=np.zeros(len(at)))
+
+
+def touch(model: ReducedModel, positions: ArrayLike, threads: int | None) -> Answers:
+    """Answer positions (n, 3) mm of the rigid tip; see ``solve``."""
+    at, radius = rows("positions", positions, 3), model.body.tip.radius
+
+    def work(own: Workspace, found: Found, part: slice) -> None:
+        touch_many(own.solver, _fitted(model.estimators.mesh_tip), at[part], found)
+
+    found = _in_threads(model, True, len(at), threads, work)
+    below = "the tip's centre lies below the accessible surface"
+    refuse_rows("positions", found.depth > radius, below)
+    over = ((found.beside > 0.0) | (found.barred > BARRED)) & (found.depth > 0.0)
+    return _answers(found, over | (found.depth > found.limit * (1 + SLIGHT)))
+
+
+def _fitted(coefficients: Array | None) -> Array:
+    return UNFITTED if coefficients is None else coefficients
+
+
+def _in_threads(
+    model: ReducedModel,
+    tip: bool,
+    count: int,
+    threads: int | None,
+    work: Callable[[Workspace, Found, slice], None],
+) -> Found:
+    """Let every thread do its part of so many queries."""
+    found, most = room(Found, n=count), threads or os.cpu_count() or 1
+    ends = np.linspace(0, count, min(most, max(count, 1)) + 1).round().astype(int).tolist()
+
+    def do(part: slice) -> None:
+        own = model.workspace(tip, in_time=False)
+        work(own, Found(*(array[part] for array in found)), part)
+
+    with ThreadPoolExecutor(len(ends) - 1) as pool:
+        list(pool.map(do, (slice(*pair) for pair in pairwise(ends))))
+    return found
+
+
+def _answers(found: Found, outside: Flags) -> Answers:
+    """Answers of what was found; errors of those outside the range are not known."""
+    converged = found.status == newton.CONVERGED
+    found.errors[outside | ~converged] = np.inf
+    return Answers(
+        contact_point=found.point,
+        normal=found.normal,
+        distance=found.distance,
+        force=found.force,
+        converged=converged,
+        iterations=found.iterations.astype(np.int64),
+        in_range=~outside,
+        error_displacement=found.errors[:, 0],
+        error_von_mises=found.errors[:, 1],
+        error_force=found.errors[:, 2],
+        min_jacobian=found.min_jacobian,
+        limit=found.limit,
+        contact_displacement=found.displacement,
+    )
