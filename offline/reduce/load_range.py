@@ -24,7 +24,7 @@ model is asked everywhere whether its answers depend on the way, straight in or 
 are lowered likewise.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -39,7 +39,13 @@ from palpate.offline.fem.potential import Potential, Projected
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.terms import DeadLoad
 from palpate.offline.reduce.ritz import energy_pod, ritz_vectors
-from palpate.offline.reduce.sampling import cone, farthest, random_points_and_rim, tangents
+from palpate.offline.reduce.sampling import (
+    cone,
+    farthest,
+    random_points,
+    random_points_and_rim,
+    tangents,
+)
 from palpate.offline.reduce.window import WHOLE, part_of
 from palpate.offline.run.streams import Stage
 from palpate.offline.run.workers import read_result
@@ -361,9 +367,7 @@ def _pressed_in(model: ReducedModel, x: Array) -> float:
     for deeper in DEPTH_SHARES[::-1]:
         position = place.touch(deeper).position
         at_once = model.touch(position)
-        if not (at_once.converged and at_once.in_range) or _apart(
-            at_once, model.touch(position, warm=state)
-        ):
+        if not at_once.converged or _apart(at_once, model.touch(position, warm=state)):
             break
         share = deeper
     return float(share)
@@ -451,6 +455,12 @@ def _contact(model: ReducedModel, _: int, point: Array, rng: Rng) -> tuple[Array
     return model.surface.project(point)[0], rng.uniform(0.0, 2.0 * np.pi)
 
 
+def _points_and_whole_rim(surface: Surface, count: int, rng: Rng) -> Iterator[Array]:
+    """Every vertex of the rim, whose corners are few, and points all over the surface."""
+    yield from surface.vertices[surface.rim()]
+    yield from random_points(surface, 3 * count // 4, rng)
+
+
 GIVING_WAY = Search(
     "giving way", 0, Stage.GIVING_WAY, random_points_and_rim, _largest_load, limit_load_share,
     first=16, closer=24, reach=2.0,
@@ -460,7 +470,7 @@ FOLDING = Search(
     first=1, closer=4, reach=2.0,
 )  # fmt: skip
 SLIPPING_OFF = Search(
-    "slipping off", TIP_DEPTH, Stage.SLIPPING_OFF, random_points_and_rim, _contact,
+    "slipping off", TIP_DEPTH, Stage.SLIPPING_OFF, _points_and_whole_rim, _contact,
     path_independent_share, first=6, closer=8, reach=1.0,
 )  # fmt: skip
 

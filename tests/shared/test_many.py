@@ -6,20 +6,10 @@ import pytest
 from palpate.offline.reduce.sampling import cone
 from palpate.shared.errors import QueryError
 
-NAMES = [
-    "contact_point",
-    "normal",
-    "distance",
-    "force",
-    "converged",
-    "iterations",
-    "in_range",
-    "error_displacement",
-    "error_von_mises",
-    "error_force",
-    "min_jacobian",
-    "contact_displacement",
-]
+NAMES = (
+    "contact_point", "normal", "distance", "force", "converged", "iterations", "in_range",
+    "error_displacement", "error_von_mises", "error_force", "min_jacobian", "contact_displacement",
+)  # fmt: skip
 
 
 @pytest.fixture
