@@ -11,6 +11,8 @@ from typing import Any
 import click
 import orjson
 
+from palpate.shared.cli import Finite
+
 
 class _Artifact(click.Path):
     """The file of an artifact, or the name of a scene whose artifact lies where training put it."""
@@ -24,9 +26,24 @@ class _Artifact(click.Path):
         return super().convert(named, param, ctx)
 
 
+class _Output(click.Path):
+    """A file to write, whose name ends as its kind does."""
+
+    def __init__(self, suffix: str) -> None:
+        super().__init__(dir_okay=False, writable=True, path_type=Path)
+        self._suffix = suffix
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        if Path(value).suffix != self._suffix:
+            self.fail(f"{value!r} must end in {self._suffix}", param, ctx)
+        return super().convert(value, param, ctx)
+
+
 ARTIFACT = _Artifact(exists=True, dir_okay=False, path_type=Path)
 OUTPUT = click.Path(dir_okay=False, writable=True, path_type=Path)
-VECTOR = (float, float, float)
+TABLE = click.Path(exists=True, dir_okay=False, path_type=Path)
+NUMBER = Finite()
+VECTOR = (NUMBER, NUMBER, NUMBER)
 
 Report = Mapping[str, object]
 Option = Callable[[Callable[..., Any]], Callable[..., Any]]
@@ -89,8 +106,8 @@ def load_options(command: Callable[..., Any]) -> Callable[..., Any]:
     pressure = "Pressure at the centre of the footprint, kPa."
     direction = "Direction of the load, of any length.  [default: the inward normal]"
     command = vector_option("--direction", help=direction)(command)
-    command = click.option("--pressure", type=float, required=True, help=pressure)(command)
-    return vector_option("--at", "position", help=at, required=True)(command)
+    command = click.option("--pressure", type=NUMBER, help=pressure)(command)
+    return vector_option("--at", "--position", "position", help=at)(command)
 
 
 @click.command()
@@ -180,16 +197,34 @@ def info(artifact: Path, as_json: bool) -> None:
 @click.command()
 @artifact_argument
 @load_options
+@click.option("--radius", type=NUMBER, help="Of the footprint, mm.  [default: the scene's]")
+@click.option("--tip", is_flag=True, help="Press with the rigid tip, its centre --at a place.")
 @click.option("--full-model", is_flag=True, help="Solve the full model as well and compare.")
-@click.option("--vtu", type=OUTPUT, metavar="OUT.vtu", help="Write mesh and fields.")
+@click.option("--vtu", type=_Output(".vtu"), metavar="OUT.vtu", help="Write mesh and fields.")
+@click.option("--csv", "table", type=TABLE, metavar="IN.csv", help="Answer every row instead.")
+@click.option("--out", type=_Output(".csv"), metavar="OUT.csv", help="Where to write the rows.")
 @reporting
-def solve(**request: Any) -> Report:
-    """Press the tissue of an artifact once.
+def solve(table: Path | None, out: Path | None, tip: bool, **request: Any) -> Report:
+    """Press the tissue of an artifact once, or with each row of a table.
 
-    The file OUT.vtu holds the mesh at rest with the point data displacement (mm), von_mises (kPa),
-    load (mN) and clamped (0 or 1): with --full-model of the full model, and with the deviations
-    displacement_error and von_mises_error of the reduced model from it.
+    The file OUT.vtu holds the mesh at rest with the point data displacement_mm, von_mises_kPa,
+    load_mN and clamped (0 or 1); with --full-model also full_displacement_mm, full_von_mises_kPa
+    and the deviations of the reduced model from them, displacement_error_mm and
+    von_mises_error_kPa.
+
+    The first line of IN.csv is x,y,z,pressure (mm, kPa), or x,y,z,pressure,dx,dy,dz with a
+    direction, or with --tip x,y,z. All cores answer, and each row as if it were alone.
     """
+    if table is not None:
+        from palpate.offline.table import solve_table
+
+        _need({"--out": out}, {key: value for key, value in request.items() if key != "artifact"})
+        return solve_table(request["artifact"], table, out or table, tip)
+    _need({"--at": request["position"]}, {"out": out})
+    if tip:
+        _need({}, {key: request[key] for key in ("pressure", "direction", "radius")})
+    else:
+        _need({"--pressure": request["pressure"]}, {})
     from palpate.offline.solve import solve
 
     report = solve(**request)
@@ -201,17 +236,29 @@ def solve(**request: Any) -> Report:
     return report
 
 
+def _need(needed: Mapping[str, object], without: Mapping[str, object]) -> None:
+    """Refuse options that are missing, and those that make no sense beside the others."""
+    for option, value in needed.items():
+        if value is None:
+            raise click.UsageError(f"Missing option '{option}'.")
+    for name, value in without.items():
+        if value is not None and value is not False:
+            option = "at" if name == "position" else name.replace("_", "-")
+            raise click.UsageError(f"'--{option}' makes no sense here.")
+
+
 @click.command()
 @artifact_argument
 @load_options
-@click.option("--out", type=OUTPUT, required=True, metavar="PNG", help="Where to draw.")
+@click.option("--out", type=_Output(".png"), required=True, metavar="PNG", help="Where to draw.")
 def picture(**request: Any) -> None:
     """Draw the pressed tissue of an artifact, coloured by von Mises stress.
 
-    Needs PyVista: pip install -e '.[pictures]'.
+    Needs PyVista: pip install 'palpate[pictures]'.
     """
     from palpate.offline.pictures import picture
 
+    _need({"--at": request["position"], "--pressure": request["pressure"]}, {})
     picture(**request)
 
 
@@ -462,7 +509,7 @@ def turbinate(scene: str, report: Path | None) -> Report:
     """Redraw figures 1, 2c and 2d of Radermacher & Reese.
 
     The turbinate under one footprint in modal, Ritz and POD bases, and contours of the relative
-    errors in five POD bases, for which PyVista is needed: pip install -e '.[pictures]'. SCENE
+    errors in five POD bases, for which PyVista is needed: pip install 'palpate[pictures]'. SCENE
     turbinate-paper is of the size of the paper's mesh; turbinate-visco is of visco-elastic tissue,
     pressed, held and let go, without contours.
     """

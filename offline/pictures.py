@@ -37,7 +37,7 @@ def require_pyvista() -> Any:
     try:
         import pyvista
     except ImportError as error:
-        raise PalpateError("pictures need PyVista: pip install -e '.[pictures]'") from error
+        raise PalpateError("pictures need PyVista: pip install 'palpate[pictures]'") from error
     return pyvista
 
 

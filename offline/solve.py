@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from palpate.offline.fem.mesh import least_volume_ratio
 from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.norms import relative
-from palpate.offline.fem.problem import FullProblem, Load
+from palpate.offline.fem.problem import FullProblem, Load, Step, TipPosition
 from palpate.shared.answer import describe
 from palpate.shared.arrays import Array
+from palpate.shared.errors import QueryError
 from palpate.shared.model import ReducedModel
 
 CELL_TYPES = {8: 12, 20: 25}  # VTK_HEXAHEDRON and VTK_QUADRATIC_HEXAHEDRON, by nodes per element
@@ -30,27 +31,32 @@ TYPE_NAMES = {"f": "Float64", "i": "Int64", "u": "UInt8"}
 def solve(
     artifact: Path,
     position: Sequence[float],
-    pressure: float,
+    pressure: float | None,
     direction: Sequence[float] | None = None,
+    radius: float | None = None,
     full_model: bool = False,
     vtu: Path | None = None,
 ) -> dict[str, Any]:
     """Answer one load as the service does, JSON-able, with ``peak`` values of the fields.
 
+    Or, without a pressure, a position of the rigid tip.
+
     Parameters
     ----------
     position : sequence of 3 floats, mm
-        Projected onto the accessible surface.
+        Projected onto the accessible surface; of a tip, that of its centre.
     pressure : float, kPa
     direction : sequence of 3 floats, optional
         The inward normal if absent.
+    radius : float, mm, optional
+        Of the footprint; the scene's if absent.
     full_model : bool
         Solve the full model too and add its answer and the errors of the reduced one against it:
         relative L2 norms over all nodes (displacement) and all nodes outside the clamped layer
         (von Mises stress).
     vtu : Path, optional
-        Where to write mesh and fields: those of the full model if it is solved, and then the
-        reduced model's deviations from them too.
+        Where to write mesh and fields; of the full model too if it is solved, and the reduced
+        model's deviations from them.
 
     Raises
     ------
@@ -59,12 +65,19 @@ def solve(
         under it.
     """
     atlas = ReducedModel.load(artifact)
-    solution, solve_us = _timed(lambda: atlas.press(position, pressure, direction))
-    if not solution.converged:
-        raise NoEquilibrium(
+    if pressure is None:
+        solution, solve_us = _timed(lambda: atlas.touch(position))
+        limit = f"depth: no equilibrium found; trained for up to {solution.depth_limit:.3g} mm"
+        step: Step = TipPosition(np.asarray(position, float))
+    else:
+        solution, solve_us = _timed(lambda: atlas.press(position, pressure, direction, radius))
+        limit = (
             "pressure: no equilibrium found under this load; the model was trained for up to "
-            f"{solution.pressure_limit:.3g} kPa there"
+            f"{solution.pressure_limit:.3g} kPa"
         )
+        step = Load(solution.contact_point, solution.direction, pressure)
+    if not solution.converged:
+        raise NoEquilibrium(f"{limit} there")
     fields, recover_us = _timed(
         lambda: {
             name: getattr(atlas, name)(solution).astype(float)
@@ -77,32 +90,37 @@ def solve(
     report["timing"] = {"solve_us": solve_us, "recover_us": recover_us}
     if not (full_model or vtu):
         return report
+    if radius not in (None, atlas.scene.endoscope.radius):
+        raise QueryError("radius", "the full model presses with the scene's")
     problem = FullProblem.of_artifact(artifact)
-    load = Load(solution.contact_point, solution.direction, pressure)
     if full_model:
-        exact, full_us = _timed(lambda: problem.solve(load))
-        moved = exact.displacement
-        contact = problem.footprint(load)
-        stress = problem.von_mises(moved, contact=contact)
-        peaks = problem.stress_field.peaks(moved, None, contact)
+        exact, full_us = _timed(lambda: problem.solve(step))
+        contact = problem.footprint(step, exact)
+        u = problem.displaced(exact, contact)
+        stress = problem.von_mises(u, contact=contact)
+        peaks = problem.stress_field.peaks(u, None, contact)
         kept = problem.beyond_clamped_layer
         report["full_model"] = {
             "error": {
-                "displacement": relative(fields["displacement"], moved),
+                "displacement": relative(fields["displacement"], u),
                 "von_mises": relative(fields["von_mises"][kept], stress[kept]),
             },
-            "peak": _peaks(moved, peaks),
+            "peak": _peaks(u, peaks),
             "iterations": exact.iterations,
             "load_steps": exact.load_steps,
-            "min_jacobian": least_volume_ratio(problem.mesh, moved),
+            "min_jacobian": least_volume_ratio(problem.mesh, exact.displacement),
             "timing": {"solve_us": full_us},
         }
-        found = {"displacement": moved, "von_mises": stress}
-        fields = found | {f"{name}_error": fields[name] - own for name, own in found.items()}
+        found = {"displacement": u, "von_mises": stress}
+        fields |= {f"full_{name}": own for name, own in found.items()}
+        fields |= {f"{name}_error": fields[name] - own for name, own in found.items()}
     if vtu:
         mesh = problem.mesh
-        fields |= {"load": problem.load_vector(load), "clamped": mesh.clamped}
-        write_vtu(vtu, mesh.nodes, mesh.elements, fields)
+        units = {name: "mm" if "displacement" in name else "kPa" for name in fields}
+        named = {f"{name}_{units[name]}": own for name, own in fields.items()}
+        if isinstance(step, Load):
+            named["load_mN"] = problem.load_vector(step)
+        write_vtu(vtu, mesh.nodes, mesh.elements, named | {"clamped": mesh.clamped})
     return report
 
 

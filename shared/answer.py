@@ -76,29 +76,40 @@ class Answers(NamedTuple):
 
 
 def describe(answer: Answer) -> dict[str, Any]:
-    """Write the answer to a load without its fields, JSON-able, as all of the software has it."""
-    return {
-        "contact": {
-            "position": answer.contact_point.tolist(),
-            "normal": answer.normal.tolist(),
-            "distance": answer.distance,
+    """Write an answer without its fields, JSON-able, as all of the software has it."""
+    errors = {
+        "displacement": finite(answer.error_displacement),
+        "von_mises": finite(answer.error_von_mises),
+    }
+    contact: dict[str, Any] = {
+        "position": answer.contact_point.tolist(),
+        "normal": answer.normal.tolist(),
+        "distance": answer.distance,
+    }
+    if answer.tip:
+        errors["force"] = finite(answer.error_force)
+        contact |= {"centre": answer.position.tolist(), "depth": answer.depth}
+        contact |= {"depth_limit": answer.depth_limit, "touches": answer.contact}
+        felt: dict[str, Any] = {"tangent": answer.tangent.tolist()}
+    else:
+        contact |= {
             "direction": answer.direction.tolist(),
             "pressure": answer.pressure,
             "radius": answer.radius,
             "pressure_limit": answer.pressure_limit,
             "depth_limit": answer.depth_limit or None,
-        },
+        }
+        felt = {"contact_displacement": answer.contact_displacement.tolist()}
+    return {
+        "contact": contact,
         "force": answer.force.tolist(),
-        "contact_displacement": answer.contact_displacement.tolist(),
+        **felt,
         "trust": {
             "converged": answer.converged,
             "iterations": answer.iterations,
             "in_range": answer.in_range,
             "out_of_range": answer.out_of_range,
-            "error_estimate": {
-                "displacement": finite(answer.error_displacement),
-                "von_mises": finite(answer.error_von_mises),
-            },
+            "error_estimate": errors,
             "min_jacobian": answer.min_jacobian,
         },
     } | ({} if answer.past is None else {"time": answer.time})

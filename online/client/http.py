@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Self
 from urllib.parse import quote
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from palpate.online.client.session import (
     Session,
@@ -20,7 +20,7 @@ from palpate.online.client.session import (
     split_address,
 )
 from palpate.online.serve import layout
-from palpate.online.serve.layout import BINARY, JSON, Accessible, Mesh
+from palpate.online.serve.layout import BINARY, JSON, Accessible, Answers, Mesh
 from palpate.shared.arrays import Array, Field
 from palpate.shared.errors import PalpateError
 
@@ -79,9 +79,7 @@ class Client:
     def __init__(self, url: str, token: str | None = None, timeout: float = 10.0) -> None:
         parts = split_address(url)
         self._url, self._token, self._timeout = url, token, timeout
-        self._headers = {"Content-Type": JSON}
-        if token is not None:
-            self._headers["Authorization"] = f"Bearer {token}"
+        self._headers = {} if token is None else {"Authorization": f"Bearer {token}"}
         self._connection = http.client.HTTPConnection(parts.netloc, timeout=timeout)
         if parts.scheme == "https":
             self._connection = http.client.HTTPSConnection(
@@ -154,17 +152,39 @@ class Client:
         *before, last = head["steps"]
         return [*map(_answer, before), _answer(last, timing=head["timing"], **fields)]
 
+    def solve_many(
+        self,
+        name: str,
+        positions: ArrayLike,
+        pressures: ArrayLike,
+        directions: ArrayLike | None = None,
+    ) -> Answers:
+        """Press with many loads: positions (n, 3) mm, pressures (n,) kPa, directions (n, 3)."""
+        asked = {"positions": positions, "pressures": pressures, "directions": directions}
+        return self._many(name, "/solve-many", asked)
+
+    def touch(self, name: str, positions: ArrayLike) -> Answers:
+        """Touch with the rigid tip at many positions (n, 3) mm of its centre, each from rest."""
+        return self._many(name, "/touch", {"positions": positions})
+
+    def _many(self, name: str, rest: str, asked: Mapping[str, ArrayLike | None]) -> Answers:
+        given = {key: np.array(rows, float) for key, rows in asked.items() if rows is not None}
+        found = self._document("POST", name, rest, layout.encode({}, given), BINARY)[1]
+        return Answers(**found)
+
     def session(self, name: str, record: Path | None = None) -> Session:
         """Open a session of a scene, on a connection of its own; see `Session`."""
         return Session(self._url, name, self._token, self._timeout, record)
 
     def _document(
-        self, method: str, name: str, rest: str, body: bytes | None = None
+        self, method: str, name: str, rest: str, body: bytes | None = None, kind: str = JSON
     ) -> tuple[layout.Head, dict[str, NDArray[Any]]]:
-        return layout.decode(self._request(method, scene_path(name, rest), BINARY, body))
+        return layout.decode(self._request(method, scene_path(name, rest), BINARY, body, kind))
 
-    def _request(self, method: str, path: str, accept: str, body: bytes | None = None) -> bytes:
-        headers = {"Accept": accept, **self._headers}
+    def _request(
+        self, method: str, path: str, accept: str, body: bytes | None = None, kind: str = JSON
+    ) -> bytes:
+        headers = {"Accept": accept, "Content-Type": kind, **self._headers}
         for kept in (self._connection.sock is not None, False):
             try:
                 self._connection.request(method, path, body, headers)

@@ -4,11 +4,11 @@ import asyncio
 import gc
 import logging
 import threading
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator, Callable, Collection, Coroutine
 from contextlib import asynccontextmanager, suppress
 from importlib.metadata import version
 from time import perf_counter
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, get_args, get_type_hints
 
 import numpy as np
 import orjson
@@ -22,14 +22,25 @@ from starlette.websockets import WebSocket
 
 from palpate.online.serve import errors, guard, layout, schemas, wire
 from palpate.online.serve.answer import answer
-from palpate.online.serve.errors import Refusal
+from palpate.online.serve.errors import Refusal, check_numbers
 from palpate.online.serve.metrics import CONTENT_TYPE, Metrics
-from palpate.online.serve.schemas import HistoryRequest, MeshRegion, SolveRequest, parse
+from palpate.online.serve.schemas import (
+    HistoryRequest,
+    ManyRequest,
+    MeshRegion,
+    SolveRequest,
+    TouchRequest,
+    parse,
+)
 from palpate.online.serve.service import ServedModel, Service
 from palpate.online.serve.wire import BINARY, JSON, MSGPACK, OFFERED, negotiate
 from palpate.online.session import frames, websocket
 from palpate.online.session.session import Sessions
+from palpate.shared.answer import Answers
+from palpate.shared.errors import PalpateError, QueryError
+from palpate.shared.files import printable
 from palpate.shared.mechanics.footprint import TIP_DEPTH
+from palpate.shared.model import ReducedModel
 
 logger = logging.getLogger(__name__)
 
@@ -77,7 +88,7 @@ def create_app(here: Service, on_ready: Callable[[], None] = lambda: None) -> Fa
             expose_headers=["Server-Timing", "Retry-After"],
         )
     # FastAPI's own inclusion of a router makes a request 20 µs slower
-    app.router.routes += [*queries.routes, *scenes.routes, *service.routes]
+    app.router.routes += [*queries.routes, *lists.routes, *scenes.routes, *service.routes]
     sockets: dict[str, Any] = {"/scenes/{name}/session": sessions, "/{path:path}": _nothing_here}
     if settings.echo:
         sockets = {websocket.ECHO: websocket.echo, **sockets}
@@ -154,7 +165,73 @@ class QueryRoute(APIRoute):
         return handle
 
 
+class ManyRoute(APIRoute):
+    """Reads a list of queries, in JSON or in the binary layout.
+
+    Endpoints take the request, the name of the scene, and what was ``asked``, by its fields.
+    """
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        """Return what answers a request of this route."""
+        kind = get_type_hints(self.endpoint)["asked"]
+
+        async def handle(request: Request) -> Response:
+            name = request.path_params["name"]
+            request.app.state.service.model(name)
+            body = await _read(request, schemas.MOST_BYTES, JSON, BINARY)
+            if request.headers["content-type"].startswith(BINARY):
+                asked = _positions(body, kind.model_fields)
+            else:
+                asked = parse(kind, body).model_dump()
+            response: Response = await self.endpoint(request, name, asked)
+            return response
+
+        return handle
+
+
+async def _listed(
+    request: Request, name: str, count: int, work: Callable[[ReducedModel], Answers]
+) -> Response:
+    """Answer a list in a thread, which uses all cores; others than lists are answered meanwhile."""
+    here: Service = request.app.state.service
+    model, media_type = here.model(name).model, _media_type(request)
+    if media_type == JSON:
+        numbers = 2 * len(layout.Answers._fields) * count
+        check_numbers(numbers, here.settings.max_json_numbers, "positions")
+    if here.working.locked():
+        message = "The service is working on another list"
+        raise Refusal("overloaded", "", message, headers={"Retry-After": "1"})
+    async with here.working:
+        try:
+            found = await asyncio.to_thread(work, model)
+        except QueryError as error:
+            raise Refusal("unanswerable_query", error.field, error.message) from None
+    arrays = {
+        field: np.ascontiguousarray(getattr(found, field), get_args(get_args(hint)[1])[0])
+        for field, hint in get_type_hints(layout.Answers).items()
+    }
+    content = wire.encode(media_type, {"scene": name}, arrays)
+    return Response(content, media_type=media_type)
+
+
+def _positions(body: bytes, fields: Collection[str]) -> dict[str, Any]:
+    """Arrays of a binary request, by the names of fields."""
+    try:
+        _, arrays = layout.decode(body)
+    except PalpateError as error:
+        raise Refusal("invalid_value", "body", str(error)) from None
+    if strange := sorted(arrays.keys() - set(fields)):
+        raise Refusal("invalid_value", printable(strange[0]), "Not a field", sorted(fields))
+    for name in fields:
+        if len(arrays.get(name, ())) > schemas.MOST_MANY:
+            raise Refusal("invalid_value", name, "Too many", {"max_length": schemas.MOST_MANY})
+        if name not in arrays and name != "directions":
+            raise Refusal("invalid_value", name, "Missing", sorted(fields))
+    return {name: arrays.get(name) for name in fields}
+
+
 queries = APIRouter(prefix="/scenes", tags=["scenes"], route_class=QueryRoute)
+lists = APIRouter(prefix="/scenes", tags=["scenes"], route_class=ManyRoute)
 scenes = APIRouter(prefix="/scenes", tags=["scenes"])
 service = APIRouter(tags=["service"])
 
@@ -204,6 +281,39 @@ async def check(request: Request, name: SceneName, load: SolveRequest) -> Respon
     """Check that a solve request is well-formed, without solving it."""
     request.app.state.service.model(name)
     return Response(b'{"valid":true}', media_type=JSON)
+
+
+@lists.post(
+    "/{name}/solve-many",
+    **_document(schemas.AnswersDocument, "How the tissue answers", 406, 413, 415, 422),
+)
+async def solve_many(request: Request, name: SceneName, asked: ManyRequest) -> Response:
+    """Press the tissue with many loads, each from rest, on all cores.
+
+    The body may be in the binary layout, too: arrays positions (n, 3), pressures (n,) and maybe
+    directions (n, 3). What is refused names the row, from 0.
+    """
+    loads: Any = asked
+    return await _listed(
+        request, name, len(loads["positions"]), lambda model: model.solve_many(**loads)
+    )
+
+
+@lists.post(
+    "/{name}/touch",
+    **_document(schemas.AnswersDocument, "How the tissue answers", 404, 406, 413, 415, 422),
+)
+async def touch(request: Request, name: SceneName, asked: TouchRequest) -> Response:
+    """Touch the tissue with the rigid tip at one or many positions, each from rest.
+
+    The body may be in the binary layout, too: an array positions (n, 3) of the tip's centre.
+    """
+    tips: Any = asked
+    if not request.app.state.service.model(name).model.has_tip:
+        raise Refusal("no_tip", "name", "This scene was trained without a tip")
+    return await _listed(
+        request, name, len(tips["positions"]), lambda model: model.touch_many(**tips)
+    )
 
 
 @scenes.get(
@@ -338,11 +448,12 @@ def _media_type(request: Request) -> str:
     return negotiate(",".join(request.headers.getlist("accept")))
 
 
-async def _read(request: Request, limit: int) -> bytes:
-    """Read the body of a JSON request, of at most `limit` bytes."""
-    content_type = request.headers.get("content-type", "")
-    if content_type.split(";", 1)[0].strip().lower() != JSON:
-        raise Refusal("unsupported_media_type", "content-type", "The body must be JSON", [JSON])
+async def _read(request: Request, limit: int, *kinds: str) -> bytes:
+    """Read the body of a request of a kind, by default JSON, of at most `limit` bytes."""
+    content_type, allowed = request.headers.get("content-type", ""), kinds or (JSON,)
+    if content_type.split(";", 1)[0].strip().lower() not in allowed:
+        message = "The body must be JSON" if not kinds else "The body is none of what is read here"
+        raise Refusal("unsupported_media_type", "content-type", message, allowed)
     body = b""
     async for chunk in request.stream():
         body += chunk

@@ -65,6 +65,11 @@ class Refusal(PalpateError):
 def check_json_size(outputs: Collection[str], nodes: int, limit: float, field: str) -> None:
     """Refuse fields that would keep the event loop busy with writing decimals."""
     numbers = nodes * (3 * ("displacement" in outputs) + ("von_mises" in outputs))
+    check_numbers(numbers, limit, field)
+
+
+def check_numbers(numbers: int, limit: float, field: str) -> None:
+    """Refuse so many numbers in JSON."""
     if numbers > limit:
         message = f"{numbers} numbers are too many for JSON; ask for a binary format instead"
         raise Refusal("too_large_for_json", field, message, {"max_numbers": limit})

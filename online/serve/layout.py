@@ -14,13 +14,14 @@ offset type     meaning
 
 The head is the JSON answer with ``arrays`` in place of ``fields``: a list of
 ``{"name", "dtype", "shape", "offset"}`` in payload order, `offset` in bytes from the payload's
-start, `dtype` one of ``float32``, ``int32`` and ``uint8``. Four-byte arrays come first, so that
-each can be viewed in place (``new Float32Array(buffer, 16 + H + offset, n)``).
+start, `dtype` one of ``float64``, ``float32``, ``int32`` and ``uint8``. Wider ones come first, so
+that each can be viewed in place (``new Float32Array(buffer, 16 + H + offset, n)``).
 """
 
 import json
 import math
 import struct
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -35,12 +36,34 @@ MAGIC = b"PLPT"
 VERSION = 1
 
 PREFIX = struct.Struct("<4sHHII")
-DTYPES = {"float32": "<f4", "int32": "<i4", "uint8": "|u1"}
+DTYPES = {"float64": "<f8", "float32": "<f4", "int32": "<i4", "uint8": "|u1"}
 
 Head = dict[str, Any]
+Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Integers = NDArray[np.int32]
 Bits = NDArray[np.uint8]
+
+
+def _dumps(document: Head) -> bytes:
+    return json.dumps(document, separators=(",", ":")).encode()
+
+
+def encode(
+    head: Head, arrays: Mapping[str, NDArray[Any]], dumps: Callable[[Head], bytes] = _dumps
+) -> bytes:
+    """Write a document; arrays are C-contiguous, of the dtypes of the layout, wider ones first."""
+    entries = []
+    offset = 0
+    for name, array in arrays.items():
+        entries.append(
+            {"name": name, "dtype": array.dtype.name, "shape": array.shape, "offset": offset}
+        )
+        offset += array.nbytes
+    text = dumps({**head, "arrays": entries})
+    text += b" " * (-len(text) % 8)
+    prefix = PREFIX.pack(MAGIC, VERSION, len(entries), len(text), offset)
+    return b"".join((prefix, text, *(array.data for array in arrays.values())))
 
 
 def decode(body: bytes) -> tuple[Head, dict[str, NDArray[Any]]]:
@@ -58,16 +81,42 @@ def decode(body: bytes) -> tuple[Head, dict[str, NDArray[Any]]]:
     start = PREFIX.size + head_length
     if len(body) != start + payload_length:
         raise PalpateError(f"{len(body)} bytes where the prefix says {start + payload_length}")
-    head = json.loads(body[PREFIX.size : start])
-    entries = head.pop("arrays")
-    if len(entries) != count:
-        raise PalpateError(f"{len(entries)} arrays where the prefix says {count}")
-    arrays = {}
-    for entry in entries:
-        size = math.prod(entry["shape"])
-        flat = np.frombuffer(body, DTYPES[entry["dtype"]], size, start + entry["offset"])
-        arrays[entry["name"]] = flat.reshape(entry["shape"])
+    try:
+        head = json.loads(body[PREFIX.size : start])
+        entries = head.pop("arrays")
+        arrays = {entry["name"]: _array(body, start, entry) for entry in entries}
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
+        raise PalpateError("not a Palpate document: its head says nonsense") from None
+    if len(arrays) != count:
+        raise PalpateError(f"{len(arrays)} arrays where the prefix says {count}")
     return head, arrays
+
+
+def _array(body: bytes, start: int, entry: Head) -> NDArray[Any]:
+    """An array of a document whose payload starts there, as a view."""
+    shape, offset = [int(extent) for extent in entry["shape"]], int(entry["offset"])
+    if min([offset, *shape]) < 0:
+        raise ValueError
+    flat = np.frombuffer(body, DTYPES[entry["dtype"]], math.prod(shape), start + offset)
+    return flat.reshape(shape)
+
+
+class Answers(NamedTuple):
+    """Answers to n loads or positions of the tip, each from rest; null in JSON is infinity."""
+
+    contact_point: Annotated[Doubles, "vector", "(n, 3), mm, on the surface, or of the tip"]
+    normal: Annotated[Doubles, "vector", "(n, 3), outward there, or along the tip's force"]
+    force: Annotated[Doubles, "vector", "(n, 3), mN"]
+    contact_displacement: Annotated[Doubles, "vector", "(n, 3), mm, under a load"]
+    distance: Annotated[Doubles, "value", "(n,), mm, of the position from the surface"]
+    error_displacement: Annotated[Doubles, "value", "(n,), estimated, relative"]
+    error_von_mises: Annotated[Doubles, "value", "(n,), estimated, relative"]
+    error_force: Annotated[Doubles, "value", "(n,), estimated, relative, of the tip"]
+    min_jacobian: Annotated[Doubles, "value", "(n,), smallest volume ratio"]
+    limit: Annotated[Doubles, "value", "(n,), kPa or mm of depth, largest trained there"]
+    iterations: Annotated[Integers, "number", "(n,), Newton steps"]
+    converged: Annotated[Bits, "bit", "(n,), 0 where there is no equilibrium, and no force"]
+    in_range: Annotated[Bits, "bit", "(n,), 1 within what the model was trained for"]
 
 
 class Mesh(NamedTuple):

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, f
 from pydantic_core import PydanticCustomError
 
 from palpate.online.serve.errors import invalid
-from palpate.online.serve.layout import Accessible, Mesh
+from palpate.online.serve.layout import Accessible, Answers, Mesh
 
 CONVENTIONS = "Units are mm, mN, kPa and s throughout; forces are those of the tissue on the tool."
 """Of every endpoint and of sessions."""
@@ -28,6 +28,12 @@ Triangle = Annotated[list[int], _THREE]
 
 MOST_STEPS = 200
 """Largest number of steps of a history: so many keep others waiting for some 50 ms."""
+
+MOST_MANY = 20_000
+"""Largest number of loads, or positions of the tip, of one request."""
+
+MOST_BYTES = 128 * MOST_MANY
+"""Largest body of such a request."""
 
 EXAMPLE_CONTACT: JsonValue = {
     "position": [5.0, 5.0, 5.0],
@@ -119,6 +125,34 @@ class HistoryRequest(_Asking):
         if times != sorted(times):
             raise PydanticCustomError("time_order", "Times should not decrease", {"order": "time"})
         return steps
+
+
+class TouchRequest(Strict):
+    """Positions of the rigid tip, each from rest."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"positions": [[5.0, 5.0, 6.8]]}]})
+
+    positions: list[Position] = Field(
+        min_length=1, max_length=MOST_MANY, description="Of the tip's centre, mm."
+    )
+
+
+class ManyRequest(Strict):
+    """Loads, each from rest and by itself."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"positions": [[5.0, 5.0, 5.0]], "pressures": [4.0]}]}
+    )
+
+    positions: list[Position] = Field(
+        min_length=1, max_length=MOST_MANY, description="Where the endoscope presses, mm."
+    )
+    pressures: list[Annotated[float, Field(ge=0, le=1e6)]] = Field(
+        min_length=1, max_length=MOST_MANY, description="At the footprints' centres, kPa."
+    )
+    directions: list[Direction] | None = Field(
+        None, max_length=MOST_MANY, description="Default: the inward normals."
+    )
 
 
 _TABLES = {
@@ -237,6 +271,7 @@ def _document(arrays: Any, **head: Any) -> type[BaseModel]:
     return pydantic.create_model(name, __doc__=told, scene=str, **head, fields=described)
 
 
+AnswersDocument = _document(Answers)
 MeshDocument = _document(Mesh, region=MeshRegion)
 AccessibleDocument = _document(Accessible)
 

@@ -31,6 +31,7 @@ class Service:
         self.models: dict[str, ServedModel] = {}
         self.refused: list[dict[str, str]] = []  # `file` and `reason` of those that are not served
         self.ready = asyncio.Event()
+        self.working = asyncio.Lock()  # on a list of queries
 
     def open(self, warm: Callable[[ServedModel], Any]) -> None:
         """Load and warm the model of every ``*.h5``; refuse those that fail, serve the others.

@@ -14,8 +14,9 @@ import msgpack
 import orjson
 from numpy.typing import NDArray
 
+from palpate.online.serve import layout
 from palpate.online.serve.errors import Refusal
-from palpate.online.serve.layout import BINARY, JSON, MAGIC, PREFIX, VERSION, Head
+from palpate.online.serve.layout import BINARY, JSON, Head
 
 MSGPACK = "application/msgpack"
 OFFERED = (JSON, BINARY, MSGPACK)
@@ -26,7 +27,7 @@ Arrays = Mapping[str, NDArray[Any]]
 def encode(media_type: str, head: Head, arrays: Arrays) -> bytes:
     """Write a document in one of the formats on offer.
 
-    Arrays are C-contiguous, of the dtypes float32, int32 and uint8, the last kind last.
+    Arrays are C-contiguous, of the dtypes of the layout, wider ones first.
     """
     if media_type == JSON:
         return orjson.dumps({**head, "fields": arrays}, option=orjson.OPT_SERIALIZE_NUMPY)
@@ -36,17 +37,7 @@ def encode(media_type: str, head: Head, arrays: Arrays) -> bytes:
             for name, array in arrays.items()
         }
         return msgpack.packb({**head, "fields": fields})
-    entries = []
-    offset = 0
-    for name, array in arrays.items():
-        entries.append(
-            {"name": name, "dtype": array.dtype.name, "shape": array.shape, "offset": offset}
-        )
-        offset += array.nbytes
-    text = orjson.dumps({**head, "arrays": entries})
-    text += b" " * (-len(text) % 8)
-    prefix = PREFIX.pack(MAGIC, VERSION, len(entries), len(text), offset)
-    return b"".join((prefix, text, *(array.data for array in arrays.values())))
+    return layout.encode(head, arrays, orjson.dumps)
 
 
 _QUALITY = re.compile(r"0(\.\d{0,3})?|1(\.0{0,3})?", re.ASCII)

@@ -30,7 +30,7 @@ def test_missing_pyvista_is_named_before_any_work(run, artifact, tmp_path, monke
     monkeypatch.chdir(tmp_path)
     result = run(*(artifact if word == "A" else word for word in command))
     assert result.exit_code == 2
-    assert ".[pictures]" in result.output
+    assert "palpate[pictures]" in result.output
     assert not list(tmp_path.iterdir())
 
 

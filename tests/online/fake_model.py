@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from palpate.shared.answer import Answer
+from palpate.shared.answer import Answer, Answers
 from palpate.shared.errors import QueryError
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH
-from palpate.shared.query import ABSURD
+from palpate.shared.query import ABSURD, rows
 from palpate.shared.reduced.transfer import Past
 from palpate.shared.scene import load_scene
 
@@ -26,6 +26,12 @@ class Memory:
 
     def forget(self) -> None:
         vars(self).clear()
+
+
+def _answers(answers: list[Answer]) -> Answers:
+    names = set(Answers._fields) - {"limit"}
+    found = {name: np.array([getattr(answer, name) for answer in answers]) for name in names}
+    return Answers(**found, limit=np.ones(len(answers)))
 
 
 class FakeModel:
@@ -161,6 +167,16 @@ class FakeModel:
             time=time,
             past=after if converged else past,
         )
+
+    def solve_many(self, positions: Any, pressures: Any, directions: Any = None) -> Answers:
+        at, pressed = rows("positions", positions, 3), rows("pressures", pressures, 1)[:, 0]
+        along = [None] * len(at) if directions is None else directions
+        return _answers(
+            [self.press(*load) for load in zip(at, pressed.tolist(), along, strict=True)]
+        )
+
+    def touch_many(self, positions: Any) -> Answers:
+        return _answers([self.touch(x) for x in rows("positions", positions, 3)])
 
     def _field(self, value: Any, answer: Answer, region: str) -> np.ndarray:
         """Fade a value at the contact point away with the distance and towards the bottom."""

@@ -61,6 +61,19 @@ def test_a_history_is_answered_step_by_step(serving, visco_atlas):
     assert not answers[2].force.any()
 
 
+def test_lists_are_answered_as_one_by_one(url):
+    own, x = FakeModel(), [[5, 5, 6.5], [2, 3, 6.2], [5, 5, 9.0]]
+    with Client(url) as client:
+        found = client.solve_many("toy", [[5, 5, 5], [2, 3, 5.5]], [4.0, 9.0], [[0, 0, -1]] * 2)
+        touched = client.touch("toy", x)
+    expected = [own.press((5, 5, 5), 4.0, (0, 0, -1)), own.press((2, 3, 5.5), 9.0, (0, 0, -1))]
+    for answers, others in ((found, expected), (touched, [own.touch(at) for at in x])):
+        for name in set(answers._fields) - {"limit"}:
+            other = [getattr(answer, name) for answer in others]
+            np.testing.assert_array_equal(getattr(answers, name), other, err_msg=name)
+    assert found.in_range.tolist() == [1, 0]
+
+
 def forwarded(listener, url):
     """Pass on what one client sends by TLS, and the answers."""
     client, _ = listener.accept()
