@@ -249,7 +249,7 @@ class ReducedModel:
         )
         own = self._memory(False, warm, past, dt)
         press.place(own.solver, at, towards)
-        check_place(self.scene.endoscope, own.outcome.distance.item(), own.outcome.tilt.item())
+        check_place(self.scene.endoscope, self.surface, own.outcome)
         answering = own.answering()
         moves: Moves = {}
         if past is not None:
@@ -409,6 +409,26 @@ class ReducedModel:
             active=active,
             solve_seconds=time.perf_counter() - started,
         )
+
+    def check(
+        self,
+        position: ArrayLike,
+        pressure: float,
+        direction: ArrayLike | None = None,
+        radius: float | None = None,
+    ) -> tuple[float, tuple[str, ...]]:
+        """Largest trained pressure (kPa) for a load, and its fields that are out of range.
+
+        See ``press``, which raises the same.
+        """
+        at, towards, radius = checked_load(
+            self.scene.endoscope, self.pressure_max, position, pressure, direction, radius
+        )
+        own = self._memory(False, None, None, 0.0)
+        found = own.outcome
+        press.place(own.solver, at, towards)
+        check_place(self.scene.endoscope, self.surface, found)
+        return found.limit.item(), out_of_range(self.scene.endoscope, at, found, pressure, radius)
 
     def solve_many(
         self,

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from palpate.shared.arrays import Array, Flags
 from palpate.shared.errors import QueryError
-from palpate.shared.geometry.surface import UPRIGHT
+from palpate.shared.geometry.surface import UPRIGHT, Surface
 from palpate.shared.reduced.outcome import Outcome
 from palpate.shared.scene import Endoscope
 
@@ -64,15 +64,19 @@ def checked_load(
     return at, towards / length, float(radius)
 
 
-def check_place(endoscope: Endoscope, distance: float, tilt: float) -> None:
-    """Raise ``QueryError`` if a load is out of reach (mm) or does not press (tilt in degrees)."""
-    reach = endoscope.reach
+def check_place(endoscope: Endoscope, surface: Surface, found: Outcome) -> None:
+    """Raise ``QueryError`` if a load that is placed is out of reach or does not press."""
+    distance, reach = found.distance.item(), endoscope.reach
     if distance > reach:
+        near = ", ".join(f"{x:.2f}" for x in found.foot)
+        low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
+        box = ", ".join(f"{a:.1f} to {b:.1f}" for a, b in zip(low, high, strict=True))
         raise QueryError(
             "position",
-            f"{distance:.2f} mm from the accessible surface, at most {reach} mm allowed",
+            f"{distance:.2f} mm from the accessible surface, at most {reach} mm allowed; nearest "
+            f"is ({near}), and it lies within ({box}) mm",
         )
-    if not tilt < 90.0:
+    if not found.tilt.item() < 90.0:
         raise QueryError("direction", "must point into the tissue")
 
 

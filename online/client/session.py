@@ -252,17 +252,20 @@ class Session:
             self._recorder = None
 
     def send(
-        self, position: Sequence[float], outputs: int = 0, client_time: float | None = None
+        self,
+        position: Sequence[float],
+        outputs: int | Sequence[str] = 0,
+        client_time: float | None = None,
     ) -> int:
         """Send a position of the tip (mm); return the number that its reply will have.
 
-        `outputs` are bits of `session.frames.Output`. The client's time (s, by default now) is
-        echoed, and that of visco-elastic tissue.
+        `outputs` are bits of `session.frames.Output`, or their names, such as ``stress``. The
+        client's time (s, by default now) is echoed, and that of visco-elastic tissue.
         """
         self._seq = (self._seq + 1) % 2**32
         x, y, z = position
         client_time = perf_counter() if client_time is None else client_time
-        request = Request(self._seq, client_time, (x, y, z), outputs)
+        request = Request(self._seq, client_time, (x, y, z), frames.output_bits(outputs))
         if self._recorder is not None:
             self._recorder.sent(request)
         self._connection.send(frames.encode_request(request))
@@ -277,7 +280,10 @@ class Session:
         return self.receive() if self._connection.poll() else None
 
     def step(
-        self, position: Sequence[float], outputs: int = 0, client_time: float | None = None
+        self,
+        position: Sequence[float],
+        outputs: int | Sequence[str] = 0,
+        client_time: float | None = None,
     ) -> Reply:
         """Send a position and wait for its reply; older replies are dropped. See `send`."""
         seq = self.send(position, outputs, client_time)

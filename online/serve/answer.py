@@ -5,6 +5,8 @@ to its last; the number of steps of a history bounds how long others wait.
 """
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from time import perf_counter
 from typing import Any
@@ -74,13 +76,8 @@ def _follow(model: ReducedModel, request: HistoryRequest) -> list[Answer]:
 
 def _press(model: ReducedModel, contact: Contact | None, path: str, **time: Any) -> Answer:
     """Answer a load that the request has at `path`, at once or, for `time`, after a past."""
-    load: tuple[Any, ...] = None, 0.0
-    if contact is not None:
-        load = contact.position, contact.pressure, contact.direction, contact.radius
-    try:
-        found = model.press(*load, **time)
-    except QueryError as error:
-        raise Refusal("unanswerable_query", f"{path}.{error.field}", error.message) from None
+    with _refused(path):
+        found = model.press(*_load(contact), **time)
     if not found.converged:
         limit = found.pressure_limit
         message = (
@@ -91,6 +88,28 @@ def _press(model: ReducedModel, contact: Contact | None, path: str, **time: Any)
     if not math.isfinite(found.force.sum() + found.contact_displacement.sum() + found.min_jacobian):
         raise Refusal("no_equilibrium", f"{path}.pressure", "The answer to this load is not finite")
     return found
+
+
+def checked(model: ReducedModel, request: SolveRequest) -> tuple[float, tuple[str, ...]]:
+    """Largest trained pressure (kPa) for a load that could be solved, and what is out of range."""
+    with _refused("contacts.0"):
+        return model.check(*_load(request.contacts[0]))
+
+
+def _load(contact: Contact | None) -> tuple[Any, ...]:
+    """What a model is asked for a contact, or its absence."""
+    if contact is None:
+        return None, 0.0
+    return contact.position, contact.pressure, contact.direction, contact.radius
+
+
+@contextmanager
+def _refused(path: str) -> Iterator[None]:
+    """Refuse what a model cannot be asked, by its place in the request."""
+    try:
+        yield
+    except QueryError as error:
+        raise Refusal("unanswerable_query", f"{path}.{error.field}", error.message) from None
 
 
 def _recover(

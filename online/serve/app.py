@@ -21,7 +21,7 @@ from starlette.routing import WebSocketRoute
 from starlette.websockets import WebSocket
 
 from palpate.online.serve import errors, guard, layout, schemas, wire
-from palpate.online.serve.answer import answer
+from palpate.online.serve.answer import answer, checked
 from palpate.online.serve.errors import Refusal, check_numbers
 from palpate.online.serve.metrics import CONTENT_TYPE, Metrics
 from palpate.online.serve.schemas import (
@@ -137,7 +137,9 @@ def _warm(sessions: Sessions, served: ServedModel) -> None:
         steps = [{"time": 0.1 * i, "contact": contact} for i, contact in enumerate(contacts)]
         body = orjson.dumps({"steps": steps, "region": "all"})
         answer(served.model, parse(HistoryRequest, body), JSON, uncounted)
+    served.model.solve_many([served.example["position"]], [served.example["pressure"]])
     if served.model.has_tip:
+        served.model.touch_many([served.tip])
         above = [models.centres[k] + 0.9 * radius * models.frames[k, 0] for k in tour]
         sessions.prepare(served, [position.tolist() for position in above])
 
@@ -275,12 +277,12 @@ async def history(request: Request, name: SceneName, load: HistoryRequest) -> Re
 
 
 @queries.post(
-    "/{name}/check", responses={200: {"model": dict[str, bool]}, **_problems(404, 413, 415, 422)}
+    "/{name}/check", responses={200: {"model": schemas.Checked}, **_problems(404, 413, 415, 422)}
 )
 async def check(request: Request, name: SceneName, load: SolveRequest) -> Response:
-    """Check that a solve request is well-formed, without solving it."""
-    request.app.state.service.model(name)
-    return Response(b'{"valid":true}', media_type=JSON)
+    """Check a solve request without solving it: what solve would refuse, and the range."""
+    limit, outside = checked(request.app.state.service.model(name).model, load)
+    return _json({"in_range": not outside, "out_of_range": outside, "pressure_limit": limit})
 
 
 @lists.post(
@@ -385,6 +387,7 @@ async def scene(name: SceneName, request: Request) -> Any:
                 "radius": endoscope.radius,
                 "reach": endoscope.reach,
             },
+            "serves": {"sessions": model.has_tip, "histories": bool(model.scene.tissue.prony)},
             "tolerance": model.scene.tolerance.model_dump(),
             "size": {
                 "nodes": len(model.nodes),

@@ -83,8 +83,13 @@ class _Asking(Strict):
         "none",
         description="The nodes to return fields for, in the order of the mesh of that region; with "
         "none, the answer holds the contact, the force and the trust block. Of a history the "
-        "fields are those of the last step.",
+        "fields are those of the last step. Who names outputs and no region gets the surface's.",
     )
+
+    def model_post_init(self, _: Any) -> None:
+        """Give who names outputs and no region those of the surface."""
+        if self.outputs and self.model_fields_set & {"outputs", "region"} == {"outputs"}:
+            self.region = "surface"
 
 
 class SolveRequest(_Asking):
@@ -309,6 +314,9 @@ class SceneSummary(SceneEntry):
     """One scene: what may be asked and how well it is answered."""
 
     ranges: Ranges
+    serves: dict[Literal["sessions", "histories"], bool] = Field(
+        description="Whether the tip has been trained, and whether the tissue knows time."
+    )
     tolerance: dict[str, float] = Field(
         description="Largest relative errors of trusted answers, as fractions."
     )
@@ -317,6 +325,14 @@ class SceneSummary(SceneEntry):
     )
     info: dict[str, Any] = Field(description="Training, validation and provenance.")
     example: dict[str, Any] = Field(description="A request that this scene can answer.")
+
+
+class Checked(BaseModel):
+    """What can be said of a load without solving it."""
+
+    in_range: bool = Field(description="Whether the model was trained for such a load.")
+    out_of_range: list[str] = Field(description="The contact's fields that are not.")
+    pressure_limit: float = Field(description="Largest pressure trained for there, kPa.")
 
 
 class ErrorBody(BaseModel):

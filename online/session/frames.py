@@ -212,6 +212,19 @@ class Request(NamedTuple):
     outputs: int = 0
 
 
+def output_bits(outputs: int | Sequence[str]) -> int:
+    """Bits of `Output`, given as such or by their names; raise `FrameError` if one is none."""
+    if isinstance(outputs, int):
+        return int(outputs)
+    bits = 0
+    for name in [outputs] if isinstance(outputs, str) else outputs:
+        if str(name).upper() not in Output.__members__:
+            known = ", ".join(bit.lower() for bit in Output.__members__)
+            raise FrameError("outputs", f"{name!r} is none of {known}")
+        bits |= Output[name.upper()]
+    return bits
+
+
 def encode_request(request: Request) -> bytes:
     """Write a request frame."""
     seq, client_time, position, outputs = request

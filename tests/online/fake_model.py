@@ -168,6 +168,10 @@ class FakeModel:
             past=after if converged else past,
         )
 
+    def check(self, *load: Any) -> tuple[float, tuple[str, ...]]:
+        answer = self.press(*load)
+        return answer.pressure_limit, answer.out_of_range
+
     def solve_many(self, positions: Any, pressures: Any, directions: Any = None) -> Answers:
         at, pressed = rows("positions", positions, 3), rows("pressures", pressures, 1)[:, 0]
         along = [None] * len(at) if directions is None else directions

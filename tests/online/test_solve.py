@@ -79,6 +79,8 @@ def test_all_formats_hold_the_same_fields_in_the_order_of_the_mesh(client, regio
         for name, values in fields.items():
             np.testing.assert_array_equal(np.array(values, np.float32), from_binary[name])
     np.testing.assert_array_equal(from_binary["displacement"], expected)
+    named = solve(client, outputs=["von_mises"]).json()["fields"]  # and no region
+    assert named == solve(client, outputs=["von_mises"], region="surface").json()["fields"]
     for outputs in ([], ["displacement"], ["von_mises"]):
         assert list(solve(client, outputs=outputs, region=region).json()["fields"]) == outputs
 

@@ -8,7 +8,7 @@ import pytest
 from palpate.online.client.http import Client
 from palpate.online.client.session import ServiceError, Session, SessionClosed
 from palpate.online.session import frames
-from palpate.online.session.frames import Flag, Output, Reason, Request
+from palpate.online.session.frames import Flag, FrameError, Output, Reason, Request
 from palpate.shared.errors import PalpateError
 
 from ..conftest import error_of, place_comes_free
@@ -81,6 +81,16 @@ def test_fields_come_when_asked_for(session, half):
     np.testing.assert_allclose(reply.coordinates[0], [0.5, 0.5])
     assert not reply.coordinates[1:].any()
     assert session.step(PRESSED).displacement is None
+
+
+def test_outputs_can_be_named(session):
+    named = session.step(PRESSED, ["stress", "displacement"])
+    assert named.outputs == Output.STRESS | Output.DISPLACEMENT
+    assert str(Output(named.outputs)) == "displacement, stress"
+    assert str(Flag(0)) == "none"
+    with pytest.raises(FrameError, match="'strain' is none of coordinates, displacement"):
+        session.step(PRESSED, ["strain"])
+    assert session.step(PRESSED).good
 
 
 def test_json_says_the_same(session):
@@ -177,7 +187,7 @@ def test_an_unknown_scene_has_no_session(url, caplog):
     with pytest.raises(ServiceError, match="No such scene") as refused:
         Session(url, "other")
     assert refused.value.status == 404
-    with pytest.raises(PalpateError, match="HTTP 403"):
+    with pytest.raises(PalpateError, match="nothing at this path"):
         Session(url, "a/b c")
     assert not caplog.records
 
