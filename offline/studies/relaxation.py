@@ -30,10 +30,17 @@ def relaxation(artifact: Path, position: Sequence[float] | None = None) -> dict[
     dict
         Depths (mm) at once and after the hold, the depth left after the rest, the largest
         difference of the two models' depths, and the median time of a step (µs).
+
+    Raises
+    ------
+    QueryError
+        If the place is out of reach.
     """
     atlas, problem = opened(artifact, HISTORIES)
     vertices = atlas.surface.vertices
     middle = vertices[np.linalg.norm(vertices - vertices.mean(axis=0), axis=1).argmin()]
+    if position is not None:
+        atlas.check(position, 0.0)
     place = Place.at(atlas, middle if position is None else np.array(position))
     steps = load_steps(PHASES)
     loads = [place.press(-place.normal, share * PRESSED, dt) for dt, share in steps]

@@ -9,6 +9,7 @@
 using System;
 using System.Globalization;
 using System.IO;
+using System.Net.Http;
 using System.Net.WebSockets;
 using System.Runtime.InteropServices;
 using System.Text;
@@ -141,7 +142,20 @@ namespace Palpate
 
         public async Task Open(Uri address, CancellationToken cancel = default)
         {
-            await socket.ConnectAsync(address, cancel);
+            try
+            {
+                await socket.ConnectAsync(address, cancel);
+            }
+            catch (WebSocketException error)
+            {
+                // what a GET of the same address is told
+                var scheme = address.Scheme == "wss" ? "https" : "http";
+                using var client = new HttpClient();
+                using var told = await client.GetAsync(
+                    new UriBuilder(address) { Scheme = scheme }.Uri, cancel);
+                var why = await told.Content.ReadAsStringAsync();
+                throw new IOException("the session was refused: " + why, error);
+            }
             Greeting = Encoding.UTF8.GetString((await Receive(cancel)).Bytes);
         }
 

@@ -12,6 +12,7 @@
 #include <unistd.h>
 
 #include <array>
+#include <cctype>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
@@ -192,8 +193,13 @@ private:
             receive_all(&next, 1);
             head += next;
         }
-        if (head.compare(0, 12, "HTTP/1.1 101") != 0)
-            throw Error("the session was refused: " + head.substr(0, head.find('\r')));
+        if (head.compare(0, 12, "HTTP/1.1 101") == 0) return;
+        const std::string status = head.substr(0, head.find('\r'));
+        for (char& c : head) c = static_cast<char>(std::tolower(static_cast<unsigned char>(c)));
+        const std::size_t at = head.find("content-length: ");
+        std::string why(at == std::string::npos ? 0 : std::stoul(head.substr(at + 16)), ' ');
+        receive_all(&why[0], why.size());
+        throw Error("the session was refused: " + status + ": " + why);
     }
 
     // Messages of at most 125 bytes; what a client sends is masked (section 5.3).

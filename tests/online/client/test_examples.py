@@ -65,6 +65,8 @@ def test_cpp_tells_what_is_wrong(program, url):
     refused = run(program, url, "other", (5.0, 5.0, 6.5))
     assert (refused.returncode, refused.stdout) == (1, "")
     assert "404" in refused.stderr
+    assert "No such scene is served" in refused.stderr
+    assert '"allowed":["toy"]' in refused.stderr
     nonsense = run(program, url, "toy", (float("nan"), 5.0, 6.5))
     assert nonsense.returncode == 1
     assert "position" in nonsense.stderr
