@@ -31,7 +31,7 @@ class Settings:
     port: int = _option(8000, "0 takes a free one.", click.IntRange(0, 65535))
     workers: int = _option(
         1,
-        "Processes that share the work, each with the models in memory. A session stays with the "
+        "Processes that share the work and the models in memory. A session stays with the "
         "worker that opened it; limits hold per worker; one that dies is replaced.",
         click.IntRange(1, 64),
     )

@@ -113,7 +113,7 @@ def _prepare(here: Service, sessions: Sessions, on_ready: Callable[[], None]) ->
         on_ready()
 
     def load() -> None:
-        here.open(lambda served: _warm(sessions, served))
+        here.open(lambda served: warm(sessions, served))
         with suppress(RuntimeError):  # the service has ended meanwhile
             loop.call_soon_threadsafe(finish)
 
@@ -122,7 +122,7 @@ def _prepare(here: Service, sessions: Sessions, on_ready: Callable[[], None]) ->
     threading.Thread(target=load, name="loading", daemon=True).start()
 
 
-def _warm(sessions: Sessions, served: ServedModel) -> None:
+def warm(sessions: Sessions, served: ServedModel) -> None:
     """Call every kernel and encoder once, so that no client pays for a first time."""
     uncounted = Metrics()
     for region, media_type in zip(("surface", "all", "none"), OFFERED, strict=True):
@@ -355,7 +355,9 @@ async def ready(request: Request) -> dict[str, str]:
 @service.get(guard.METRICS, response_class=PlainTextResponse, responses=_problems())
 async def metrics(request: Request) -> Response:
     """Tell what was counted and timed, of every worker, in the text format of Prometheus."""
-    return Response(request.app.state.service.metrics.text(), media_type=CONTENT_TYPE)
+    # in a thread: the system takes a millisecond and more to add up shared memory
+    text = await asyncio.to_thread(request.app.state.service.metrics.text)
+    return Response(text, media_type=CONTENT_TYPE)
 
 
 @scenes.get("", response_model=schemas.SceneList, responses=_problems())

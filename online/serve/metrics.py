@@ -67,6 +67,7 @@ FAMILIES = (
     Family("counter", "worker_starts_total", "Starts of the worker"),
     Family("gauge", "worker_pid", "Process number of the worker"),
     Family("gauge", "worker_resident_bytes", "Memory that the worker holds"),
+    Family("gauge", "worker_own_bytes", "The same, what n processes share counted as an nth"),
 )
 _KEYS = [(family, (family.name, *value)) for family in FAMILIES for value in family.values]
 _WIDTHS = (_SUM + 1 if family.type == "histogram" else 1 for family, _ in _KEYS)
@@ -78,7 +79,7 @@ _QUERY_PHASES, _FRAME_PHASES = (_CELLS["phase_seconds", k, PHASES[0]] for k in K
 _QUERY_QUEUE, _FRAME_QUEUE = (_CELLS["queue_seconds", kind] for kind in KINDS)
 _QUERY_OUT_OF_RANGE = _CELLS["flags_total", "query", "out_of_range"]
 _ANSWERED, _SUPERSEDED, _ = (_CELLS["frames_total", name] for name in FRAMES)
-_SESSIONS, _, _STARTS, _PID, _RESIDENT = (_CELLS[f.name,] for f in FAMILIES[-5:])
+_SESSIONS, _, _STARTS, _PID, _RESIDENT, _OWN = (_CELLS[f.name,] for f in FAMILIES[-6:])
 
 _FRAME_FLAGS = [
     [_ANSWERED]
@@ -101,7 +102,8 @@ class Metrics:
         self._row = self._rows[self.worker]
         self._row[_SESSIONS] = 0.0  # those of a killed worker are gone
         self._row[_STARTS] += 1.0
-        self._row[_PID], self._row[_RESIDENT] = os.getpid(), math.nan
+        self._row[_PID] = os.getpid()
+        self._row[_RESIDENT] = self._row[_OWN] = math.nan
 
     @property
     def restarted(self) -> bool:
@@ -150,6 +152,8 @@ class Metrics:
             with suppress(OSError):  # not every system says it
                 pages = Path(f"/proc/{int(row[_PID])}/statm").read_text().split()[1]
                 row[_RESIDENT] = int(pages) * mmap.PAGESIZE
+                rollup = Path(f"/proc/{int(row[_PID])}/smaps_rollup").read_text()
+                row[_OWN] = 1024 * int(rollup.partition("\nPss:")[2].split()[0])
         lines = []
         for family in FAMILIES:
             name = f"palpate_{family.name}"

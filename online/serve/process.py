@@ -2,11 +2,14 @@
 
 The supervisor is uvicorn's. It binds the socket, starts the workers, starts a new one for each that
 dies, and passes on the signal to end. All workers accept from the one socket, so a session belongs
-to the worker that accepted it and is none of the others' business.
+to the worker that accepted it and is none of the others' business. The supervisor loads the models
+and the workers are forked from it, so that all have them in the same memory and a new one is ready
+at once.
 """
 
 import asyncio
 import ctypes
+import gc
 import json
 import logging
 import os
@@ -14,21 +17,26 @@ import signal
 import sys
 import tempfile
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
+from socket import socket
 from time import perf_counter
-from typing import ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 import uvicorn
 from fastapi import FastAPI
+from uvicorn._subprocess import subprocess_started
 from uvicorn.protocols.http.httptools_impl import (
     STATUS_LINE,
     HttpToolsProtocol,
     RequestResponseCycle,
 )
+from uvicorn.supervisors import multiprocess
 from uvicorn.supervisors.multiprocess import Multiprocess
 
 from palpate.online.serve.errors import Refusal
@@ -38,6 +46,9 @@ from palpate.online.session.websocket import OPTIONS
 from palpate.online.settings import Settings
 from palpate.shared.errors import PalpateError
 from palpate.shared.files import printable
+
+if TYPE_CHECKING:
+    from palpate.online.serve.service import Service
 
 logger = logging.getLogger(__name__)
 
@@ -184,7 +195,12 @@ class HttpProtocol(HttpToolsProtocol):
 
 
 class Supervisor(Multiprocess):
-    """Uvicorn's, but it does not wait for ever for a worker to end."""
+    """Uvicorn's, but its workers are forked, and it does not wait for ever for one to end."""
+
+    def init_processes(self) -> None:
+        """Start the workers."""
+        multiprocess.get_subprocess = _forked  # uvicorn would start them without the models
+        super().init_processes()
 
     def join_all(self) -> None:
         """Wait for the workers; kill those that are still loading their models."""
@@ -194,6 +210,12 @@ class Supervisor(Multiprocess):
             if worker.process.is_alive():
                 worker.process.kill()
         super().join_all()
+
+
+def _forked(config: uvicorn.Config, target: Callable[..., None], sockets: list[socket]) -> Any:
+    """Make a worker that begins with all that this process has in memory."""
+    inherited = {"config": config, "target": target, "sockets": sockets, "stdin_fileno": None}
+    return get_context("fork").Process(target=subprocess_started, kwargs=inherited)
 
 
 def serve(settings: Settings) -> None:
@@ -241,8 +263,9 @@ def serve(settings: Settings) -> None:
         with tempfile.TemporaryDirectory(prefix="palpate-") as directory:
             table = Path(directory) / "metrics"
             make_table(table, settings.workers)
-            config.app = partial(_work, settings, url, table)
+            config.app = partial(_work, settings, url, table, None)
             if settings.workers > 1:
+                config.app = partial(_work, settings, url, table, _loaded(settings))
                 Supervisor(config, [bound]).run()
             else:
                 uvicorn.Server(config).run([bound])
@@ -255,9 +278,23 @@ def serve(settings: Settings) -> None:
             os._exit(0)
 
 
-def _work(settings: Settings, url: str, table: Path) -> FastAPI:
+def _loaded(settings: Settings) -> "Service":
+    """Load and warm the models for workers to share."""
+    from palpate.online.serve.app import warm
+    from palpate.online.serve.service import Service
+    from palpate.online.session.session import Sessions
+
+    service = Service(settings)
+    sessions = Sessions(service)
+    service.open(lambda served: warm(sessions, served))
+    gc.collect()
+    gc.freeze()  # its marks would be written into memory that is shared
+    return service
+
+
+def _work(settings: Settings, url: str, table: Path, shared: "Service | None") -> FastAPI:
     """Make the application of one worker, in its own process."""
-    # Not before: the supervisor has no use for the models' code.
+    # Not before: a supervisor that starts no workers has no use for the models' code.
     from palpate.online.serve.app import create_app
     from palpate.online.serve.service import Service
 
@@ -266,7 +303,7 @@ def _work(settings: Settings, url: str, table: Path) -> FastAPI:
     logging.getLogger("uvicorn.error").setLevel(logging.WARNING)
     # On systems without file locks there is one worker, which has no use for a table.
     metrics = Metrics(table if settings.workers > 1 else None)
-    service = Service(settings, metrics)
+    service = Service(settings, metrics, shared)
 
     def greet() -> None:
         if settings.realtime:

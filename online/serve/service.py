@@ -3,7 +3,7 @@
 import asyncio
 import logging
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 from palpate.online.serve.errors import Refusal
 from palpate.online.serve.metrics import Metrics
@@ -24,9 +24,15 @@ class ServedModel(NamedTuple):
 
 
 class Service:
-    """What endpoints and sessions work with; without `metrics` this is the only worker."""
+    """What endpoints and sessions work with; without `metrics` this is the only worker.
 
-    def __init__(self, settings: Settings, metrics: Metrics | None = None) -> None:
+    It has the models of another that it is forked from, if there is one.
+    """
+
+    def __init__(
+        self, settings: Settings, metrics: Metrics | None = None, shared: Self | None = None
+    ) -> None:
+        self._shared = shared
         self.settings, self.metrics = settings, metrics or Metrics()
         self.models: dict[str, ServedModel] = {}
         self.refused: list[dict[str, str]] = []  # `file` and `reason` of those that are not served
@@ -38,6 +44,11 @@ class Service:
 
         Hidden files are none of them.  Clients learn names of files and not where they are.
         """
+        if self._shared is not None:
+            self.models, self.refused = self._shared.models, self._shared.refused
+            for served in self.models.values():
+                warm(served)
+            return
         found = sorted(self.settings.artifacts.glob("*.h5"))
         for path in (path for path in found if not path.name.startswith(".")):
             try:

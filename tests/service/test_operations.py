@@ -101,6 +101,9 @@ def test_a_killed_worker_is_replaced_while_the_others_sessions_go_on(serve, arti
             time.sleep(0.02)
         assert after[0]["palpate_worker_pid"] != before[0]["palpate_worker_pid"]
         assert after[1]["palpate_worker_pid"] == before[1]["palpate_worker_pid"]
+        for worker in after.values():  # the models are in memory once
+            own, whole = (worker[f"palpate_worker_{kind}_bytes"] for kind in ("own", "resident"))
+            assert 0 < own < 0.7 * whole
         with session_on(0, server.url, client) as session:  # it has clients again
             assert session.step(position).good
 
