@@ -69,10 +69,12 @@ $(artifact): | .venv/run
 resolve := $(bin)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes \
 	--no-header --no-annotate --group build pyproject.toml
 
+all := --extra train --extra loadtest
+
 lock: | .venv/bin/python
 	$(pip) install uv
-	$(resolve) --extra test --extra dev --output-file requirements-dev.lock
-	$(resolve) --constraint requirements-dev.lock --output-file requirements.lock
+	$(resolve) $(all) --extra test --extra dev --output-file requirements-dev.lock
+	$(resolve) $(all) --constraint requirements-dev.lock --output-file requirements.lock
 
 clean:
 	rm -rf .venv .benchmarks .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache

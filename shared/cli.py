@@ -25,6 +25,10 @@ Example, from a scene to an answer:
 """
 
 
+EXTRAS = {"tqdm": "train", "matplotlib": "loadtest", "pyvista": "pictures"}
+"""Extra that brings a package which not every installation has."""
+
+
 class Finite(click.FloatRange):
     """A finite number in a range."""
 
@@ -59,6 +63,11 @@ class _Commands(click.Group):
     def invoke(self, ctx: click.Context) -> object:
         try:
             return super().invoke(ctx)
+        except ModuleNotFoundError as error:
+            if error.name not in EXTRAS:
+                raise
+            extra = f"pip install 'palpate[{EXTRAS[error.name]}]'"
+            raise _UserError(f"this needs {error.name}: {extra}") from error
         except (PalpateError, OSError) as error:
             said = error.strerror if isinstance(error, OSError) else str(error)
             if said is None or os.environ.get("PALPATE_DEBUG"):

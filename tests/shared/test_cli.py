@@ -57,6 +57,37 @@ def test_our_errors_are_one_line_and_show_their_origin_when_asked(run, monkeypat
     assert isinstance(run("fail").exception, PalpateError)
 
 
+HIDE = """
+import sys
+for name in ("tqdm", "matplotlib", "pyvista", "mkl"):
+    sys.modules[name] = None  # as if it were not installed
+from palpate.shared.cli import main
+main(sys.argv[1:])
+"""
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("train quick", "Error: this needs tqdm: pip install 'palpate[train]'"),
+        ("picture A --at 4 5 8 --pressure 1 --out x.png", "'palpate[pictures]'"),
+        ("info A", "scene          quick"),
+        ("solve A --at 4 5 8 --pressure 1 --json", '{"scene":"quick"'),
+        ("scene quick", 'name = "quick"'),
+        ("serve --artifacts nowhere", "no artifacts (*.h5) in nowhere"),
+    ],
+)
+def test_what_serves_and_asks_runs_without_extras_and_the_rest_names_its_own(
+    artifact, tmp_path, command, said
+):
+    words = [str(artifact) if word == "A" else word for word in command.split()]
+    run = subprocess.run(
+        [sys.executable, "-c", HIDE, *words], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert said in run.stdout + run.stderr
+    assert "Traceback" not in run.stderr
+
+
 def printed(script, **environment):
     """What a script prints, in words."""
     run = subprocess.run(
