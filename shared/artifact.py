@@ -95,15 +95,16 @@ class Stored(NamedTuple):
     def check_values(self, values: NDArray[Any], sizes: dict[str, int]) -> None:
         """Raise ``ValueError`` unless all values are such as a reader can do with."""
         usable = bool(np.isfinite(values).all())
-        match self.values.rpartition(" "):
+        match self.values.partition(" "):
             case "<", _, size:
                 top = _extent(size, sizes)
                 usable = not values.size or 0 <= values.min() <= values.max() < top
-            case "rising to", _, size:
-                usable = values[0] == 0 <= np.diff(values).min() and values[-1] == sizes[size]
+            case "rising", _, end:
+                last = sizes[end.removeprefix("to ")]
+                usable = values[0] == 0 <= np.diff(values).min() and values[-1] == last
             case ">", _, _:
                 usable = usable and bool((values > 0).all())
-            case _, _, "nan":
+            case "nan", _, _:
                 usable = not np.isinf(values).any()
         if not usable:
             raise ValueError(f"dataset {self.name!r} has values not {self.values or 'finite'}")
