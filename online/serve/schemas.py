@@ -260,6 +260,7 @@ _ROWS: dict[str, Any] = {
     "triangle": list[Triangle],
     "number": list[int],
     "value": list[float],
+    "estimate": list[float | None],
     "bit": list[Literal[0, 1]],
 }
 

@@ -60,14 +60,14 @@ class Service:
             except Exception as error:
                 reason = str(error)
                 if not isinstance(error, PalpateError):  # no reason to withhold the others
-                    logger.exception("failed on %s", path)
+                    logger.exception("failed on %s", printable(str(path)))
                     reason = f"{path}: cannot be used: {type(error).__name__}"
-                logger.error("refused %s", reason)
+                logger.error("refused %s", printable(reason))
                 told = {"file": path.name, "reason": reason.replace(str(path), path.name)}
                 self.refused.append({key: printable(text) for key, text in told.items()})
             else:
                 self.models[name] = served
-                logger.info("serving %s from %s", name, path)
+                logger.info("serving %s from %s", name, printable(str(path)))
 
     def require_ready(self) -> None:
         """Raise `Refusal` while models are being loaded."""

@@ -122,14 +122,17 @@ class Tip(NamedTuple):
         soft = softer * (1.0 - softer)
         bb = (2.0 / 3.0 * images * (1.0 - images) + soft) / length**2
         rr = (images * (1.0 - images) + soft) / length**2
-        kept = 1.0 - law[2]
-        elastic = (force + law[3]) / kept
-        dent, eased = law[0] * elastic ** (2.0 / 3.0), law[1] * elastic
-        shift = b * dent - r * eased  # of the penetration at this force
-        changes[0] = -kept * elastic * (0.6 * b * dent - 0.5 * r * eased)
+        kept, shift = 1.0 - law[2], 0.0  # of the penetration at a force
+        changes[:] = 0.0
+        # the energy is that beyond where contact begins
+        for elastic, sign in ((max(law[3], 0.0) / kept, 1.0), ((force + law[3]) / kept, -1.0)):
+            dent, eased = law[0] * elastic ** (2.0 / 3.0), law[1] * elastic
+            shift = b * dent - r * eased
+            whole = sign * kept * elastic
+            changes[0] += whole * (0.6 * b * dent - 0.5 * r * eased)
+            changes[2] += whole * (0.6 * (b * b + bb) * dent - 0.5 * (r * r + rr) * eased)
         changes[1] = -shift * stiffness
-        changes[2] = shift**2 * stiffness
-        changes[2] -= kept * elastic * (0.6 * (b * b + bb) * dent - 0.5 * (r * r + rr) * eased)
+        changes[2] += shift**2 * stiffness
 
     def image_distance(self, away, share):
         """Distance from a right angle that does as much as one ``away`` mm with a share of it."""

@@ -173,8 +173,11 @@ class FakeModel:
         return answer.pressure_limit, answer.out_of_range
 
     def solve_many(self, positions: Any, pressures: Any, directions: Any = None) -> Answers:
-        at, pressed = rows("positions", positions, 3), rows("pressures", pressures, 1)[:, 0]
-        along = [None] * len(at) if directions is None else directions
+        at = rows("positions", positions, 3)
+        pressed = rows("pressures", pressures, 1, len(at))[:, 0]
+        along = (
+            [None] * len(at) if directions is None else rows("directions", directions, 3, len(at))
+        )
         return _answers(
             [self.press(*load) for load in zip(at, pressed.tolist(), along, strict=True)]
         )

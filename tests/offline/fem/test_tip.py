@@ -46,7 +46,7 @@ def test_a_ball_on_a_layer_is_that_of_hertz_whatever_the_mesh():
 
 @pytest.mark.parametrize("poisson", [0.3, 0.45])
 def test_at_an_edge_the_force_is_that_of_a_sphere_integrated_on_a_fine_mesh(poisson):
-    """Without its image the contact is too stiff by a fifth."""
+    """As it leans: without the law's change with the place the force is 10 % off and more."""
     scene = parse_scene(SLAB.replace("tissue.poisson = 0.45", f"tissue.poisson = {poisson}"))
     problem, radius = FullProblem(scene), scene.endoscope.radius
     for aside in (0.0, 0.1):
@@ -55,8 +55,8 @@ def test_at_an_edge_the_force_is_that_of_a_sphere_integrated_on_a_fine_mesh(pois
             for depth in (0.15, 0.6)
         ]
         for *_, found, exact in compared(problem, scene, levels, TIP_GRADING):
-            off = np.linalg.norm(found.felt) / np.linalg.norm(exact.felt) - 1.0
-            assert abs(off) < 0.07
+            off = np.linalg.norm(found.felt - exact.felt) / np.linalg.norm(exact.felt)
+            assert off < 0.08
 
 
 @pytest.mark.parametrize(

@@ -74,8 +74,8 @@ MOONEY = MooneyRivlinTissue, {"law": "mooney-rivlin", "c10": 2.0, "c01": 1.0, "p
 @pytest.mark.parametrize(
     ("kind", "change", "message"),
     [
-        (DEMIRAY, {"b": 0.0}, "greater than 0"),
-        (MOONEY, {"c10": 0.0}, "c10\n.*greater than 0"),
+        (DEMIRAY, {"b": 0.0}, "greater than or equal to"),
+        (MOONEY, {"c10": 0.0}, "c10\n.*greater than or equal to"),
         (MOONEY, {"c01": -0.1}, "c01\n.*greater than or equal to 0"),
         (MOONEY, {"young": 15.0}, "young\n.*not permitted"),
         (MOONEY, {"prony": ((0.7, 0.1),)}, r"less than c10 / \(c10 \+ c01\) = 0.6667"),

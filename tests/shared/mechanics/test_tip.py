@@ -70,17 +70,8 @@ def test_how_the_law_fades_from_an_edge_is_a_derivative(past):
     def law(edge):
         return *TIP.local_law(1.0 / TIP.radius, edge), *past
 
-    # in time the energy is that beyond where contact begins, which its place does not change
-    began = past[1] / (1.0 - past[0])
-
     def energy(edge):
-        beta, relief = law(edge)[:2]
-        begins = tip.approach(beta, relief, began)
-        return (
-            tip.push(*law(edge), depth)[2]
-            + (1.0 - past[0]) * tip.squeeze(beta, relief, begins)[2]
-            - past[1] * begins
-        )
+        return tip.push(*law(edge), depth)[2]
 
     force, stiffness, _ = tip.push(*law(edge), depth)
     TIP.fading(edge, np.array(law(edge)), force, stiffness, found)
