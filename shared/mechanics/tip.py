@@ -112,7 +112,9 @@ class Tip(NamedTuple):
         """Write how the law changes ``edge`` mm away from an edge, at a given penetration.
 
         Derivatives ``changes`` (3,) in that distance: of the energy (mN), of the force (mN/mm), and
-        second of the energy (mN/mm).  ``law`` is beta, relief, loss, held; see ``push``.
+        second of the energy (mN/mm).  ``law`` is beta, relief, loss, held; see ``push``.  What a
+        past takes off the force is remembered as a force, of the place where it was, so in time the
+        place does not know of the edge.
         """
         length, more = EDGE * self.radius, 0.5 * (self.psi - 1.0)
         fade = math.exp(-edge / length)
@@ -122,17 +124,14 @@ class Tip(NamedTuple):
         soft = softer * (1.0 - softer)
         bb = (2.0 / 3.0 * images * (1.0 - images) + soft) / length**2
         rr = (images * (1.0 - images) + soft) / length**2
-        kept, shift = 1.0 - law[2], 0.0  # of the penetration at a force
-        changes[:] = 0.0
-        # the energy is that beyond where contact begins
-        for elastic, sign in ((max(law[3], 0.0) / kept, 1.0), ((force + law[3]) / kept, -1.0)):
-            dent, eased = law[0] * elastic ** (2.0 / 3.0), law[1] * elastic
-            shift = b * dent - r * eased
-            whole = sign * kept * elastic
-            changes[0] += whole * (0.6 * b * dent - 0.5 * r * eased)
-            changes[2] += whole * (0.6 * (b * b + bb) * dent - 0.5 * (r * r + rr) * eased)
+        dent, eased = law[0] * force ** (2.0 / 3.0), law[1] * force
+        shift = b * dent - r * eased  # of the penetration at this force
+        changes[0] = -force * (0.6 * b * dent - 0.5 * r * eased)
         changes[1] = -shift * stiffness
-        changes[2] += shift**2 * stiffness
+        changes[2] = shift**2 * stiffness
+        changes[2] -= force * (0.6 * (b * b + bb) * dent - 0.5 * (r * r + rr) * eased)
+        if law[2] != 0.0 or law[3] != 0.0:
+            changes[:] = 0.0
 
     def image_distance(self, away, share):
         """Distance from a right angle that does as much as one ``away`` mm with a share of it."""
