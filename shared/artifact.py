@@ -94,7 +94,7 @@ class Stored(NamedTuple):
 
     def check_values(self, values: NDArray[Any], sizes: dict[str, int]) -> None:
         """Raise ``ValueError`` unless all values are such as a reader can do with."""
-        usable = bool(np.isfinite(values).all())
+        usable = values.dtype.kind in "iub" or bool(np.isfinite(values).all())
         match self.values.partition(" "):
             case "<", _, size:
                 top = _extent(size, sizes)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -19,18 +19,14 @@ from numpy.typing import ArrayLike
 from palpate.shared.answer import Answers
 from palpate.shared.arrays import Array, Flags
 from palpate.shared.compiled import room
-from palpate.shared.geometry.surface import UPRIGHT
 from palpate.shared.mechanics import newton
-from palpate.shared.query import ABSURD, BARRED, BESIDE, refuse_rows, rows
+from palpate.shared.query import ABSURD, load_beyond, refuse_rows, rows, tip_beyond
 from palpate.shared.reduced.features import UNFITTED
 from palpate.shared.reduced.many import Found, press_many, touch_many
 
 if TYPE_CHECKING:
     from palpate.shared.model import ReducedModel
     from palpate.shared.reduced.workspace import Workspace
-
-SLIGHT = 1e-9
-"""Relative excess over a limit that is round-off."""
 
 
 def solve(
@@ -75,11 +71,9 @@ def solve(
     reach = f"more than {endoscope.reach} mm from the accessible surface"
     refuse_rows("positions", found.distance > endoscope.reach, reach)
     refuse_rows("directions", ~(found.tilt < 90.0), "must point into the tissue")
-    above = np.abs(np.sum((at - found.point) * found.normal, axis=1))
-    outside = (found.distance > BESIDE) & (above < UPRIGHT * found.distance)
-    outside |= pressed > found.limit * (1 + SLIGHT)
-    outside |= found.tilt > endoscope.max_tilt + 1e-6
-    return _answers(found, outside)._replace(error_force=np.zeros(len(at)))
+    above = np.sum((at - found.point) * found.normal, axis=1)
+    beyond = load_beyond(endoscope, above, found.distance, found.tilt, pressed, found.limit)
+    return _answers(found, beyond)._replace(error_force=np.zeros(len(at)))
 
 
 def touch(model: ReducedModel, positions: ArrayLike, threads: int | None) -> Answers:
@@ -92,8 +86,9 @@ def touch(model: ReducedModel, positions: ArrayLike, threads: int | None) -> Ans
     found = _in_threads(model, True, len(at), threads, work)
     below = "the tip's centre lies below the accessible surface"
     refuse_rows("positions", found.depth > radius, below)
-    over = ((found.beside > 0.0) | (found.barred > BARRED)) & (found.depth > 0.0)
-    return _answers(found, over | (found.depth > found.limit * (1 + SLIGHT)))
+    near = found.depth > 0.0
+    beyond = tip_beyond(found.beside, found.barred, near, found.depth, found.limit)
+    return _answers(found, beyond)
 
 
 def _fitted(coefficients: Array | None) -> Array:
@@ -120,8 +115,9 @@ def _in_threads(
     return found
 
 
-def _answers(found: Found, outside: Flags) -> Answers:
-    """Answers of what was found; errors of those outside the range are not known."""
+def _answers(found: Found, beyond: Mapping[str, Flags]) -> Answers:
+    """Answers of what was found; errors of those beyond the range in a field are not known."""
+    outside = np.any(list(beyond.values()), axis=0)
     converged = found.status == newton.CONVERGED
     found.errors[outside | ~converged] = np.inf
     return Answers(

@@ -30,7 +30,7 @@ from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH
 from palpate.shared.mechanics.tip import EDGE_FIELD, dented, held
 from palpate.shared.near_field import Contact
-from palpate.shared.query import BARRED, check_place, checked_load, out_of_range, vector
+from palpate.shared.query import check_place, checked_load, out_of_range, tip_beyond, vector
 from palpate.shared.reduced import press, touch
 from palpate.shared.reduced.features import UNFITTED, near_rim, total_errors
 from palpate.shared.reduced.outcome import Outcome
@@ -367,11 +367,9 @@ class ReducedModel:
             )
         parts = tuple([(k, w, own.warm.q[slot].copy()) for slot, k, w in answering])
         converged = found.status.item() == newton.CONVERGED
-        outside: tuple[str, ...] = ()
-        if (beside or found.barred.item() > BARRED) and (touched or depth > 0.0):
-            outside += ("position",)
-        if depth > limit * (1 + 1e-9):
-            outside += ("depth",)
+        near = touched or depth > 0.0
+        beyond = tip_beyond(beside, found.barred.item(), near, depth, limit)
+        outside = tuple(field for field, so in beyond.items() if so)
         if not outside and converged and not touched and past is None:
             reduction, (total, mesh) = _NONE, ([0.0] * 3, _NONE)
         else:

@@ -1,6 +1,7 @@
 """What a query must be to be answered, and what it must be to be within the trained range."""
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -84,18 +85,40 @@ def out_of_range(
     endoscope: Endoscope, at: Array, found: Outcome, pressure: float, radius: float
 ) -> tuple[str, ...]:
     """Fields of a load that are not of the kind the model was trained for."""
-    fields: tuple[str, ...] = ()
-    distance = found.distance.item()
-    beside = UPRIGHT * distance  # rather beyond the rim than above or below
-    if distance > BESIDE and abs(np.dot(at - found.foot, found.upward)) < beside:
-        fields += ("position",)
-    if pressure > found.limit.item() * (1 + 1e-9):
-        fields += ("pressure",)
-    if found.tilt.item() > endoscope.max_tilt + 1e-6:
-        fields += ("direction",)
-    if radius != endoscope.radius:
-        fields += ("radius",)
-    return fields
+    above = np.dot(at - found.foot, found.upward)
+    numbers = (found.distance.item(), found.tilt.item(), pressure, found.limit.item())
+    beyond = load_beyond(endoscope, above, *numbers) | {"radius": radius != endoscope.radius}
+    return tuple(field for field, outside in beyond.items() if outside)
+
+
+def load_beyond(
+    endoscope: Endoscope, above: Any, distance: Any, tilt: Any, pressure: Any, limit: Any
+) -> dict[str, Any]:
+    """Whether the fields of a load, or of loads (n,), are beyond the trained range.
+
+    ``above`` and ``distance`` (mm) are those of the position from the surface.
+    """
+    # rather beyond the rim than above or below
+    beside = (distance > BESIDE) & (np.abs(above) < UPRIGHT * distance)
+    return {
+        "position": beside,
+        "pressure": over(pressure, limit),
+        "direction": tilt > endoscope.max_tilt + 1e-6,
+    }
+
+
+def tip_beyond(beside: Any, barred: Any, near: Any, depth: Any, limit: Any) -> dict[str, Any]:
+    """The same of a position of the tip, or of positions (n,), see ``Outcome``.
+
+    Where the tip is not ``near`` the tissue it is beside nothing.
+    """
+    aside = ((beside > 0.0) | (barred > BARRED)) & near
+    return {"position": aside, "depth": over(depth, limit)}
+
+
+def over(level: Any, limit: Any) -> Any:
+    """Whether a pressure or a depth is more than its limit, and not by round-off."""
+    return level > limit * (1 + 1e-9)
 
 
 def vector(field: str, value: ArrayLike) -> Array:

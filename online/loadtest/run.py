@@ -31,7 +31,7 @@ from palpate.online.loadtest.streams import (
     drive,
 )
 from palpate.online.serve.wire import BINARY, JSON
-from palpate.online.session.frames import Flag, Output
+from palpate.online.session.frames import Flag, output_bits
 from palpate.online.session.websocket import ECHO
 from palpate.online.settings import Plan
 from palpate.shared.arrays import Array, Flags
@@ -93,7 +93,7 @@ def _streams(plan: Plan) -> Iterator[Stream]:
     with Client(plan.url, token=plan.token) as client:
         ranges = client.scene(plan.scene)["ranges"]
         surface = client.accessible(plan.scene)
-    outputs = sum(Output[name.upper()] for name in plan.outputs)
+    outputs = output_bits(plan.outputs)
     for i in range(plan.sessions):
         due = _schedule(plan, plan.rate, i / plan.sessions)
         path = tool_path(surface, ranges["radius"], plan.depth, due, rng)

@@ -191,6 +191,12 @@ class ManyRoute(APIRoute):
         return handle
 
 
+_OF_ANSWERS = {
+    field: get_args(get_args(hint)[1])[0] for field, hint in get_type_hints(layout.Answers).items()
+}
+"""Types of the arrays that answer a list."""
+
+
 async def _listed(
     request: Request, name: str, count: int, work: Callable[[ReducedModel], Answers]
 ) -> Response:
@@ -209,8 +215,8 @@ async def _listed(
         except QueryError as error:
             raise Refusal("unanswerable_query", error.field, error.message) from None
     arrays = {
-        field: np.ascontiguousarray(getattr(found, field), get_args(get_args(hint)[1])[0])
-        for field, hint in get_type_hints(layout.Answers).items()
+        field: np.ascontiguousarray(getattr(found, field), dtype)
+        for field, dtype in _OF_ANSWERS.items()
     }
     content = wire.encode(media_type, {"scene": name}, arrays)
     return Response(content, media_type=media_type)

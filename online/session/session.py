@@ -225,7 +225,7 @@ class Session:
         asked = parse(TextRequest, text)
         nodes, most = len(self._model.surface_nodes), self._service.settings.max_json_numbers
         check_json_size(asked.outputs, nodes, most, "outputs")
-        outputs = sum({Output[name.upper()] for name in asked.outputs})
+        outputs = frames.output_bits(asked.outputs)
         request = Request(asked.seq, asked.client_time, asked.position, outputs)
         return write_reply(self._answer(request, start))
 

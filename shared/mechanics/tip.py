@@ -116,6 +116,9 @@ class Tip(NamedTuple):
         past takes off the force is remembered as a force, of the place where it was, so in time the
         place does not know of the edge.
         """
+        changes[:] = 0.0
+        if law[2] != 0.0 or law[3] != 0.0:
+            return
         length, more = EDGE * self.radius, 0.5 * (self.psi - 1.0)
         fade = math.exp(-edge / length)
         images, softer = fade / (1.0 + fade), more * fade / (1.0 + more * fade)
@@ -130,8 +133,6 @@ class Tip(NamedTuple):
         changes[1] = -shift * stiffness
         changes[2] = shift**2 * stiffness
         changes[2] -= force * (0.6 * (b * b + bb) * dent - 0.5 * (r * r + rr) * eased)
-        if law[2] != 0.0 or law[3] != 0.0:
-            changes[:] = 0.0
 
     def image_distance(self, away, share):
         """Distance from a right angle that does as much as one ``away`` mm with a share of it."""

@@ -24,7 +24,6 @@ class Found(NamedTuple):
     limit: Annotated[Array, "n"]  # kPa or mm
     point: Annotated[Array, "n, 3"]  # mm
     normal: Annotated[Array, "n, 3"]
-    direction: Annotated[Array, "n, 3"]  # of a load
     force: Annotated[Array, "n, 3"]  # mN
     displacement: Annotated[Array, "n, 3"]  # mm, under a load
     errors: Annotated[Array, "n, 3"]  # of mesh and reduction
@@ -41,7 +40,6 @@ def press_many(solver, mesh, positions, directions, pressures, radius, found):
         press.press(solver, pressures[i], radius)
         found.point[i] = outcome.foot
         found.normal[i] = outcome.upward
-        found.direction[i] = outcome.direction
         found.displacement[i] = outcome.displacement
         found.tilt[i] = outcome.tilt[0]
         _note(outcome, mesh, pressures[i], i, found)

@@ -32,9 +32,6 @@ def rows(report, visco_artifact):
     return {(row["method"], row["stressor"]): row for row in rows}
 
 
-@pytest.mark.xfail(
-    reason="edges under the tip in time: the past is remembered as a force", strict=False
-)
 def test_the_artifact_never_fails_silently_and_answers_steps_of_every_length(report, rows):
     for name in (LOADS, TIP):
         assert report[name]["silently_wrong"] == report[name]["nan"] == report[name]["crashes"] == 0
@@ -52,9 +49,6 @@ def test_every_cell_counts_its_cases_and_time_that_makes_no_sense_is_refused_by_
         assert int(rows[method, "time runs back"][REFUSED]) == CASES
 
 
-@pytest.mark.xfail(
-    reason="edges under the tip in time: the past is remembered as a force", strict=False
-)
 def test_a_long_hold_does_not_drift_and_a_periodic_movement_repeats(report):
     for name in METHODS:
         assert report[name]["drift"][LONGEST] < 5e-3

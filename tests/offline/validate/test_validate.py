@@ -83,14 +83,20 @@ def test_validation_over_histories(visco_artifact, validate):
     assert report["worst_displacement"]["max"] >= report["last_displacement"]["max"]
 
 
-@pytest.mark.xfail(
-    reason="edges under the tip in time: the past is remembered as a force", strict=False
-)
-def test_validation_over_histories_of_the_tip(visco_artifact, validate):
-    report, rows = validate(visco_artifact, "--tip", "--histories", 2, "--seed", 3)
+@pytest.fixture(scope="module")
+def touched(visco_artifact, validate):
+    return validate(visco_artifact, "--tip", "--histories", 2, "--seed", 3)
+
+
+@pytest.mark.xfail(reason="73 %: at edges in time the law is too soft and its range too deep")
+def test_estimates_over_histories_of_the_tip_cover_their_errors(touched):
+    assert touched[0]["covered"] >= 0.8
+
+
+def test_validation_over_histories_of_the_tip(touched):
+    report, rows = touched
     assert [report[k] for k in ("histories", "unconverged", "other_equilibrium")] == [2, 0, 0]
     assert report["displacement"]["mean"] <= 0.015
     assert report["von_mises"]["mean"] <= 0.02
     assert report["force"]["mean"] <= 0.01
-    assert report["covered"] >= 0.8
     assert all(float(row["force"]) for row in rows)
