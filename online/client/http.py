@@ -48,6 +48,7 @@ class Answer(NamedTuple):
     time: float = 0.0  # s, since rest, of a history's step
     displacement: Field | None = None  # (k, 3) mm; this and stress are None if not asked for
     von_mises: Field | None = None  # (k,) kPa
+    peak: Mapping[str, float] | None = None  # largest displacement and stress, if asked for
     timing: Mapping[str, float] = {}  # µs, where the service's time went
 
 
@@ -121,7 +122,8 @@ class Client:
         """Press the tissue at a position (mm) with a pressure (kPa).
 
         The direction is by default the inward normal, the radius (mm) the scene's. `outputs` are
-        the fields to return, for the nodes of `region`: ``none``, ``surface`` or ``all``.
+        the fields to return, for the nodes of `region`: ``none``, ``surface`` or ``all``; with
+        ``peak`` among them the answer has the largest values of the whole body as well.
         Raises `ServiceError` if the service refuses.
         """
         contact = _contact(position, pressure, direction, radius)
@@ -172,9 +174,9 @@ class Client:
         found = self._document("POST", name, rest, layout.encode({}, given), BINARY)[1]
         return Answers(**found)
 
-    def session(self, name: str, record: Path | None = None) -> Session:
+    def session(self, name: str, record: Path | None = None, reconnect: float = 0.0) -> Session:
         """Open a session of a scene, on a connection of its own; see `Session`."""
-        return Session(self._url, name, self._token, self._timeout, record)
+        return Session(self._url, name, self._token, self._timeout, record, reconnect)
 
     def _document(
         self, method: str, name: str, rest: str, body: bytes | None = None, kind: str = JSON

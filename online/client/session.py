@@ -10,9 +10,9 @@ import ssl
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, sleep
 from typing import TYPE_CHECKING, Any, Self
 from urllib.parse import SplitResult, quote, urlsplit
 
@@ -28,6 +28,15 @@ from palpate.shared.errors import PalpateError
 
 if TYPE_CHECKING:
     from palpate.online.session.recording import Recorder
+
+LOST = {1001, 1006, 4000}
+"""Codes of ends that a new session helps against: of the service, the connection, the patience."""
+
+SHORTEST_PAUSE, LONGEST_PAUSE = 0.05, 2.0
+"""Seconds between attempts to connect again; each is twice the one before."""
+
+BUSY = {429, 503}
+"""Statuses of refusals that may pass."""
 
 
 class ServiceError(PalpateError):
@@ -210,6 +219,10 @@ class Session:
     ``palpate replay``. The `greeting` is what the service said of the scene and of its frames.
     Raises `ServiceError` if the service refuses the session.
 
+    With `reconnect` (s) a `step` that finds its session lost begins another one and goes on; no
+    attempt is made later than that. The tissue is at rest then and snapshots are gone: the answer
+    is `Reply.first`, and `reconnections` counts.
+
     Examples
     --------
     >>> with Session("http://127.0.0.1:8000", "turbinate") as session:      # doctest: +SKIP
@@ -224,14 +237,24 @@ class Session:
         token: str | None = None,
         timeout: float = 10.0,
         record: Path | None = None,
+        reconnect: float = 0.0,
     ) -> None:
-        self._seq = 0
-        self._connection = Connection(url, scene_path(scene, "/session"), token, timeout)
+        self._open = partial(Connection, url, scene_path(scene, "/session"), token, timeout)
+        self._seq, self._patience, self.reconnections = 0, reconnect, 0
+        self._connection, self.greeting = self._begin()
         try:
-            self.greeting: dict[str, Any] = json.loads(self._connection.receive())
             self._recorder = None if record is None else _recorder(record, self.greeting)
         except BaseException:
             self._connection.socket.close()
+            raise
+
+    def _begin(self) -> tuple[Connection, dict[str, Any]]:
+        """Connect and be greeted."""
+        connection = self._open()
+        try:
+            return connection, json.loads(connection.receive())
+        except BaseException:
+            connection.socket.close()
             raise
 
     def __enter__(self) -> Self:
@@ -241,7 +264,7 @@ class Session:
         self.close()
 
     def fileno(self) -> int:
-        """Return the socket's number, for those who wait for several."""
+        """Return the socket's number, for those who wait for several; `reconnect` changes it."""
         return self._connection.socket.fileno()
 
     def close(self) -> None:
@@ -286,10 +309,40 @@ class Session:
         client_time: float | None = None,
     ) -> Reply:
         """Send a position and wait for its reply; older replies are dropped. See `send`."""
+        try:
+            return self._step(position, outputs, client_time)
+        except SessionClosed as closed:
+            if not self._patience or closed.code not in LOST:
+                raise
+        self.reconnect()
+        return self._step(position, outputs, client_time)
+
+    def _step(
+        self, position: Sequence[float], outputs: int | Sequence[str], client_time: float | None
+    ) -> Reply:
         seq = self.send(position, outputs, client_time)
         while (reply := self.receive()).seq != seq:
             pass
         return reply
+
+    def reconnect(self) -> None:
+        """Begin another session, as `step` does, for who sends and receives without it.
+
+        Raises what the last attempt did; `step` may then be called again.
+        """
+        end, pause, lost = perf_counter() + self._patience, SHORTEST_PAUSE, self._connection.socket
+        while True:
+            try:
+                self._connection, self.greeting = self._begin()
+                break
+            except (PalpateError, OSError) as error:
+                refused = isinstance(error, ServiceError) and error.status not in BUSY
+                if refused or perf_counter() + pause > end:
+                    raise
+            sleep(pause)
+            pause = min(2.0 * pause, LONGEST_PAUSE)
+        lost.close()
+        self.reconnections += 1
 
     def snapshot(self, number: int = 0) -> None:
         """Let the service keep the state of the tissue; replies still under way are dropped."""

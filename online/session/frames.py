@@ -79,6 +79,7 @@ class Flag(_Bits):
     CLAMPED = 8, "the step was too long for its time: `position` is short of the one asked for"
     FALLBACK = 16, "no answer there: all is the last good answer's, but the errors are infinite"
     STALLED = 32, "more time than `longest_step` had passed, or less than none; it was cut"
+    FIRST = 64, "the first answer of its session: the tissue was at rest before"
 
 
 class Reason(IntEnum):
@@ -175,6 +176,11 @@ class Reply(NamedTuple):
         """Whether this is a trained-for equilibrium at the position asked for."""
         asked = Flag.CONVERGED | Flag.IN_RANGE | Flag.CLAMPED | Flag.FALLBACK
         return self.flags & asked == Flag.CONVERGED | Flag.IN_RANGE
+
+    @property
+    def first(self) -> bool:
+        """Whether the tissue was at rest before this, as at the beginning of every session."""
+        return bool(self.flags & Flag.FIRST)
 
 
 REPLY_FIELDS = tuple(

@@ -4,7 +4,8 @@ A recording is an HDF5 file with one dataset for each field of a reply (`session
 row for each reply in order of arrival, and beside them what was asked for and when. Every dataset
 has ``units`` and a ``description``. Since an answer depends on those before it, and on how many
 positions were solved for each (``steps``), the recording of a whole session is enough to answer it
-again, bit for bit (`session.tracker.replay`).
+again, bit for bit (`session.tracker.replay`). Where a client had to connect again, the sessions
+follow one another: each begins with a reply that says `Flag.FIRST`.
 """
 
 import json
@@ -22,7 +23,7 @@ from palpate.shared.arrays import Array
 from palpate.shared.errors import PalpateError
 
 FORMAT = "palpate-session"
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 
 CHUNK = 2000
 """Replies that are kept in memory until they are written."""

@@ -46,7 +46,7 @@ VOLATILE = ("server_received", "server_sent", "solve_time", "superseded")
 """Fields of a reply that depend on the clock and on the network."""
 
 # enumerations are slow to calculate with
-_CONTACT, _CONVERGED, _IN_RANGE, _CLAMPED, _FALLBACK, _STALLED = map(int, Flag)
+_CONTACT, _CONVERGED, _IN_RANGE, _CLAMPED, _FALLBACK, _STALLED, _FIRST = map(int, Flag)
 _COORDINATES, _DISPLACEMENT, _VON_MISES, _STRESS, _HALF = map(int, Output)
 _SOLVED, _NO_EQUILIBRIUM, _BELOW_SURFACE = map(int, Reason)
 
@@ -90,7 +90,7 @@ class ToolTracker:
         """
         start = perf_counter()
         target = np.array(position, np.float64)
-        passed = 0.0 if self._clock is None else now - self._clock
+        first, passed = (True, 0.0) if self._clock is None else (False, now - self._clock)
         self._span, self._reached = min(max(passed, 0.0), LONGEST), 0.0
         reason, steps = self._solve(target, 1.0), 1
         if reason == _NO_EQUILIBRIUM:
@@ -99,7 +99,7 @@ class ToolTracker:
         self._clock = now - (1.0 - self._reached) * self._span
         # before the first good answer, one without force and without any claim
         touch = self._good or Answer(position=target, contact_point=target)
-        flags = _CONTACT * touch.contact
+        flags = _CONTACT * touch.contact | _FIRST * first
         if self._reached == 0.0:
             flags |= _FALLBACK
         else:
@@ -196,6 +196,8 @@ def replay(recording: Recording, model: ReducedModel) -> dict[str, Any]:
     tracker, commands = ToolTracker(model), list(recording.commands)
     again = np.zeros_like(recording.replies)
     for i, request in enumerate(recording.requests):
+        if recording.replies["flags"][i] & _FIRST:  # of one of the sessions of a client
+            tracker.restart()
         while commands and commands[0][0] <= i:
             _, restores, number = commands.pop(0)
             (tracker.restore if restores else tracker.snapshot)(number)

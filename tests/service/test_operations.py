@@ -70,11 +70,11 @@ def test_settings_come_from_the_environment_and_a_token_lets_other_machines_in(s
     assert "secret" not in server.log
 
 
-def session_on(worker, url, client):
+def session_on(worker, url, client, **options):
     """Open a session on a worker: again and again, since any of them may accept it."""
     for _ in range(500):
         before = workers(url)[worker]["palpate_sessions"]
-        session = client.session("quick")
+        session = client.session("quick", **options)
         if workers(url)[worker]["palpate_sessions"] > before:
             return session
         session.close()
@@ -92,10 +92,14 @@ def test_a_killed_worker_is_replaced_while_the_others_sessions_go_on(serve, arti
         position = sessions[0].greeting["example"]["position"]
         replies = [session.step(position) for session in sessions]
         assert all(reply.contact for reply in replies), replies
+        lasting = stack.enter_context(session_on(0, server.url, client, reconnect=10.0))
+        assert lasting.step(position).first
 
         os.kill(int(before[0]["palpate_worker_pid"]), signal.SIGKILL)
         with pytest.raises(SessionClosed):
             sessions[0].step(position)
+        assert lasting.step(position).first  # it is with the other worker, or with the new one
+        assert lasting.reconnections == 1
         while (after := workers(server.url))[0]["palpate_worker_starts_total"] < 2:
             assert sessions[1].step(position).good
             time.sleep(0.02)

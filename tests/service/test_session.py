@@ -1,10 +1,13 @@
 """Sessions of a process of its own, on a trained scene."""
 
 import json
+import signal
 import socket
 import subprocess
 import threading
 import time
+from contextlib import ExitStack
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -69,6 +72,28 @@ def test_stopping_under_load_tells_the_sessions(serve, artifact):
             thread.join()
     assert heard == [(1001, "the service is stopping")] * 3
     assert "Traceback" not in server.log
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_a_session_outlives_its_service(serve, artifact, number):
+    """The service is killed or stopped, and started again while the next step is waiting."""
+    with serve(artifact.parent) as first, ExitStack() as stack:
+        session = stack.enter_context(Session(first.url, "quick", reconnect=60.0))
+        position = session.greeting["example"]["position"]
+        before = session.step(position)
+        first.stop(number)
+        replies = []
+        step = threading.Thread(target=lambda: replies.append(session.step(position)))
+        step.start()
+        time.sleep(0.5)
+        assert not replies
+        stack.enter_context(serve(artifact.parent, "--port", str(urlsplit(first.url).port)))
+        step.join()
+        (after,) = replies
+        assert (before.first, after.first, after.good) == (True, True, True)
+        assert session.reconnections == 1
+        np.testing.assert_allclose(after.force, before.force, rtol=1e-6)
+        assert not session.step(position).first
 
 
 def test_stopping_does_not_wait_for_a_client_that_does_not_read(serve, artifact):

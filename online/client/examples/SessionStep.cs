@@ -39,6 +39,7 @@ namespace Palpate
         Clamped = 8,
         Fallback = 16,
         Stalled = 32,
+        First = 64,
     }
 
     public enum Reason : uint

@@ -40,6 +40,7 @@ enum Flag : std::uint16_t {
     clamped = 8,
     fallback = 16,
     stalled = 32,
+    first = 64,
 };
 
 enum Reason : std::uint32_t {

@@ -37,7 +37,7 @@ def test_a_position_is_answered_with_force_and_tangent(session):
     seq = session.send(PRESSED, client_time=12.5)
     reply = session.receive()
     assert (reply.seq, reply.client_time) == (seq, 12.5)
-    assert reply.flags == Flag.CONTACT | Flag.CONVERGED | Flag.IN_RANGE
+    assert reply.flags == Flag.CONTACT | Flag.CONVERGED | Flag.IN_RANGE | Flag.FIRST
     np.testing.assert_allclose(reply.force, [0, 0, 10.0])
     np.testing.assert_allclose(reply.tangent, np.diag([0, 0, -20.0]))
     np.testing.assert_array_equal(reply.position, PRESSED)
@@ -150,7 +150,7 @@ def test_an_answer_that_is_not_finite_stays_inside(opening):
     with opening(model) as session:
         model.poison = True
         reply = session.step(PRESSED)
-        assert reply.flags == Flag.FALLBACK
+        assert reply.flags == Flag.FALLBACK | Flag.FIRST
         assert not reply.force.any()
 
 

@@ -8,8 +8,7 @@ from palpate.online.session.tracker import LONGEST, ToolTracker
 
 from ..fake_model import FakeModel
 
-GOOD = Flag.CONVERGED | Flag.IN_RANGE
-TOUCHING = GOOD | Flag.CONTACT
+TOUCHING = Flag.CONVERGED | Flag.IN_RANGE | Flag.CONTACT
 
 
 @pytest.fixture(params=[False, True], ids=["elastic", "in time"])
@@ -31,7 +30,8 @@ def is_fallback(answer, good):
 
 def test_a_position_that_can_be_solved_takes_one_step(model):
     _, answer = begun(model, 5.0, 5.0, 6.5)
-    assert (answer.flags, answer.steps, answer.reason) == (TOUCHING, 1, Reason.NONE)
+    told = answer.flags, answer.steps, answer.reason
+    assert told == (TOUCHING | Flag.FIRST, 1, Reason.NONE)
     np.testing.assert_array_equal(answer.touch.position, [5.0, 5.0, 6.5])
 
 
@@ -88,7 +88,7 @@ def test_a_position_that_makes_no_sense_falls_back_at_once_and_takes_no_time(mod
 
 def test_before_any_answer_nothing_is_claimed(model):
     _, answer = begun(model, 5.0, 5.0, 4.0)
-    assert (answer.flags, answer.reason) == (Flag.FALLBACK, Reason.BELOW_SURFACE)
+    assert (answer.flags, answer.reason) == (Flag.FALLBACK | Flag.FIRST, Reason.BELOW_SURFACE)
     assert not answer.touch.force.any()
     assert not answer.touch.tangent.any()
 
@@ -107,9 +107,9 @@ def test_a_restarted_tracker_is_a_new_one(model):
     tracker, _ = begun(model, 1.0, 5.0, 6.5, stride=0.3)
     tracker.restart()
     answer = tracker.follow((9.0, 5.0, 6.5), 0.0, 9.0)
-    assert (answer.flags, answer.touch.time) == (TOUCHING, 0.0)
+    assert (answer.flags, answer.touch.time) == (TOUCHING | Flag.FIRST, 0.0)
     tracker.restart()
-    assert tracker.follow((9.0, 5.0, 4.0), budget=0.0).flags == Flag.FALLBACK
+    assert tracker.follow((9.0, 5.0, 4.0), budget=0.0).flags == Flag.FALLBACK | Flag.FIRST
 
 
 def test_a_snapshot_brings_back_the_state(model):
@@ -127,9 +127,9 @@ def test_a_snapshot_brings_back_the_state(model):
 def test_the_clients_time_passes():
     in_time = FakeModel(in_time=True)
     tracker = ToolTracker(in_time)
-    for now in (100.0, 100.001, 100.003, 100.003):
+    for now, first in (100.0, Flag.FIRST), (100.001, 0), (100.003, 0), (100.003, 0):
         answer = tracker.follow((5.0, 5.0, 6.5), 0.0, now)
-        assert answer.flags == TOUCHING
+        assert answer.flags == TOUCHING | first
     np.testing.assert_allclose(in_time.steps, [0.0, 0.001, 0.002, 0.0], atol=1e-9)
     assert answer.touch.time == pytest.approx(0.003)
 
