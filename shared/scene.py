@@ -395,12 +395,12 @@ def parse_scene(text: str, folder: Path | None = None, source: str = "scene") ->
     """
     try:
         scene = Scene.model_validate_json(json.dumps(_derived(tomllib.loads(text)), default=str))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise SceneError(f"{source}: not TOML: {error}") from error
     except ValidationError as error:
         faults = [_explain(dict(detail)) for detail in error.errors(include_url=False)]
         between = "\n  " if len(faults) > 1 else " "
         raise SceneError(between.join([f"{source}:", *faults])) from error
+    except (ValueError, RecursionError) as error:  # of integers without an end as well
+        raise SceneError(f"{source}: not TOML: {error}") from error
     scene._text = text
     scene._folder = folder
     return scene

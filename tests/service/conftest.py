@@ -2,6 +2,7 @@ import os
 import re
 import signal
 import subprocess
+import tempfile
 from contextlib import contextmanager
 
 import pytest
@@ -17,17 +18,20 @@ class Server:
     """
 
     def __init__(self, directory, *arguments, **environment):
+        # no pipe, which would fill and stop it
+        self._stderr = tempfile.TemporaryFile("w+")  # noqa: SIM115
         self.process = subprocess.Popen(
             [*PALPATE, "serve", "--artifacts", directory, "--port", "0", *arguments],
             stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            stderr=self._stderr,
             text=True,
             env={**os.environ, "PYTHONUNBUFFERED": "1", **environment},
         )
         self.greeting = ""
         while "Try:" not in self.greeting:
             line = self.process.stdout.readline()
-            assert line, self.process.communicate()
+            if not line:
+                raise AssertionError(self._said())
             self.greeting += line
         self.url = re.search(r"http://[\d.]+:\d+", self.greeting)[0]
         self.log = ""
@@ -35,8 +39,14 @@ class Server:
     def stop(self, number=signal.SIGTERM):
         """Send a signal and return the exit code."""
         self.process.send_signal(number)
-        _, self.log = self.process.communicate(timeout=10)
+        self.process.communicate(timeout=10)
+        self.log = self._said()
+        self._stderr.close()
         return self.process.returncode
+
+    def _said(self):
+        self._stderr.seek(0)
+        return self._stderr.read()
 
 
 @pytest.fixture(scope="session")
