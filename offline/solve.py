@@ -19,7 +19,7 @@ from palpate.offline.fem.mesh import least_volume_ratio
 from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import FullProblem, Load, Step, TipPosition
-from palpate.shared.answer import describe
+from palpate.shared.answer import describe, peak
 from palpate.shared.arrays import Array
 from palpate.shared.errors import QueryError
 from palpate.shared.model import ReducedModel
@@ -86,7 +86,7 @@ def solve(
     )
     report = {"scene": atlas.name} | describe(solution)
     moved = atlas.displacement(solution)
-    report["peak"] = _peaks(moved, atlas.peaks(solution, moved))
+    report["peak"] = peak(moved, atlas.peaks(solution, moved))
     report["timing"] = {"solve_us": solve_us, "recover_us": recover_us}
     if not (full_model or vtu):
         return report
@@ -105,7 +105,7 @@ def solve(
                 "displacement": relative(fields["displacement"], u),
                 "von_mises": relative(fields["von_mises"][kept], stress[kept]),
             },
-            "peak": _peaks(u, peaks),
+            "peak": peak(u, peaks),
             "iterations": exact.iterations,
             "load_steps": exact.load_steps,
             "min_jacobian": least_volume_ratio(problem.mesh, exact.displacement),
@@ -130,15 +130,6 @@ def _timed(call: Callable[[], Any]) -> tuple[Any, float]:
     started = time.perf_counter()
     result = call()
     return result, 1e6 * (time.perf_counter() - started)
-
-
-def _peaks(displacement: NDArray[np.floating], stress: tuple[float, float]) -> dict[str, float]:
-    """Largest displacement (mm) and stress (kPa), and the stress's 99th percentile.
-
-    Stress as in ``StressField.peaks``.
-    """
-    moved = float(np.linalg.norm(displacement, axis=1).max())
-    return {"displacement": moved, "von_mises": stress[0], "von_mises_p99": stress[1]}
 
 
 def write_vtu(

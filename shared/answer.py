@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from palpate.shared.arrays import Array, Flags, Ints
+from palpate.shared.arrays import Array, Field, Flags, Ints
 from palpate.shared.near_field import Contact
 from palpate.shared.reduced.transfer import Local, Past
 
@@ -113,6 +113,12 @@ def describe(answer: Answer) -> dict[str, Any]:
             "min_jacobian": answer.min_jacobian,
         },
     } | ({} if answer.past is None else {"time": answer.time})
+
+
+def peak(displacement: Field | Array, stress: tuple[float, float]) -> dict[str, float]:
+    """Largest displacement (mm) of nodes (n, 3), and stress (kPa) as in ``StressField.peaks``."""
+    moved = float(np.linalg.norm(displacement, axis=1).max())
+    return {"displacement": moved, "von_mises": stress[0], "von_mises_p99": stress[1]}
 
 
 def finite(value: float) -> float | None:

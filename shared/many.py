@@ -10,7 +10,6 @@ import math
 import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +26,9 @@ from palpate.shared.reduced.many import Found, press_many, touch_many
 if TYPE_CHECKING:
     from palpate.shared.model import ReducedModel
     from palpate.shared.reduced.workspace import Workspace
+
+PART = 200
+"""Queries that a thread takes at once: some 20 ms."""
 
 
 def solve(
@@ -58,7 +60,7 @@ def solve(
     refuse_rows("pressures", (pressed < 0) | (pressed > most), f"must be 0 to {most:.3g} kPa")
     towards = np.zeros_like(at)
     if directions is not None:
-        towards = rows("directions", directions, 3, len(at))
+        towards = 0.5 * rows("directions", directions, 3, len(at))  # as in ``checked_load``
         length = np.array([math.hypot(*row) for row in towards.tolist()])
         refuse_rows("directions", length == 0.0, "must not be zero")
         towards = towards / length[:, None]
@@ -102,16 +104,19 @@ def _in_threads(
     threads: int | None,
     work: Callable[[Workspace, Found, slice], None],
 ) -> Found:
-    """Let every thread do its part of so many queries."""
-    found, most = room(Found, n=count), threads or os.cpu_count() or 1
-    ends = np.linspace(0, count, min(most, max(count, 1)) + 1).round().astype(int).tolist()
+    """Let threads take parts of so many queries until all are done."""
+    found, starts = room(Found, n=count), range(0, count, PART)
+    left = iter(starts)
 
-    def do(part: slice) -> None:
+    def do(_: int) -> None:
         own = model.workspace(tip, in_time=False)
-        work(own, Found(*(array[part] for array in found)), part)
+        for start in left:  # which one thread at a time is given
+            part = slice(start, start + PART)
+            work(own, Found(*(array[part] for array in found)), part)
 
-    with ThreadPoolExecutor(len(ends) - 1) as pool:
-        list(pool.map(do, (slice(*pair) for pair in pairwise(ends))))
+    most = max(1, min(threads or os.cpu_count() or 1, len(starts)))
+    with ThreadPoolExecutor(most) as pool:
+        list(pool.map(do, range(most)))
     return found
 
 

@@ -58,7 +58,7 @@ def checked_load(
         raise QueryError("radius", f"must be in {allowed}, not {radius}")
     if direction is None:
         return at, INWARD, float(radius)
-    towards = vector("direction", direction)
+    towards = 0.5 * vector("direction", direction)  # else the length of the largest is infinite
     length = math.hypot(*towards.tolist())
     if length == 0.0:
         raise QueryError("direction", "must not be the zero vector")

@@ -5,7 +5,7 @@ to its last; the number of steps of a history bounds how long others wait.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from itertools import pairwise
 from time import perf_counter
@@ -19,7 +19,8 @@ from palpate.online.serve.errors import Refusal, check_json_size
 from palpate.online.serve.metrics import PHASES, Metrics
 from palpate.online.serve.schemas import Contact, HistoryRequest, SolveRequest
 from palpate.online.serve.wire import JSON
-from palpate.shared.answer import Answer, describe
+from palpate.shared.answer import Answer, describe, peak
+from palpate.shared.arrays import Field
 from palpate.shared.errors import QueryError
 from palpate.shared.model import ReducedModel
 from palpate.shared.reduced.transfer import REST
@@ -48,9 +49,10 @@ def answer(
     else:
         answers = [_press(model, request.contacts[0], "contacts.0")]
     solved = perf_counter()
-    fields = _recover(model, answers[-1], request)
+    fields, more = _recover(model, answers[-1], request)
     recovered = perf_counter()
     steps = [describe(answer) for answer in answers]
+    steps[-1] |= more
     told = {"steps": steps} if isinstance(request, HistoryRequest) else steps[0]
     timing = {"solve_us": 1e6 * (solved - start), "recover_us": 1e6 * (recovered - solved)}
     head = {"scene": model.name, **told, "timing": timing}
@@ -114,16 +116,22 @@ def _refused(path: str) -> Iterator[None]:
 
 def _recover(
     model: ReducedModel, answer: Answer, request: SolveRequest | HistoryRequest
-) -> wire.Arrays:
-    """Get the fields that a request wants; they are finite."""
-    fields, region = {}, request.region
-    if region != "none":
+) -> tuple[wire.Arrays, Mapping[str, Any]]:
+    """Get the fields that a request wants, and the ``peak`` if it wants that; all is finite."""
+    fields: dict[str, Field] = {}
+    more: dict[str, dict[str, float]] = {}
+    region = request.region
+    if region != "none" or "peak" in request.outputs:
         displacement = model.displacement(answer)
+    if "peak" in request.outputs:
+        more["peak"] = peak(displacement, model.peaks(answer, displacement))
+    if region != "none":
         if "displacement" in request.outputs:
             nodes = model.surface_nodes if region == "surface" else slice(None)
             fields["displacement"] = displacement[nodes]
         if "von_mises" in request.outputs:
             fields["von_mises"] = model.von_mises(answer, region, displacement)
-    if not all(np.isfinite(field).all() for field in fields.values()):
+    largest = [math.isfinite(value) for values in more.values() for value in values.values()]
+    if not (all(largest) and all(np.isfinite(field).all() for field in fields.values())):
         raise Refusal("no_equilibrium", "region", "The fields of this answer are not finite")
-    return fields
+    return fields, more

@@ -124,9 +124,10 @@ def _prepare(here: Service, sessions: Sessions, on_ready: Callable[[], None]) ->
 
 def warm(sessions: Sessions, served: ServedModel) -> None:
     """Call every kernel and encoder once, so that no client pays for a first time."""
-    uncounted = Metrics()
+    uncounted, outputs = Metrics(), get_args(schemas.Output)
     for region, media_type in zip(("surface", "all", "none"), OFFERED, strict=True):
-        body = orjson.dumps({"contacts": [served.example], "region": region})
+        asked = {"contacts": [served.example], "region": region, "outputs": outputs}
+        body = orjson.dumps(asked)
         answer(served.model, parse(SolveRequest, body), media_type, uncounted)
     models, radius = served.model.models, served.model.scene.endoscope.radius
     tour: list[int] = []
@@ -135,7 +136,7 @@ def warm(sessions: Sessions, served: ServedModel) -> None:
         tour = [here, there, here]
         contacts = ({"position": at, "pressure": 0.1} for at in models.centres[tour].tolist())
         steps = [{"time": 0.1 * i, "contact": contact} for i, contact in enumerate(contacts)]
-        body = orjson.dumps({"steps": steps, "region": "all"})
+        body = orjson.dumps({"steps": steps, "region": "all", "outputs": outputs})
         answer(served.model, parse(HistoryRequest, body), JSON, uncounted)
     served.model.solve_many([served.example["position"]], [served.example["pressure"]])
     if served.model.has_tip:

@@ -4,19 +4,22 @@ Answers are written straight from arrays; their models below describe them to th
 OpenAPI page. Beside an array of a document stand the type of its rows in JSON and its meaning.
 """
 
+import json
+import re
 from typing import Annotated, Any, Literal, TypeVar, get_type_hints
 
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, field_validator
 from pydantic_core import PydanticCustomError
 
-from palpate.online.serve.errors import invalid
+from palpate.online.serve.errors import Refusal, invalid
 from palpate.online.serve.layout import Accessible, Answers, Mesh
 
 CONVENTIONS = "Units are mm, mN, kPa and s throughout; forces are those of the tissue on the tool."
 """Of every endpoint and of sessions."""
 
 FieldName = Literal["displacement", "von_mises"]
+Output = Literal["displacement", "von_mises", "peak"]
 Region = Literal["none", "surface", "all"]
 MeshRegion = Literal["surface", "all"]
 
@@ -76,19 +79,23 @@ class Contact(Strict):
 
 
 class _Asking(Strict):
-    outputs: list[FieldName] = Field(
-        ["displacement", "von_mises"], max_length=2, description="The fields to return."
+    outputs: list[Output] = Field(
+        ["displacement", "von_mises"],
+        max_length=3,
+        description="The fields to return; with peak also the largest values of the whole body, "
+        "which need no region.",
     )
     region: Region = Field(
         "none",
         description="The nodes to return fields for, in the order of the mesh of that region; with "
-        "none, the answer holds the contact, the force and the trust block. Of a history the "
-        "fields are those of the last step. Who names outputs and no region gets the surface's.",
+        "none, the answer holds the contact, the force and the trust block. Of a history fields "
+        "and peak are those of the last step. Who names fields and no region gets the surface's.",
     )
 
     def model_post_init(self, _: Any) -> None:
-        """Give who names outputs and no region those of the surface."""
-        if self.outputs and self.model_fields_set & {"outputs", "region"} == {"outputs"}:
+        """Give who names fields and no region those of the surface."""
+        named = self.model_fields_set & {"outputs", "region"} == {"outputs"}
+        if named and set(self.outputs) - {"peak"}:
             self.region = "surface"
 
 
@@ -172,10 +179,29 @@ M = TypeVar("M", bound=Strict)
 def parse(kind: type[M], text: bytes | str) -> M:
     """Read a message from its JSON text; raise `Refusal` with the field that is wrong."""
     try:
-        return kind.model_validate_json(text)
+        message = kind.model_validate_json(text)
     except ValidationError as error:
         details = error.errors(include_url=False, include_input=False)
         raise invalid(details, {"": list(kind.model_fields), **_TABLES}) from None
+    _refuse_repeated(text if isinstance(text, str) else text.decode())
+    return message
+
+
+_KEY = re.compile(r'"([^"]*)"\s*:')
+
+
+def _refuse_repeated(text: str) -> None:
+    """Refuse JSON in which a table has a key twice: readers differ in which one counts."""
+    keys = _KEY.findall(text)
+    if len(keys) > len(set(keys)) or "\\" in text:  # rare, but in histories
+        json.loads(text, object_pairs_hook=_once)
+
+
+def _once(pairs: list[tuple[str, Any]]) -> None:
+    keys = [key for key, _ in pairs]
+    for key in keys:
+        if keys.count(key) > 1:
+            raise Refusal("invalid_value", key, "Given twice")
 
 
 class ContactAnswer(BaseModel):
@@ -225,11 +251,20 @@ Timing = Annotated[
 ]
 
 
+class Peak(BaseModel):
+    """The largest values of the fields in the whole body."""
+
+    displacement: float = Field(description="mm")
+    von_mises: float = Field(description="kPa, outside the layer at the support.")
+    von_mises_p99: float = Field(description="kPa, that 1 % of the volume is above.")
+
+
 class _Answer(BaseModel):
     contact: ContactAnswer
     force: Vector = Field(description="mN")
     contact_displacement: Vector = Field(description="Displacement of the contact point, mm.")
     trust: Trust
+    peak: Peak | None = Field(None, description="Only there if asked for.")
 
 
 class Answer(_Answer):

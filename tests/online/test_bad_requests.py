@@ -47,6 +47,12 @@ FIELDS = {
     "zero radius": (contact(radius=0), "contacts.0.radius"),
     "misspelt field": ({"contacts": [{"position": [5, 5, 5], "presure": 1}]}, "contacts.0.presure"),
     "unknown key": ({**contact(), "steps": 3}, "steps"),
+    "pressure twice": ('{"contacts":[{"position":[5,5,5],"pressure":1,"pressure":2}]}', "pressure"),
+    "pressure twice, once escaped": (
+        '{"contacts":[{"position":[5,5,5],"pressure":1,"\\u0070ressure":2}]}',
+        "pressure",
+    ),
+    "contacts twice": (json.dumps(contact())[:-1] + "," + json.dumps(contact())[1:], "contacts"),
     "unknown output": ({**contact(), "outputs": ["strain"]}, "outputs.0"),
     "huge outputs": ({**contact(), "outputs": ["displacement"] * 999}, "outputs"),
     "unknown region": ({**contact(), "region": "left"}, "region"),

@@ -85,6 +85,24 @@ def test_all_formats_hold_the_same_fields_in_the_order_of_the_mesh(client, regio
         assert list(solve(client, outputs=outputs, region=region).json()["fields"]) == outputs
 
 
+def test_the_largest_values_are_told_to_who_asks_for_them(client):
+    """Whatever the region; of the fields that are named with them those of the surface."""
+    model = FakeModel()
+    found = model.press(**QUERY["contacts"][0])
+    moved = model.displacement(found)
+    largest, percentile = model.peaks(found, moved)
+    expected = {"displacement": np.linalg.norm(moved, axis=1).max(), "von_mises": largest}
+    expected["von_mises_p99"] = percentile
+    answer = solve(client, outputs=["peak"]).json()
+    assert answer["peak"] == pytest.approx(expected)
+    assert answer["fields"] == {}
+    answer = solve(client, outputs=["peak", "von_mises"]).json()
+    assert answer["peak"] == pytest.approx(expected)
+    assert len(answer["fields"]["von_mises"]) == len(model.surface_nodes)
+    head, _ = layout.decode(solve(client, BINARY, outputs=["peak"]).content)
+    assert head["peak"] == pytest.approx(expected)
+
+
 def test_a_load_beyond_training_is_answered_with_a_flag(client):
     answer = solve(client, contacts=[{"position": [5, 5, 5], "pressure": 12}]).json()
     assert answer["trust"]["in_range"] is False

@@ -35,6 +35,11 @@ def test_help_lists_every_command_and_an_example(run):
         *(([command, "--help"], 0, f"Usage: palpate {command}") for command in COMMANDS),
         (["--version"], 0, "palpate, version 0."),
         (["knead"], 2, "No such command 'knead'"),
+        (["serve", "--rate-limit", "nan"], 2, "nan is not a finite number"),
+        (["serve", "--port", "99999"], 2, "99999 is not in the range"),
+        (["serve", "--max-wait", "-1"], 2, "-1.0 is not in the range"),
+        (["loadtest", "http://127.0.0.1:1", "--rate", "nan"], 2, "nan is not a finite number"),
+        (["loadtest", "http://127.0.0.1:1"], 2, "http://127.0.0.1:1: no service answers there"),
     ],
 )
 def test_commands_explain_themselves_and_others_are_refused(run, arguments, exit_code, said):

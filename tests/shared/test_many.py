@@ -4,12 +4,18 @@ import numpy as np
 import pytest
 
 from palpate.offline.reduce.sampling import cone
+from palpate.shared import many
 from palpate.shared.errors import QueryError
 
 NAMES = (
     "contact_point", "normal", "distance", "force", "converged", "iterations", "in_range",
     "error_displacement", "error_von_mises", "error_force", "min_jacobian", "contact_displacement",
 )  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def small_parts(monkeypatch):
+    monkeypatch.setattr(many, "PART", 7)
 
 
 @pytest.fixture
@@ -59,6 +65,7 @@ WRONG = {
     "positions.1": {"positions": [[5, 5, 8], [5, np.nan, 8]]},
     "positions": {"positions": [[5, 5], [5, 5]]},
     "positions.0": {"positions": [[5, 5, 80], [5, 5, 8]]},
+    "positions.1, too large to be squared": {"positions": [[5, 5, 8], 3 * [1.7e308]]},
     "pressures.1": {"pressures": [1.0, -1.0]},
     "pressures": {"pressures": [1.0]},
     "directions.0": {"directions": [[0, 0, 1], [0, 0, -1]]},
@@ -71,7 +78,14 @@ def test_the_row_that_is_wrong_is_named(atlas, field, changes):
     loads = {"positions": [[5, 5, 8], [5, 6, 8]], "pressures": [1.0, 1.0]} | changes
     with pytest.raises(QueryError) as refused:
         atlas.solve_many(**loads)
-    assert refused.value.field == field
+    assert refused.value.field == field.partition(",")[0]
+
+
+def test_directions_may_be_as_large_as_numbers_are(atlas):
+    """Nor does the direction of one change with its length."""
+    at, along = np.array([[5.0, 5.0, 8.0]]), np.array([[0.9, 0.8, -1.0]])
+    usual, large = (atlas.solve_many(at, [1.0], scale * along) for scale in (1.0, 1.79e308))
+    np.testing.assert_allclose(large.force, usual.force, rtol=1e-12)
 
 
 def test_a_tip_below_the_surface_is_named(atlas):

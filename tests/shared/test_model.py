@@ -126,7 +126,8 @@ def test_no_pressure_moves_nothing_and_the_length_of_a_direction_means_nothing(a
     assert np.abs(atlas.displacement(solution)).max() <= 1e-9
     assert np.abs(atlas.von_mises(solution)).max() <= 1e-6
     usual, *others = (
-        atlas.press(*contact, scale * np.array([0.2, 0.1, -1.0])) for scale in (7, 2e-162, 1e200)
+        atlas.press(*contact, scale * np.array([0.9, 0.8, -1.0]))
+        for scale in (7, 2e-162, 1e200, 1.79e308)
     )
     assert np.linalg.norm(usual.direction) == pytest.approx(1)
     for other in others:
@@ -142,7 +143,14 @@ def test_whole_numbers_are_answered_by_the_kernel_that_is_there(atlas, contact):
 
 NONSENSE = {
     "pressure": (math.nan, math.inf, -1e-9),
-    "position": ([math.nan, 0, 0], [0, math.inf, 0], [1.0, 2.0], "here", [5.0, 5.0, 500.0]),
+    "position": (
+        [math.nan, 0, 0],
+        [0, math.inf, 0],
+        [1.0, 2.0],
+        "here",
+        [5.0, 5.0, 500.0],
+        3 * [1.7e308],
+    ),
     "direction": ([0, 0, 0], [0, math.nan, -1], [0, -1], [0, 0, 1], [1, 0, 0]),
     "radius": (0.0, -1.0, 2.001, math.nan),
 }
@@ -165,8 +173,10 @@ def test_a_position_off_the_surface_is_moved_to_it_within_reach(atlas, contact):
     solution = atlas.press(x + 0.99 * reach * UP, pressure)
     assert solution.distance == pytest.approx(0.99 * reach)
     np.testing.assert_allclose(solution.contact_point, x, atol=1e-9)
-    with pytest.raises(QueryError, match=f"at most {reach} mm"):
+    with pytest.raises(QueryError, match=f"at most {reach} mm") as refused:
         atlas.press(x + 1.01 * reach * UP, pressure)
+    near = ", ".join(f"{value:.2f}" for value in x)
+    assert f"nearest is ({near}), and it lies within (" in str(refused.value)
 
 
 def test_the_surface_is_part_of_the_whole(atlas, contact):

@@ -49,6 +49,16 @@ def test_an_answer_has_the_names_and_values_that_it_has_in_process(url):
                     np.testing.assert_allclose(one, other, err_msg=name)
 
 
+def test_the_largest_values_come_when_asked_for(url):
+    own = FakeModel()
+    found = own.press((5, 5, 5), 4.0)
+    with Client(url) as client:
+        assert client.solve("toy", (5, 5, 5), 4.0).peak is None
+        answer = client.solve("toy", (5, 5, 5), 4.0, outputs=["peak"])
+    assert answer.peak["von_mises"] == own.peaks(found, own.displacement(found))[0]
+    assert answer.displacement is None
+
+
 def test_a_history_is_answered_step_by_step(serving, visco_atlas):
     at = visco_atlas.models.centres[0].tolist()
     steps = [(0.1, at, 0.5), (0.5, at, 1.0), (1.0, None, 0.0)]
