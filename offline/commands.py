@@ -181,17 +181,19 @@ def train(scene: str, out: Path | None, workers: int | None, force: bool, only_c
 
 @click.command()
 @artifact_argument
+@click.option("--errors", is_flag=True, help="Show where errors come from instead.")
 @click.option("--json", "as_json", is_flag=True, help="Print all that is known as JSON.")
-def info(artifact: Path, as_json: bool) -> None:
+def info(artifact: Path, errors: bool, as_json: bool) -> None:
     """Show what an artifact holds.
 
     Its body and tissue, the loads that it is made for, how accurate it is and how it was made. The
     JSON holds the text of the scene as well.
     """
-    from palpate.offline.info import info, lines
+    from palpate.offline.info import budget, info, lines
 
     report = info(artifact)
-    click.echo(_json(report) if as_json else "\n".join(lines(report)))
+    told = budget(report) if errors else lines(report)
+    click.echo(_json(report) if as_json else "\n".join(told))
 
 
 @click.command()

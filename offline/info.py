@@ -14,7 +14,10 @@ from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.reduced.press import TOLERANCE
 from palpate.shared.scene import Patch, Scene, SceneError, parse_scene
 
-LABELS = 14  # column at which the values of ``lines`` stand
+LABELS, WIDTH = 14, 14  # of the columns of ``lines`` and ``budget``
+
+COLUMNS = {"displacement": "displacement", "von_mises": "von Mises", "force": "tip's force"}
+"""What errors are of."""
 
 
 def info(artifact: Path) -> dict[str, Any]:
@@ -60,14 +63,14 @@ def info(artifact: Path) -> dict[str, Any]:
 
 
 def lines(report: Mapping[str, Any]) -> list[str]:
-    """What ``info`` found, one line for each aspect, and a table of errors."""
+    """What ``info`` found, a line for each aspect."""
     scene = parse_scene(report["text"])
     box = zip("xyz", *report["body"]["box"], strict=True)
     layout, provenance = report["training"]["layout"], report["provenance"]
     loads, depths = report["loads"], report["loads"]["tip_depth_limits"]
     said = {
         "scene": f"{scene.name}: {scene.description}",
-        "body": ", ".join(f"{axis} {low:.1f} to {high:.1f}" for axis, low, high in box)
+        "body": ", ".join(f"{axis} {low:z.1f} to {high:.1f}" for axis, low, high in box)
         + f" mm; {report['body']['elements']} elements {scene.geometry.element}, "
         f"{report['body']['dofs']} DOFs",
         "tissue": _tissue(scene),
@@ -79,28 +82,35 @@ def lines(report: Mapping[str, Any]) -> list[str]:
         "rigid tip": f"up to {depths[0]:.2g} to {depths[1]:.2g} mm deep, depending on the place"
         if depths
         else "not trained, so there are no sessions",
-        "reduced model": f"{layout['patches']} local models of {layout['modes']} modes and "
-        f"{layout['cubature_points_median']:g} points",
-        **trust(report),
-        "trained": f"{provenance['started'][:10]} in {duration(provenance['wall_seconds'])}, "
-        f"commit {provenance['git_commit'][:12]}; {report['bytes'] / 1e6:.1f} MB",
+        **accuracy(report),
+        "made": f"{provenance['started'][:10]} in {duration(provenance['wall_seconds'])}, commit "
+        f"{provenance['git_commit'][:12]}; {report['bytes'] / 1e6:.1f} MB, {layout['patches']} "
+        f"local models of {layout['modes']} modes and {layout['cubature_points_median']:g} points",
     }
-    return [*(f"{label:<{LABELS}} {text}" for label, text in said.items()), *budget(report)]
+    return labelled(said)
+
+
+def labelled(said: Mapping[str, str]) -> list[str]:
+    """Lines that begin with what they are about."""
+    return [f"{label:<{LABELS}} {text}" for label, text in said.items()]
 
 
 def accuracy(report: Mapping[str, Any]) -> dict[str, str]:
     """Errors that training found, by what presses."""
-    return {
-        label: f"95 of 100 random {noun} at most {percent(found['displacement']['p95'])} in "
-        f"displacement, {percent(found['von_mises']['p95'])} in von Mises stress"
-        for label, noun, found in _validations(report)
-    }
+    said = {}
+    for label, found, mesh in _validations(report):
+        names = [name for name in COLUMNS if name in found]
+        own = ", ".join(f"{COLUMNS[name]} {percent(found[name]['p95'])}" for name in names)
+        said[label] = f"95 of 100 within: {own}; by the mesh: " + ", ".join(
+            percent(mesh.get(name, {}).get("p95", math.nan)) for name in names
+        )
+    return said
 
 
 def trust(report: Mapping[str, Any]) -> dict[str, str]:
     """How far estimates of errors hold, and how many right answers they cast doubt on."""
     said = {}
-    for label, _, found in _validations(report):
+    for label, found, _ in _validations(report):
         flagged = found["flagged"]
         said[label.replace("errors", "trust")] = (
             f"covers 95 % of errors, confidence {percent(found['confidence'])}; doubts "
@@ -111,7 +121,7 @@ def trust(report: Mapping[str, Any]) -> dict[str, str]:
 
 
 def budget(report: Mapping[str, Any]) -> list[str]:
-    """A table of what each source of errors has of them."""
+    """A table of what each source of errors has of them, and how far their estimates hold."""
     training, scene = report["training"], parse_scene(report["text"])
     tip = report.get("validation_tip", {})
     sources = {
@@ -123,26 +133,28 @@ def budget(report: Mapping[str, Any]) -> list[str]:
             name: {"p95": most} for name, most in scene.tolerance.total._asdict().items()
         },
     }
-    columns = {"displacement": "displacement", "von_mises": "von Mises", "force": "tip's force"}
-    if not tip:
-        del columns["force"]
+    columns = {name: text for name, text in COLUMNS.items() if tip or name != "force"}
     rows = {
         source: [percent(found.get(name, {}).get("p95", math.nan)) for name in columns]
         for source, found in sources.items()
     }
     table = {"95 of 100": list(columns.values())} | rows
-    return [
-        f"{source:<{LABELS}} " + "".join(f"{value:<14}" for value in values).rstrip()
+    told = {
+        source: "".join(f"{value:<{WIDTH}}" for value in values).rstrip()
         for source, values in table.items()
-    ]
+    }
+    return labelled(told | trust(report))
 
 
-def _validations(report: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-    """Label, what was asked, and summary of each kind of query at once."""
-    kinds = {"errors": ("validation", "loads"), "tip's errors": ("validation_tip", "positions")}
-    for label, (kind, noun) in kinds.items():
+def _validations(
+    report: Mapping[str, Any],
+) -> Iterator[tuple[str, Mapping[str, Any], Mapping[str, Any]]]:
+    """Label, summary, and errors of the mesh of each kind of query at once."""
+    kinds = {"errors": ("validation", "mesh_errors")}
+    kinds |= {"tip's errors": ("validation_tip", "mesh_errors_tip")}
+    for label, (kind, mesh) in kinds.items():
         if kind in report:
-            yield label, noun, report[kind]
+            yield label, report[kind], report["training"].get(mesh, {})
 
 
 def closing(artifact: Path) -> list[str]:

@@ -26,20 +26,27 @@ def test_info(answer, artifact):
     assert find_scene("quick").text == report["text"]
 
 
-def test_info_for_people_is_a_dozen_lines_in_units_and_a_table_of_errors(run, artifact):
+def test_info_for_people_is_ten_lines_in_units_and_for_who_asks_a_table_of_errors(run, artifact):
     lines = run("info", artifact).stdout.splitlines()
-    assert len(lines) <= 18
+    assert len(lines) == 10
     assert lines[0].startswith("scene          quick: A thin slab")
     assert "Young's modulus at rest 15 kPa" in lines[2]
-    assert re.search(r"trust +covers 95 % of errors, confidence \d\d %; doubts", lines[8])
-    for line in lines:
+    share = r"[\d.]+ %"
+    own = f"displacement {share}, von Mises {share}"
+    mesh = f"by the mesh: {share}, {share}"
+    assert re.fullmatch(f"errors +95 of 100 within: {own}; {mesh}", lines[7])
+    own += f", tip's force {share}"
+    assert re.fullmatch(f"tip's errors +95 of 100 within: {own}; {mesh}, {share}", lines[8])
+    table = run("info", artifact, "--errors").stdout.splitlines()
+    assert re.match(r"trust +covers 95 % of errors, confidence \d\d %; doubts", table[6])
+    for line in lines + table:
         assert len(line) <= 120
         assert not re.search(r"[{}\[\]]|  %|None", line), line
 
 
 def test_info_tells_the_sources_of_errors_side_by_side(answer, artifact):
     report = answer("info", artifact)
-    table = {line[:LABELS].strip(): line[LABELS:].split("  ") for line in budget(report)}
+    table = {line[:LABELS].strip(): line[LABELS:].split("  ") for line in budget(report)[:6]}
     table = {key: [value.strip() for value in row if value.strip()] for key, row in table.items()}
     assert table["95 of 100"] == ["displacement", "von Mises", "tip's force"]
     assert table["tolerance"] == ["3 %", "12 %", "5 %"]
@@ -109,6 +116,10 @@ REFUSED = {
     "train many.toml": "more than 200000 elements in all",
     "train tiny.toml": "endoscope.radius = 1e-09: Input should be greater than or equal to 0.01",
     f"solve A {AT} 1 --vtu full.vtu": "No space left on device",
+    f"solve A {AT} 1 --vtu out.txt": "'out.txt' must end in .vtu",
+    f"solve A {AT} 1 --radius 9": "radius: must be in [1.0, 2.0] mm",
+    "study relaxation V --at nan 0 0": "nan is not a finite number",
+    "study relaxation V --at 1000 0 0": "mm from the accessible surface",
     "validate A --queries 2 --csv /dev/full": "No space left on device",
     "validate A --tip --histories 2": "is elastic",
 }
@@ -116,7 +127,7 @@ REFUSED = {
 
 @pytest.mark.parametrize(("command", "reason"), REFUSED.items())
 def test_what_makes_no_sense_is_told_in_a_line(
-    run, artifact, tmp_path, monkeypatch, command, reason
+    run, artifact, visco_artifact, tmp_path, monkeypatch, command, reason
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "text.h5").write_text("not an artifact")
@@ -130,7 +141,8 @@ def test_what_makes_no_sense_is_told_in_a_line(
     (tmp_path / "full.vtu").symlink_to("/dev/full")
     for name, text in scenes.items():
         (tmp_path / f"{name}.toml").write_text(text)
-    result = run(*(artifact if word == "A" else word for word in command.split()))
+    named = {"A": artifact, "V": visco_artifact}
+    result = run(*(named.get(word, word) for word in command.split()))
     assert result.exit_code == 2
     told = result.stderr.splitlines()[-1]
     assert told.startswith("Error: ")
