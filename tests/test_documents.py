@@ -11,8 +11,21 @@ import numpy as np
 import pytest
 
 from palpate.offline.scenes import shipped_scenes
-from palpate.offline.studies.figures import TABLE, document, figures, table
+from palpate.offline.studies.figures import (
+    ANSWER,
+    SAMPLE,
+    TABLE,
+    document,
+    figures,
+    sample,
+    table,
+)
+from palpate.online.serve.answer import answer
+from palpate.online.serve.metrics import Metrics
+from palpate.online.serve.schemas import SolveRequest, parse
+from palpate.online.serve.wire import JSON
 from palpate.shared.cli import main
+from palpate.shared.model import ReducedModel
 
 ROOT = Path(__file__).parents[1]
 FIGURES = ROOT / "artifacts"
@@ -100,7 +113,26 @@ def test_its_python_runs(visco_artifact, capsys):
 def test_figures_are_what_the_command_writes():
     assert TEXTS[FIGURES / "FIGURES.md"] == document(WANTED, FOUND)
     assert TABLE.search(TEXTS[ROOT / "README.md"])[0] == table(WANTED, FOUND)
+    assert SAMPLE.search(TEXTS[ROOT / "README.md"])[0] == sample(FOUND[ANSWER]["report"])
     assert set(FOUND) | {row["command"] for row in WANTED["readme"]} <= MEASURED
+
+
+def shape(document):
+    """The names in a document, whatever the values."""
+    if not isinstance(document, dict):
+        return None
+    return {name: shape(part) for name, part in document.items()}
+
+
+def test_its_answer_is_to_its_question_and_has_all_that_the_service_says(visco_artifact):
+    text = TEXTS[ROOT / "README.md"]
+    (asked,) = json.loads(re.search(r"solve -H .*\n +-d '(.*)'", text)[1])["contacts"]
+    words = ["--at", *map(str, asked["position"]), "--pressure", f"{asked['pressure']:g}"]
+    assert ANSWER.split()[2:] == words
+    contact = {"position": [5.0, 5.0, 8.0], "pressure": 1.0}
+    request = parse(SolveRequest, json.dumps({"contacts": [contact]}))
+    said = answer(ReducedModel.load(visco_artifact), request, JSON, Metrics())
+    assert shape(json.loads(SAMPLE.search(text)[0])) == shape(json.loads(said.body))
 
 
 def test_what_has_not_been_measured_is_said():

@@ -1,5 +1,7 @@
 """All figures with the commands that measure them: ``artifacts/FIGURES.md`` and README's few.
 
+README shows an answer, too, that of ``ANSWER``.
+
 ``figures.toml`` says which commands there are and what of their reports is shown, ``figures.json``
 holds the last report of each, with the commit and the day it was made at.  In a template,
 ``{displacement/mean|p95:%}`` stands for two entries of the report's ``displacement`` in percent.
@@ -10,6 +12,7 @@ import re
 import shlex
 import subprocess
 import sys
+import textwrap
 import tomllib
 from datetime import UTC, datetime
 from fnmatch import fnmatch
@@ -27,11 +30,16 @@ UNITS = {"%": (100, 2), "s": (1, 3), "ms": (1e-3, 2), "µs": (1, 3), "MB": (1e-6
 """Factor from what reports hold (1, s, µs, bytes), and digits shown."""
 
 ENTRIES = re.compile(r"\{([^:}]*):?([^}]*)\}")
+ANSWER = "solve turbinate --at 10 20 11 --pressure 3"
+"""The load that README presses with."""
+
 TABLE = re.compile(r"(?<=<!-- figures -->\n).*?(?=<!-- end of figures -->)", re.DOTALL)
+
+SAMPLE = re.compile(r"(?<=```json\n)\{\"scene\".*?(?=```)", re.DOTALL)
 
 
 def figures(folder: Path, pattern: str | None) -> None:
-    """Write ``FIGURES.md`` and README's table, after running the commands that match a pattern."""
+    """Write ``FIGURES.md`` and README's part, after running the commands that match a pattern."""
     wanted = tomllib.loads((folder / "figures.toml").read_text("utf-8"))
     for command in (c for section in wanted["section"] for c in section["commands"]):
         if pattern is not None and fnmatch(command, pattern):
@@ -40,6 +48,8 @@ def figures(folder: Path, pattern: str | None) -> None:
     (folder / "FIGURES.md").write_text(document(wanted, found), "utf-8")
     readme = folder.parent / "README.md"
     text = TABLE.sub(lambda _: table(wanted, found), readme.read_text("utf-8"))
+    if ANSWER in found:
+        text = SAMPLE.sub(lambda _: sample(found[ANSWER]["report"]), text)
     readme.write_text(text, "utf-8")
 
 
@@ -79,6 +89,32 @@ def table(wanted: dict[str, Any], found: Found) -> str:
     """README's figures."""
     rows = [[r["what"], *_cells(found, r["command"], [r["figure"]])] for r in wanted["readme"]]
     return "\n".join(_rows(["what", "figure", "measured"], rows)) + "\n"
+
+
+def sample(report: dict[str, Any]) -> str:
+    """The answer that the service gives to what a command was asked, a line for each part or more.
+
+    Digits are cut off, and what only the command tells is left out.
+    """
+    told = {name: report[name] for name in report if name not in ("peak", "timing")}
+    timing = {"solve_us": round(report["timing"]["solve_us"]), "recover_us": 0}
+    told |= {"fields": {}, "timing": timing}  # no fields are asked for
+    lines = []
+    for name, value in told.items():
+        text = json.dumps({name: _rounded(value)})[1:-1]
+        lines.append(textwrap.fill(text, 100, initial_indent=" ", subsequent_indent="  "))
+    return "{" + ",\n".join(lines).removeprefix(" ") + "}\n"
+
+
+def _rounded(value: Any) -> Any:
+    """Numbers of a report with two digits behind the point, or three if they are small."""
+    if isinstance(value, dict):
+        return {name: _rounded(part) for name, part in value.items()}
+    if isinstance(value, list):
+        return [_rounded(part) for part in value]
+    if not isinstance(value, float):
+        return value
+    return round(value, 2 if abs(value) >= 0.1 else 3) + 0.0
 
 
 def _rows(heading: list[str], rows: list[list[str]]) -> list[str]:
