@@ -28,9 +28,9 @@ Examples:
 def serve(**settings: Any) -> None:
     """Answer loads over HTTP and in sessions.
 
-    Prints a request to try once every model is loaded and warm. Every option can also be set by
-    the variable named beside it. On loopback anybody on this machine is served; on any other
-    address a token is asked for, unless --public says not to.
+    Prints the address of its page and a request to try once every model is loaded and warm. Every
+    option can also be set by the variable named beside it. On loopback anybody on this machine is
+    served; on any other address a token is asked for, unless --public says not to.
     """
     from palpate.online.serve.process import serve
 

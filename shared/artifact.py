@@ -15,7 +15,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from io import BufferedRandom, BufferedReader
 from pathlib import Path
 from types import UnionType
@@ -59,6 +59,7 @@ class Artifact:
     scene: str  # the TOML text
     documents: dict[str, Any]  # JSON-able: ``provenance``, ``training``, ``validation``
     arrays: dict[str, NDArray[Any]]
+    seal: str = ""  # SHA-256 of the file it was read from
 
 
 class Stored(NamedTuple):
@@ -226,9 +227,9 @@ def read_artifact(path: Path, *kinds: type) -> Artifact:
     """
     try:
         with open_regular(path) as file:
-            _check_seal(file, path)
+            seal = _check_seal(file, path)
         with h5py.File(path, "r") as opened:
-            return _read(opened, path, kinds)
+            return replace(_read(opened, path, kinds), seal=seal)
     except ArtifactError:
         raise
     except OSError as error:
@@ -237,7 +238,7 @@ def read_artifact(path: Path, *kinds: type) -> Artifact:
         raise ArtifactError(f"{path}: incomplete: {error}") from error
 
 
-def _check_seal(file: BufferedReader, path: Path) -> None:
+def _check_seal(file: BufferedReader, path: Path) -> str:
     seal = re.fullmatch(rb"%b (\d+) ([0-9a-f]{64})\n\0+" % FORMAT.encode(), file.read(SEAL_BYTES))
     if seal is None:
         raise ArtifactError(f"{path}: not an artifact of this software")
@@ -249,6 +250,7 @@ def _check_seal(file: BufferedReader, path: Path) -> None:
         )
     if _digest_of_rest(file) != seal[2].decode():
         raise ArtifactError(f"{path}: truncated or altered: it does not match its checksum")
+    return seal[2].decode()
 
 
 def _digest_of_rest(file: BufferedReader | BufferedRandom) -> str:

@@ -16,7 +16,7 @@ from palpate.shared.answer import Answer, Answers
 from palpate.shared.arrays import Array, Field, Flags
 from palpate.shared.artifact import Artifact, ArtifactError, read_artifact, values_of
 from palpate.shared.errors import PalpateError, QueryError
-from palpate.shared.fields import FieldRecovery
+from palpate.shared.fields import Composition, FieldRecovery
 from palpate.shared.geometry.surface import Surface, SurfaceIndex, boundary_triangles
 from palpate.shared.local_models import (
     Body,
@@ -77,6 +77,8 @@ class ReducedModel:
         Load range at the surface's vertices; see ``mechanics.footprint.pressure_limit``.
     models : LocalModels
     estimators : Estimators
+    seal : str
+        SHA-256 of the artifact.
     """
 
     def __init__(
@@ -89,8 +91,10 @@ class ReducedModel:
         limits: Array,
         models: LocalModels,
         estimators: Estimators,
+        seal: str = "",
     ) -> None:
         self.name = name
+        self.seal = seal
         self.scene = scene
         self.info = info
         self.body = body
@@ -139,6 +143,7 @@ class ReducedModel:
             limits=values_of(LoadRange, arrays)["limits"],
             models=LocalModels.of(arrays, scene),
             estimators=estimators,
+            seal=artifact.seal,
         )
 
     @property
@@ -479,6 +484,14 @@ class ReducedModel:
             displacement = self.fields.displacement(answer)
         stress = self.fields.von_mises(answer, displacement)
         return stress if region == "all" else stress[self.surface_nodes]
+
+    def surface_modes(self, number: int) -> Field:
+        """Modes (s, r, 3) mm of a local model at the s nodes of the surface."""
+        return self.fields.modes(number, self.surface_nodes)
+
+    def composition(self, answer: Answer) -> Composition:
+        """What the displacement of the surface is made of."""
+        return self.fields.composition(answer, self.surface_nodes)
 
     def peaks(self, answer: Answer, displacement: Field) -> tuple[float, float]:
         """Largest von Mises stress and its 99th percentile (kPa) outside the clamped layer.

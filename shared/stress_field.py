@@ -9,7 +9,7 @@ from palpate.shared.arrays import Array, Flags
 from palpate.shared.geometry.elements import gauss, hexahedron, shape
 from palpate.shared.geometry.quadrature import stress_recovery, volume_quadrature
 from palpate.shared.local_models import Body
-from palpate.shared.mechanics.stress import nodal_von_mises, point_von_mises, remember
+from palpate.shared.mechanics.stress import NearField, nodal_von_mises, point_von_mises, remember
 from palpate.shared.near_field import Contact, NearFields
 
 HIGHEST = 0.01
@@ -30,9 +30,13 @@ class StressField:
         self._recovery = stress_recovery(body.nodes, body.elements, body.law, precision)
         self._near = NearFields(body)
 
+    def dent(self, points: Array, contact: Contact | None) -> NearField:
+        """What the mesh does not follow of a tip at points (n, 3) mm."""
+        return self._near.dent(points, contact)
+
     def add_dent(self, u: Displacement, contact: Contact | None) -> None:
         """Add to displacements of the mesh what it does not follow of a tip."""
-        near = self._near.dent(self._body.nodes, contact)
+        near = self.dent(self._body.nodes, contact)
         u[near.points] += near.displacement
 
     def von_mises(self, u: Displacement, B: Array | None, contact: Contact | None) -> Array:

@@ -12,6 +12,8 @@ import pytest  # noqa: E402
 
 from palpate.shared.model import ReducedModel  # noqa: E402
 
+from . import browser  # noqa: E402
+
 
 @pytest.fixture
 def rng():
@@ -59,3 +61,16 @@ def visco_artifact(tmp_path_factory):
 def visco_atlas(visco_artifact):
     """Return the reduced model of the quick scene of visco-elastic tissue."""
     return ReducedModel.load(visco_artifact)
+
+
+@pytest.fixture(scope="session")
+def new_tab(tmp_path_factory):
+    """Return a function that opens a tab of a browser; without a browser the test is skipped.
+
+    Where the variable NEED_BROWSER is set it fails.
+    """
+    if browser.find() is None:
+        said = "no Chromium on this machine: apt-get install chromium-headless-shell"
+        pytest.fail(said) if os.environ.get("NEED_BROWSER") else pytest.skip(said)
+    with browser.browsing(tmp_path_factory.mktemp("browser")) as new_tab:
+        yield new_tab

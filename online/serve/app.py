@@ -7,12 +7,12 @@ import threading
 from collections.abc import AsyncIterator, Callable, Collection, Coroutine
 from contextlib import asynccontextmanager, suppress
 from importlib.metadata import version
-from time import perf_counter
+from time import perf_counter, time
 from typing import Annotated, Any, get_args, get_type_hints
 
 import numpy as np
 import orjson
-from fastapi import APIRouter, FastAPI, Path, Request, Response
+from fastapi import APIRouter, FastAPI, Path, Query, Request, Response
 from fastapi.responses import PlainTextResponse
 from fastapi.routing import APIRoute
 from starlette.exceptions import HTTPException
@@ -20,10 +20,11 @@ from starlette.middleware.cors import CORSMiddleware
 from starlette.routing import WebSocketRoute
 from starlette.websockets import WebSocket
 
-from palpate.online.serve import errors, guard, layout, schemas, wire
+from palpate.online.serve import errors, guard, layout, schemas, tickets, wire
 from palpate.online.serve.answer import answer, checked
 from palpate.online.serve.errors import Refusal, check_numbers
 from palpate.online.serve.metrics import CONTENT_TYPE, Metrics
+from palpate.online.serve.page import pages
 from palpate.online.serve.schemas import (
     HistoryRequest,
     ManyRequest,
@@ -72,6 +73,7 @@ def create_app(here: Service, on_ready: Callable[[], None] = lambda: None) -> Fa
         lifespan=lifespan,
         exception_handlers=dict.fromkeys(errors.KINDS, errors.refuse),
         redirect_slashes=False,
+        docs_url=None,  # the page of the service's own needs nobody else's files
         redoc_url=None,
         # Even unused it looks for a tracer in every request; the service times itself.
         telemetry={"tracing": False, "metrics": False, "logs": False},
@@ -88,7 +90,8 @@ def create_app(here: Service, on_ready: Callable[[], None] = lambda: None) -> Fa
             expose_headers=["Server-Timing", "Retry-After"],
         )
     # FastAPI's own inclusion of a router makes a request 20 µs slower
-    app.router.routes += [*queries.routes, *lists.routes, *scenes.routes, *service.routes]
+    parts = queries, lists, scenes, service, pages
+    app.router.routes += [route for part in parts for route in part.routes]
     sockets: dict[str, Any] = {"/scenes/{name}/session": sessions, "/{path:path}": _nothing_here}
     if settings.echo:
         sockets = {websocket.ECHO: websocket.echo, **sockets}
@@ -367,6 +370,17 @@ async def metrics(request: Request) -> Response:
     return Response(text, media_type=CONTENT_TYPE)
 
 
+@service.post("/tickets", response_model=schemas.Ticket, responses=_problems())
+async def ticket(request: Request) -> Any:
+    """Get a ticket to open a session with, for browsers, which send no token in a handshake.
+
+    It is part of the session's address, ``?ticket=...``; a service without a token needs none.
+    """
+    token = request.app.state.service.settings.token
+    issued = tickets.issue(token, time()) if token else None
+    return _json({"ticket": issued, "valid_s": tickets.VALID})
+
+
 @scenes.get("", response_model=schemas.SceneList, responses=_problems())
 async def served_scenes(request: Request) -> Any:
     """List the scenes that are served, and the files that had to be refused."""
@@ -405,6 +419,7 @@ async def scene(name: SceneName, request: Request) -> Any:
                 "triangles": len(model.surface_triangles),
             },
             "info": model.info,
+            "artifact": model.seal,
             "example": {"contacts": [served.example]},
         }
     )
@@ -441,6 +456,53 @@ async def accessible(name: SceneName, request: Request) -> Response:
         depth_limit=model.limits[:, TIP_DEPTH].astype(np.float32) if model.has_tip else None,
     )
     return _arrays(request, {"scene": name}, found)
+
+
+@scenes.get(
+    "/{name}/modes", **_document(schemas.CentresDocument, "Where the local models are", 406, 422)
+)
+async def centres(name: SceneName, request: Request) -> Response:
+    """Get where the local models are, so that modes can be fetched before they are needed."""
+    model = request.app.state.service.model(name).model
+    found = layout.Centres(model.models.centres.astype(np.float32))
+    return _arrays(request, {"scene": name, "artifact": model.seal}, found)
+
+
+@scenes.get(
+    "/{name}/modes/{model}",
+    **_document(schemas.ModesDocument, "The modes", 406, 422),
+)
+async def modes(
+    name: SceneName,
+    model: Annotated[int, Path(description="Number of a local model.", ge=0)],
+    request: Request,
+    artifact: Annotated[
+        str | None, Query(description="The hash that the scene states; with it, kept for ever.")
+    ] = None,
+) -> Response:
+    """Get the modes of a local model at the nodes of the surface's mesh.
+
+    Their sum, each times its coordinate of the ``PARTS`` of a session's frame, is a displacement.
+    """
+    served = request.app.state.service.model(name).model
+    if artifact not in (None, served.seal):
+        raise Refusal("unknown_artifact", "artifact", "The scene has been replaced", served.seal)
+    if model >= (count := len(served.models.region)):
+        raise Refusal("unknown_model", "model", "No such local model", {"lt": count})
+    # in a thread: answers need not wait for it
+    found = await asyncio.to_thread(_rounded, served, model)
+    response = _arrays(request, {"scene": name, "model": model, "artifact": served.seal}, found)
+    lasting = "public, max-age=31536000, immutable" if artifact else "no-cache"
+    response.headers.update({"Cache-Control": lasting, "Vary": "Accept"})
+    return response
+
+
+def _rounded(model: ReducedModel, number: int) -> layout.Modes:
+    """Modes of a local model as whole numbers of steps."""
+    modes = model.surface_modes(number)
+    steps = np.maximum(np.abs(modes).max(axis=(0, 2)), np.finfo(np.float32).tiny) / layout.MOST
+    rounded = np.rint(modes / steps[:, None]).astype(np.int16)
+    return layout.Modes(steps.astype(np.float32), rounded)
 
 
 def _arrays(request: Request, head: layout.Head, arrays: Any) -> Response:

@@ -17,7 +17,7 @@ from palpate.shared.errors import PalpateError
 _CODES = {
     401: "unauthorized",
     403: "foreign_origin",
-    404: "unknown_scene no_tip no_time unknown_snapshot not_found",
+    404: "unknown_scene unknown_artifact unknown_model no_tip no_time unknown_snapshot not_found",
     405: "method_not_allowed",
     406: "not_acceptable",
     413: "body_too_large",

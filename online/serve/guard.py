@@ -10,10 +10,12 @@ import re
 from collections.abc import Mapping
 from contextlib import suppress
 from functools import lru_cache
-from time import perf_counter
+from time import perf_counter, time
+from urllib.parse import parse_qs
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from palpate.online.serve import page, tickets
 from palpate.online.serve.errors import Refusal
 from palpate.online.serve.metrics import Metrics
 from palpate.online.settings import Settings
@@ -47,6 +49,7 @@ class Guard:
         self._app, self._metrics = app, metrics
         self._origins = frozenset(origin.encode() for origin in settings.origins)
         self._hosts = {machine_name(host) for host in settings.hosts}
+        self._token = settings.token
         self._secret = f"Bearer {settings.token}".encode() if settings.token else None
         self._rates = RateLimit(settings.rate_limit) if settings.rate_limit else None
         self._max_wait = settings.max_wait
@@ -57,7 +60,7 @@ class Guard:
             try:
                 headers = dict(scope["headers"])
                 self._check_names(headers)
-                self._check_token(headers)
+                self._check_token(scope, headers)
                 if scope["path"] != METRICS:
                     self._check_load(scope, perf_counter())
             except Refusal as refusal:
@@ -81,13 +84,23 @@ class Guard:
             message = "Pages of this origin may not use the service"
             raise Refusal("foreign_origin", "origin", message)
 
-    def _check_token(self, headers: Mapping[bytes, bytes]) -> None:
-        given = headers.get(b"authorization", b"")
+    def _check_token(self, scope: Scope, headers: Mapping[bytes, bytes]) -> None:
+        """Refuse who presents no token, but for the page, which asks for it."""
+        path, given = scope["path"], headers.get(b"authorization", b"")
+        if self._secret is None or path in page.OPEN or path.startswith(page.PREFIX):
+            return
+        if scope["type"] == "websocket" and self._has_ticket(scope):
+            return
         # takes as long for a token that is nearly right as for any other
-        if self._secret is not None and not hmac.compare_digest(given, self._secret):
+        if not hmac.compare_digest(given, self._secret):
             message = "This service asks for a token: Authorization: Bearer TOKEN"
             said = {"WWW-Authenticate": "Bearer"}
             raise Refusal("unauthorized", "authorization", message, headers=said)
+
+    def _has_ticket(self, scope: Scope) -> bool:
+        """Whether a handshake has a valid ticket in its address."""
+        (ticket, *_) = parse_qs(scope["query_string"].decode("latin-1")).get("ticket", [""])
+        return tickets.is_valid(ticket, self._token or "", time())
 
     def _check_load(self, scope: Scope, now: float) -> None:
         """Refuse what has waited too long, and clients that ask too often."""

@@ -14,8 +14,8 @@ offset type     meaning
 
 The head is the JSON answer with ``arrays`` in place of ``fields``: a list of
 ``{"name", "dtype", "shape", "offset"}`` in payload order, `offset` in bytes from the payload's
-start, `dtype` one of ``float64``, ``float32``, ``int32`` and ``uint8``. Wider ones come first, so
-that each can be viewed in place (``new Float32Array(buffer, 16 + H + offset, n)``).
+start, `dtype` one of ``float64``, ``float32``, ``int32``, ``int16`` and ``uint8``. Wider ones come
+first, so that each can be viewed in place (``new Float32Array(buffer, 16 + H + offset, n)``).
 """
 
 import json
@@ -36,13 +36,17 @@ MAGIC = b"PLPT"
 VERSION = 1
 
 PREFIX = struct.Struct("<4sHHII")
-DTYPES = {"float64": "<f8", "float32": "<f4", "int32": "<i4", "uint8": "|u1"}
+DTYPES = {"float64": "<f8", "float32": "<f4", "int32": "<i4", "int16": "<i2", "uint8": "|u1"}
 
 Head = dict[str, Any]
 Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Integers = NDArray[np.int32]
+Shorts = NDArray[np.int16]
 Bits = NDArray[np.uint8]
+
+MOST = 32767
+"""Steps of the largest value of a mode."""
 
 
 def _dumps(document: Head) -> bytes:
@@ -138,3 +142,16 @@ class Accessible(NamedTuple):
     depth_limit: Annotated[
         Floats | None, "value", "(v,), mm, largest trained of the tip; absent without one"
     ] = None
+
+
+class Centres(NamedTuple):
+    """The local models of a scene, by their numbers."""
+
+    centres: Annotated[Floats, "vector", "(p, 3), mm, on the surface"]
+
+
+class Modes(NamedTuple):
+    """Modes of a local model at the surface's nodes, orthonormal in energy."""
+
+    steps: Annotated[Floats, "value", "(r,), mm, of each mode"]
+    modes: Annotated[Shorts, "steps", "(s, r, 3), in steps"]

@@ -311,9 +311,10 @@ def _work(settings: Settings, url: str, table: Path, shared: "Service | None") -
         logger.info("worker %d is ready", metrics.worker)
         if metrics.worker or metrics.restarted:
             return  # the first worker says it once
+        click.echo(f"Open {url}/ in a browser (API: {url}/docs)")
         for refused in service.refused:
             click.echo(f"Refused {refused['reason']}")
-        click.echo(f"Serving {', '.join(service.models) or 'nothing'} on {url} (API: {url}/docs)")
+        click.echo(f"Serving {', '.join(service.models) or 'nothing'}")
         for name, model in list(service.models.items())[:1]:
             click.echo(
                 f"Try: curl {url}/scenes/{name}/solve -H 'Content-Type: application/json' "

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, f
 from pydantic_core import PydanticCustomError
 
 from palpate.online.serve.errors import Refusal, invalid
-from palpate.online.serve.layout import Accessible, Answers, Mesh
+from palpate.online.serve.layout import Accessible, Answers, Centres, Mesh, Modes
 
 CONVENTIONS = "Units are mm, mN, kPa and s throughout; forces are those of the tissue on the tool."
 """Of every endpoint and of sessions."""
@@ -297,6 +297,7 @@ _ROWS: dict[str, Any] = {
     "value": list[float],
     "estimate": list[float | None],
     "bit": list[Literal[0, 1]],
+    "steps": list[list[Annotated[list[int], _THREE]]],
 }
 
 
@@ -315,6 +316,15 @@ def _document(arrays: Any, **head: Any) -> type[BaseModel]:
 AnswersDocument = _document(Answers)
 MeshDocument = _document(Mesh, region=MeshRegion)
 AccessibleDocument = _document(Accessible)
+CentresDocument = _document(Centres, artifact=str)
+ModesDocument = _document(Modes, model=int, artifact=str)
+
+
+class Ticket(BaseModel):
+    """What opens a session in place of the token."""
+
+    ticket: str | None = Field(description="Null if the service asks for no token.")
+    valid_s: float = Field(description="Seconds that it is valid.")
 
 
 class SceneEntry(BaseModel):
@@ -360,6 +370,7 @@ class SceneSummary(SceneEntry):
         description="What the fields of this scene hold."
     )
     info: dict[str, Any] = Field(description="Training, validation and provenance.")
+    artifact: str = Field(description="SHA-256 of the trained file that is served.")
     example: dict[str, Any] = Field(description="A request that this scene can answer.")
 
 

@@ -11,8 +11,12 @@ reply are followed by what was asked for, without gaps, in this order:
 
 1. ``COORDINATES``: float32 (4, coordinates), mm mN energy norm; a row per local model, zeros where
    `model` is -1;
-2. ``DISPLACEMENT``: (nodes, 3), mm, of the nodes of the surface's mesh;
-3. ``VON_MISES``: (nodes,), kPa;
+2. ``PARTS``: what the displacement of the surface is made of: uint32 m, r, d and 0; int32 (m,),
+   local models; float32 (m, r), mm mN energy norm, their states times weights; int32 (d,), nodes;
+   float32 (d, 3), mm, what the tip's dent adds there. The modes are those of
+   ``/scenes/{name}/modes/{model}``; the past of visco-elastic tissue is in more than four models;
+3. ``DISPLACEMENT``: (nodes, 3), mm, of the nodes of the surface's mesh;
+4. ``VON_MISES``: (nodes,), kPa;
 
 the last two as float32, or as float16 with ``HALF``.
 """
@@ -68,6 +72,7 @@ class Output(_Bits):
     VON_MISES = 4, "von Mises stress of the surface"
     STRESS = 8, "`max_von_mises` and `p99_von_mises`"
     HALF = 16, "fields as float16"
+    PARTS = 32, "what the displacement of the surface is made of"
 
 
 class Flag(_Bits):
@@ -80,6 +85,8 @@ class Flag(_Bits):
     FALLBACK = 16, "no answer there: all is the last good answer's, but the errors are infinite"
     STALLED = 32, "more time than `longest_step` had passed, or less than none; it was cut"
     FIRST = 64, "the first answer of its session: the tissue was at rest before"
+    TOO_DEEP = 128, "not in range: deeper than the model was trained for there"
+    BESIDE = 256, "not in range: the tip presses what lies beyond the rim of the surface"
 
 
 class Reason(IntEnum):
@@ -123,8 +130,8 @@ _Estimate = Annotated[float, "float32", "", "estimated relative error; infinite:
 class Reply(NamedTuple):
     """A reply frame: of each field its type in the frame, its unit and its meaning.
 
-    Arrays are views of the frame. The last three follow the fields, and are None unless they were
-    asked for; of `coordinates` the number stands among the fields.
+    Arrays are views of the frame. The last six and `coordinates` follow the fields, and are None
+    unless they were asked for; of `coordinates` the number stands among the fields.
     """
 
     version: Annotated[int, "uint16", "", "of this layout, 2"]
@@ -165,6 +172,10 @@ class Reply(NamedTuple):
     reason: Annotated[int, "uint32", "", "why `position` is not the one asked for; 0 if it is"]
     displacement: Array | None
     von_mises: Array | None
+    part_models: Array | None
+    part_states: Array | None
+    dented: Array | None
+    dent: Array | None
 
     @property
     def contact(self) -> bool:
@@ -201,7 +212,7 @@ REPLY, _REPLY = _layout(REPLY_FIELDS)
 _OUTPUTS = sum(Output)
 _LARGEST = float(np.finfo(np.float32).max)
 # enumerations are slow to calculate with
-_COORDINATES, _DISPLACEMENT, _VON_MISES, _, _HALF = map(int, Output)
+_COORDINATES, _DISPLACEMENT, _VON_MISES, _, _HALF, _PARTS = map(int, Output)
 _IN_RANGE = int(Flag.IN_RANGE)
 
 
@@ -338,18 +349,28 @@ def decode_reply(frame: bytes) -> Reply:
     if len(frame) < REPLY.itemsize:
         raise FrameError("frame", f"{len(frame)} bytes are too few for a reply")
     head = dict(zip(REPLY.names or (), np.frombuffer(frame, REPLY, 1)[0].item(), strict=True))
-    nodes, kind, end = head["nodes"], "<f2" if head["outputs"] & _HALF else "<f4", REPLY.itemsize
-    for name, bit, dtype, shape in (
-        ("coordinates", _COORDINATES, "<f4", (MODELS, head["coordinates"])),
-        ("displacement", _DISPLACEMENT, kind, (nodes, 3)),
-        ("von_mises", _VON_MISES, kind, (nodes,)),
-    ):
-        head[name] = None
-        if head["outputs"] & bit:
-            start, end = end, end + math.prod(shape) * np.dtype(dtype).itemsize
-            if end > len(frame):
-                raise FrameError("frame", f"{len(frame)} bytes end within {name}")
-            head[name] = np.frombuffer(frame[start:end], dtype).reshape(shape)
+    kind, end = "<f2" if head["outputs"] & _HALF else "<f4", REPLY.itemsize
+    nodes, coordinates = head["nodes"], head["coordinates"]
+
+    def take(name: str, dtype: str, *shape: int) -> Array:
+        nonlocal end
+        start, end = end, end + math.prod(shape) * np.dtype(dtype).itemsize
+        if end > len(frame):
+            raise FrameError("frame", f"{len(frame)} bytes end within {name}")
+        return np.frombuffer(frame[start:end], dtype).reshape(shape)
+
+    head |= dict.fromkeys(Reply._fields[len(REPLY_FIELDS) :]) | {"coordinates": None}
+    if head["outputs"] & _COORDINATES:
+        head["coordinates"] = take("coordinates", "<f4", MODELS, coordinates)
+    if head["outputs"] & _PARTS:
+        m, r, d, _ = take("parts", "<u4", 4).tolist()
+        head["part_models"] = take("part_models", "<i4", m)
+        head["part_states"] = take("part_states", "<f4", m, r)
+        head["dented"], head["dent"] = take("dented", "<i4", d), take("dent", "<f4", d, 3)
+    if head["outputs"] & _DISPLACEMENT:
+        head["displacement"] = take("displacement", kind, nodes, 3)
+    if head["outputs"] & _VON_MISES:
+        head["von_mises"] = take("von_mises", kind, nodes)
     if end != len(frame):
         raise FrameError("frame", f"{len(frame)} bytes where its fields say {end}")
     return Reply(**head)

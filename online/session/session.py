@@ -262,6 +262,7 @@ class Session:
         model = self._model
         document = {
             "scene": model.name,
+            "artifact": model.seal,
             "tip_radius": model.scene.endoscope.radius,
             "example": {"position": self._served.tip},
             "nodes": len(model.surface_nodes),

@@ -18,6 +18,7 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate.online.session import frames
 from palpate.online.session.frames import REPLY, Extras, Flag, Output, Reason, ToolAnswer
@@ -46,8 +47,10 @@ VOLATILE = ("server_received", "server_sent", "solve_time", "superseded")
 """Fields of a reply that depend on the clock and on the network."""
 
 # enumerations are slow to calculate with
-_CONTACT, _CONVERGED, _IN_RANGE, _CLAMPED, _FALLBACK, _STALLED, _FIRST = map(int, Flag)
-_COORDINATES, _DISPLACEMENT, _VON_MISES, _STRESS, _HALF = map(int, Output)
+_CONTACT, _CONVERGED, _IN_RANGE, _CLAMPED, _FALLBACK, _STALLED, _FIRST, _TOO_DEEP, _BESIDE = map(
+    int, Flag
+)
+_COORDINATES, _DISPLACEMENT, _VON_MISES, _STRESS, _HALF, _PARTS = map(int, Output)
 _SOLVED, _NO_EQUILIBRIUM, _BELOW_SURFACE = map(int, Reason)
 
 
@@ -104,6 +107,8 @@ class ToolTracker:
             flags |= _FALLBACK
         else:
             flags |= _CONVERGED | _IN_RANGE * touch.in_range | _CLAMPED * (self._reached < 1.0)
+            flags |= _TOO_DEEP * ("depth" in touch.out_of_range)
+            flags |= _BESIDE * ("position" in touch.out_of_range)
         if self._past is not None and passed != self._span:
             flags |= _STALLED
         if self._reached == 1.0:
@@ -157,7 +162,8 @@ def recover(model: ReducedModel, touch: Answer, outputs: int) -> Extras:
     if not outputs & ~_HALF:
         return frames.NO_EXTRAS
     kind = np.float16 if outputs & _HALF else np.float32
-    surface, fields = model.surface_nodes, []
+    surface = model.surface_nodes
+    fields: list[NDArray[Any]] = []
     coordinates, nodes = 0, len(surface) if outputs & (_DISPLACEMENT | _VON_MISES) else 0
     largest = percentile = 0.0
     if outputs & _COORDINATES:
@@ -167,6 +173,10 @@ def recover(model: ReducedModel, touch: Answer, outputs: int) -> Extras:
         for row, state in zip(rows, states, strict=False):
             row[:] = state
         fields.append(rows)
+    if outputs & _PARTS:
+        made = model.composition(touch)
+        counts = np.array([*made.states.shape, len(made.dented), 0], np.uint32)
+        fields += [counts, *made]
     if outputs & (_DISPLACEMENT | _VON_MISES | _STRESS):
         everywhere = model.displacement(touch)
     if outputs & _DISPLACEMENT:

@@ -8,6 +8,7 @@ import numpy as np
 
 from palpate.shared.answer import Answer, Answers
 from palpate.shared.errors import QueryError
+from palpate.shared.fields import Composition
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH
 from palpate.shared.query import ABSURD, rows
@@ -52,7 +53,8 @@ class FakeModel:
     deepest = 1.5
     stride = np.inf
     has_tip = True
-    models = SimpleNamespace(viscous=None)
+    models = SimpleNamespace(viscous=None, region=np.zeros(4, int), centres=np.zeros((4, 3)))
+    seal = "5ea1"
 
     def __init__(
         self, name: str = "toy", divisions: int = 10, in_time: bool = False, **changes: Any
@@ -159,6 +161,7 @@ class FakeModel:
             converged=converged,
             iterations=1,
             in_range=depth <= DEEPEST_TRAINED,
+            out_of_range=("depth",) * (depth > DEEPEST_TRAINED),
             error_displacement=0.001,
             error_von_mises=0.002,
             error_force=0.003,
@@ -195,6 +198,16 @@ class FakeModel:
     def displacement(self, answer: Answer, region: str = "all") -> np.ndarray:
         moved = -max(answer.depth, 0.0) * UP if answer.tip else answer.contact_displacement
         return self._field(moved, answer, region)
+
+    def surface_modes(self, number: int) -> np.ndarray:
+        x, y, _ = self.nodes[self.surface_nodes].T
+        return np.stack([np.outer(x, UP), np.outer(y, UP)], axis=1).astype(np.float32)
+
+    def composition(self, answer: Answer) -> Composition:
+        states = np.array([q for _, _, q in answer.parts], np.float32).reshape(-1, 2)
+        moved = self.displacement(answer, "surface")
+        models = np.full(len(states), 3, np.int32)
+        return Composition(models, states, np.arange(len(moved), dtype=np.int32), moved)
 
     def peaks(self, answer: Answer, displacement: np.ndarray) -> tuple[float, float]:
         stress = self.von_mises(answer)

@@ -228,3 +228,30 @@ def test_under_the_tip_the_surface_has_its_dent(atlas):
     node = np.argmin(np.linalg.norm(atlas.nodes - top, axis=1))
     assert atlas.displacement(found)[node, 2] == pytest.approx(-0.2, rel=0.03)
     assert atlas.fields.of_mesh(found)[node, 2] > -0.15
+
+
+def made_again(model, answer):
+    """Return the displacement of the surface, made of what it says it is made of."""
+    models, states, dented, dent = model.composition(answer)
+    displacement = np.zeros((len(model.surface_nodes), 3))
+    for number, state in zip(models.tolist(), states, strict=True):
+        displacement += np.einsum("srx,r->sx", model.surface_modes(number), state)
+    displacement[dented] += dent
+    return displacement
+
+
+def test_the_surface_is_made_of_local_models_and_the_dent(atlas, visco_atlas):
+    """At once, and in time, where it holds what is left behind far from the tip as well."""
+    radius = atlas.scene.endoscope.radius
+    tip = [5.0, 4.2, 8.0 + radius - 0.5]
+    answers = [(atlas, atlas.touch(tip)), (atlas, atlas.press([5.0, 5.0, 8.0], 1.0))]
+    past = REST
+    for x in np.linspace(2.0, 8.0, 13):
+        answer = visco_atlas.touch([x, *tip[1:]], past=past, dt=0.02)
+        past = answer.past
+    assert len(visco_atlas.composition(answer).models) > len(answer.parts)
+    for model, found in (*answers, (visco_atlas, answer)):
+        assert found.converged
+        displacement = model.displacement(found, "surface")
+        largest = np.abs(displacement).max()
+        assert np.abs(made_again(model, found) - displacement).max() < 1e-5 * largest

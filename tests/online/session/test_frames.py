@@ -127,6 +127,25 @@ def test_a_reply_cut_short_is_refused(rng):
         frames.decode_reply(frame + b"x")
 
 
+def test_what_a_displacement_is_made_of_comes_back(rng):
+    states, dent = rng.random((2, 5), np.float32), rng.random((3, 3), np.float32)
+    models, dented = np.array([7, 4], np.int32), np.array([1, 2, 9], np.int32)
+    counts = np.array([2, 5, 3, 0], np.uint32)
+    stress = rng.random(11, np.float32).astype(np.float16)
+    outputs = Output.PARTS | Output.VON_MISES | Output.HALF
+    extras = Extras(outputs, nodes=11, fields=[counts, models, states, dented, dent, stress])
+    frame = frames.encode_reply(REQUEST, step(), extras)
+    reply = frames.decode_reply(frame)
+    for found, sent in (
+        (reply.part_models, models), (reply.part_states, states), (reply.dented, dented),
+        (reply.dent, dent), (reply.von_mises, stress),
+    ):  # fmt: skip
+        np.testing.assert_array_equal(found, sent)
+    assert reply.displacement is None
+    with pytest.raises(FrameError, match="within part_models"):
+        frames.decode_reply(frame[: frames.REPLY.itemsize + 18])
+
+
 def test_the_protocol_has_the_layout():
     """``python -m palpate.online.session.frames`` writes it."""
     told = frames.layout()["reply"]["fields"]

@@ -1,0 +1,227 @@
+"""The page in a browser without a window, as its user meets it."""
+
+import json
+import signal
+import socket
+import time
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from palpate.online.client.session import Session
+
+pytestmark = pytest.mark.service
+
+MIDDLE = 480, 330
+"""Where the tissue is seen on a page of 1280 x 720."""
+
+OPENED = "window.palpate?.session?.reader && palpate.readings.drawn.length > 0"
+
+
+def press(tab, x, y):
+    tab.mouse("moved", x, y)
+    tab.mouse("pressed", x, y, button="left", buttons=1, clickCount=1)
+
+
+def release(tab, x, y):
+    tab.mouse("released", x, y, button="left", clickCount=1)
+
+
+@pytest.fixture(scope="module")
+def tab(new_tab):
+    return new_tab()
+
+
+@pytest.fixture
+def page(tab, server):
+    """Return a tab in which the quick scene has just been opened."""
+    tab.open("about:blank")
+    tab.open(server.url)
+    tab.wait(OPENED)
+    return tab
+
+
+def test_it_is_up_in_two_seconds_without_complaints_and_asks_nobody_else(page, server):
+    assert page.run("palpate.opened") < 2.0
+    for address in page.requests:
+        assert address.startswith((server.url, server.url.replace("http:", "ws:"))), address
+    assert page.complaints == []
+    assert page.run("document.getElementById('link').textContent") == "connected"
+    # colours of some pixels, read before they are shown
+    different = page.run("""(() => {
+        const { view } = palpate, { gl, canvas } = view;
+        palpate.draw();
+        const pixels = new Uint8Array(4 * canvas.width * canvas.height);
+        gl.readPixels(0, 0, canvas.width, canvas.height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+        return new Set(new Uint32Array(pixels.buffer)).size;
+    })()""")
+    assert different > 100
+    assert not page.run("palpate.view.gl.isContextLost()")
+    assert page.run("palpate.view.gl.getError()") == 0
+
+
+COMPARE = """async (positions) => {
+    const base = document.querySelector("script[type=module]").src.replace("main.js", "");
+    const { Session } = await import(base + "session.js");
+    const { view } = palpate;
+    let answered = null;
+    const session = new Session(palpate.name, {
+        greeting: () => {}, state: () => {}, reply: (reply) => answered(reply),
+    });
+    while (!session.ready) await new Promise((done) => setTimeout(done, 5));
+    const found = [];
+    for (const position of positions) {
+        const reply = await new Promise((resolve) => {
+            answered = resolve;
+            session.send(position, ["PARTS", "DISPLACEMENT"]);
+        });
+        const models = [...reply.parts.models];
+        for (const k of models) await palpate.fetchModes(k);
+        view.showParts(reply.parts);
+        palpate.compare(view.readBack(), reply.displacement);
+        found.push([palpate.compared, models.length, reply.CONTACT]);
+    }
+    session.close();
+    return found;
+}"""
+
+
+def test_the_shader_makes_the_servers_displacement(page, atlas, rng):
+    """At contacts all over the surface, so that local models come and go."""
+    radius = atlas.scene.endoscope.radius
+    at = rng.integers(len(atlas.surface.vertices), size=50)
+    depth = rng.uniform(0.2, 1.0, 50) * atlas.limits[at, 2]
+    away = (radius - depth)[:, None] * atlas.surface.normals[at]
+    positions = (atlas.surface.vertices[at] + away).tolist()
+    found = np.array(page.run(f"({COMPARE})({json.dumps(positions)})"), float)
+    assert len(found) == 50
+    assert found[:, 2].all()
+    assert found[:, 0].max() < 1e-3, found[:, 0].max()
+    assert found[:, 1].max() > 1
+
+
+def test_a_drag_feels_what_a_session_feels_at_the_same_positions(page, server):
+    x, y = MIDDLE
+    press(page, x, y)
+    page.wait("palpate.answer?.CONTACT && palpate.tool.now === palpate.tool.level")
+    for step in range(1, 11):
+        page.mouse("moved", x + 6 * step, y, button="left", buttons=1)
+        page.wait(f"palpate.tool.cursor[0] > {2 * (x + 6 * step - 1) / 960 - 1}")
+        time.sleep(0.02)
+    release(page, x + 60, y)
+    page.wait("palpate.tool.now < -0.9 && !palpate.answer.CONTACT")
+    log = page.run("palpate.log")
+    assert len(log) > 12
+    assert sum(np.linalg.norm(entry["force"]) > 0 for entry in log) > 10
+    with Session(server.url, "quick") as session:
+        for entry in log:
+            reply = session.step(entry["asked"])
+            np.testing.assert_allclose(entry["force"], reply.force, rtol=1e-9, atol=1e-9)
+            np.testing.assert_array_equal(entry["position"], reply.position)
+
+
+def test_the_wheel_presses_deeper_and_the_lamp_says_what_is_wrong(page):
+    x, y = MIDDLE
+    press(page, x, y)
+    page.wait("palpate.answer?.CONTACT")
+    force = page.run("palpate.answer.force")
+    for _ in range(40):
+        page.mouse("wheel", x, y, deltaX=0, deltaY=-100)
+    page.wait("palpate.answer.TOO_DEEP")
+    page.wait("document.getElementById('lamp').dataset.state === 'doubt'")
+    assert "Out of range: depth" in page.run("document.getElementById('trust').textContent")
+    assert np.linalg.norm(page.run("palpate.answer.force")) > np.linalg.norm(force)
+    assert "unknown" in page.run("document.getElementById('force').textContent")
+    release(page, x, y)
+
+
+def test_a_drag_beside_the_tissue_turns_it_and_the_address_says_how(page):
+    before = page.run("palpate.camera.yaw")
+    page.mouse("pressed", 60, 600, button="left", buttons=1, clickCount=1)
+    page.mouse("moved", 160, 600, button="left", buttons=1)
+    release(page, 160, 600)
+    page.wait(f"palpate.camera.yaw < {before} - 0.1")
+    page.wait("location.hash.includes('view=')")
+    view, address = page.run("palpate.camera.toText()"), page.run("location.href")
+    page.open("about:blank")
+    page.open(address)
+    page.wait(OPENED)
+    assert page.run("palpate.camera.toText()") == view
+
+
+def test_keys_turn_zoom_and_press(page):
+    page.run("document.getElementById('canvas').focus()")
+
+    def key(name):
+        page.call("Input.dispatchKeyEvent", type="keyDown", key=name)
+        page.call("Input.dispatchKeyEvent", type="keyUp", key=name)
+
+    yaw, distance = page.run("palpate.camera.yaw"), page.run("palpate.camera.distance")
+    key("ArrowLeft")
+    key("+")
+    assert page.run("palpate.camera.yaw") != yaw
+    assert page.run("palpate.camera.distance") < distance
+    key("Enter")
+    page.wait("palpate.answer?.CONTACT")
+    key("Enter")
+    page.wait("!palpate.answer.CONTACT")
+
+
+def test_a_hidden_page_sends_nothing(page):
+    press(page, *MIDDLE)
+    page.wait("palpate.answer?.CONTACT")
+    page.run("Object.defineProperty(document, 'hidden', { configurable: true, get: () => true })")
+    page.wait("palpate.session.ready")
+    sent = page.run("palpate.session.sequence")
+    page.mouse("moved", MIDDLE[0] + 20, MIDDLE[1], button="left", buttons=1)
+    time.sleep(0.3)
+    assert page.run("palpate.session.sequence") == sent
+    page.run("delete document.hidden")
+    page.wait(f"palpate.session.sequence > {sent}")
+    release(page, *MIDDLE)
+
+
+def test_it_comes_back_when_the_service_does(tab, serve, artifact):
+    with closing(socket.create_server(("127.0.0.1", 0))) as free:
+        port = str(free.getsockname()[1])
+    with serve(artifact.parent, "--port", port) as server:
+        tab.open(server.url)
+        tab.wait(OPENED)
+        tab.run("window.same = true")
+        server.stop(signal.SIGKILL)
+        tab.wait("document.getElementById('message').textContent.includes('Trying again')")
+    with serve(artifact.parent, "--port", port):
+        tab.wait("palpate.session.reader")
+        tab.wait("document.getElementById('link').textContent === 'connected'")
+        assert tab.run("document.getElementById('message').hidden")
+        press(tab, *MIDDLE)
+        tab.wait("palpate.answer?.CONTACT")
+        release(tab, *MIDDLE)
+        assert tab.run("window.same")
+
+
+def test_a_scene_that_is_not_served_is_told(tab, server):
+    tab.open("about:blank")
+    tab.open(f"{server.url}/#scene=nowhere")
+    tab.wait("document.getElementById('message').textContent.includes('No such scene')")
+
+
+def test_without_webgl_it_says_what_to_do(new_tab, server):
+    tab = new_tab()
+    tab.call(
+        "Page.addScriptToEvaluateOnNewDocument",
+        source="HTMLCanvasElement.prototype.getContext = () => null",
+    )
+    tab.open(server.url)
+    tab.wait("document.getElementById('message').textContent.includes('hardware acceleration')")
+
+
+def test_the_endpoints_are_described_without_another_host(tab, server):
+    tab.open(f"{server.url}/docs")
+    tab.wait("document.querySelectorAll('details').length > 10")
+    text = tab.run("document.body.textContent")
+    for words in ("/scenes/{name}/solve", "contacts", "pressure_limit", "Offset", "kPa"):
+        assert words.lower() in text.lower(), words
+    assert all(address.startswith(server.url) for address in tab.requests)
+    assert tab.complaints == []
