@@ -55,6 +55,22 @@ class Answer(NamedTuple):
     time: float = 0.0  # s, since rest, of tissue with a past
     past: Past | None = None  # to go on from; the one before if this answer did not converge
     active: tuple[tuple[int, float, Local], ...] = ()  # with a past: local models and theirs
+    stiffness: float = 1.0  # Young's modulus over that of the training
+
+    def stiffened(self, ratio: float) -> "Answer":
+        """Answer of tissue so many times as stiff as the training's, which moves as far.
+
+        Forces and stresses go with Young's modulus at a given Poisson's ratio; what the fields and
+        the next step are made of, ``parts``, ``footprint`` and ``past``, is the training's.
+        """
+        return self._replace(
+            force=ratio * self.force,
+            tangent=ratio * self.tangent,
+            energy=ratio * self.energy,
+            pressure=ratio * self.pressure,
+            pressure_limit=ratio * self.pressure_limit,
+            stiffness=ratio,
+        )
 
 
 class Answers(NamedTuple):

@@ -117,11 +117,12 @@ class FieldRecovery:
         stress = self._stress.von_mises(displacement, self._remembered(answer), answer.footprint)
         # an answer that did not converge may be beyond single precision
         with np.errstate(over="ignore"):
-            return stress.astype(np.float32)
+            return (answer.stiffness * stress).astype(np.float32)
 
     def peaks(self, answer: Answer, displacement: Field) -> tuple[float, float]:
         """Largest stress and 99th percentile (kPa) of an answer; see ``StressField.peaks``."""
-        return self._stress.peaks(displacement, self._remembered(answer), answer.footprint)
+        found = self._stress.peaks(displacement, self._remembered(answer), answer.footprint)
+        return answer.stiffness * found[0], answer.stiffness * found[1]
 
     def _remembered(self, answer: Answer) -> Array | None:
         """``B`` of ``mechanics.viscosity`` (e, 6, 8) at the points of all elements, of a past."""

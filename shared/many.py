@@ -19,7 +19,7 @@ from palpate.shared.answer import Answers
 from palpate.shared.arrays import Array, Flags
 from palpate.shared.compiled import room
 from palpate.shared.mechanics import newton
-from palpate.shared.query import ABSURD, load_beyond, refuse_rows, rows, tip_beyond
+from palpate.shared.query import ABSURD, load_beyond, refuse_rows, rows, stiffness, tip_beyond
 from palpate.shared.reduced.features import UNFITTED
 from palpate.shared.reduced.many import Found, press_many, touch_many
 
@@ -36,6 +36,7 @@ def solve(
     positions: ArrayLike,
     pressures: ArrayLike,
     directions: ArrayLike | None,
+    young: float | None,
     threads: int | None,
 ) -> Answers:
     """Answer pressed footprints.
@@ -46,6 +47,8 @@ def solve(
     pressures : array_like, shape (n,), kPa
     directions : array_like, shape (n, 3), or None
         None for the inward normals.
+    young : float or None
+        Of all, kPa; see ``ReducedModel.press``.
     threads : int or None
         None for one on each core.
 
@@ -56,8 +59,10 @@ def solve(
     """
     at, endoscope = rows("positions", positions, 3), model.scene.endoscope
     pressed = rows("pressures", pressures, 1, len(at))[:, 0]
-    most = ABSURD * model.pressure_max
+    ratio = stiffness(model.scene.tissue.young, young)
+    most = ratio * ABSURD * model.pressure_max
     refuse_rows("pressures", (pressed < 0) | (pressed > most), f"must be 0 to {most:.3g} kPa")
+    pressed = pressed / ratio
     towards = np.zeros_like(at)
     if directions is not None:
         towards = 0.5 * rows("directions", directions, 3, len(at))  # as in ``checked_load``
@@ -75,11 +80,15 @@ def solve(
     refuse_rows("directions", ~(found.tilt < 90.0), "must point into the tissue")
     above = np.sum((at - found.point) * found.normal, axis=1)
     beyond = load_beyond(endoscope, above, found.distance, found.tilt, pressed, found.limit)
-    return _answers(found, beyond)._replace(error_force=np.zeros(len(at)))
+    answers = _answers(found, beyond, ratio)
+    return answers._replace(limit=ratio * found.limit, error_force=np.zeros(len(at)))
 
 
-def touch(model: ReducedModel, positions: ArrayLike, threads: int | None) -> Answers:
+def touch(
+    model: ReducedModel, positions: ArrayLike, young: float | None, threads: int | None
+) -> Answers:
     """Answer positions (n, 3) mm of the rigid tip; see ``solve``."""
+    ratio = stiffness(model.scene.tissue.young, young)
     at, radius = rows("positions", positions, 3), model.body.tip.radius
 
     def work(own: Workspace, found: Found, part: slice) -> None:
@@ -90,7 +99,7 @@ def touch(model: ReducedModel, positions: ArrayLike, threads: int | None) -> Ans
     refuse_rows("positions", found.depth > radius, below)
     near = found.depth > 0.0
     beyond = tip_beyond(found.beside, found.barred, near, found.depth, found.limit)
-    return _answers(found, beyond)
+    return _answers(found, beyond, ratio)
 
 
 def _fitted(coefficients: Array | None) -> Array:
@@ -120,8 +129,11 @@ def _in_threads(
     return found
 
 
-def _answers(found: Found, beyond: Mapping[str, Flags]) -> Answers:
-    """Answers of what was found; errors of those beyond the range in a field are not known."""
+def _answers(found: Found, beyond: Mapping[str, Flags], ratio: float) -> Answers:
+    """Answers of what was found in tissue so many times as stiff.
+
+    Errors of those beyond the range in a field are not known.
+    """
     outside = np.any(list(beyond.values()), axis=0)
     converged = found.status == newton.CONVERGED
     found.errors[outside | ~converged] = np.inf
@@ -129,7 +141,7 @@ def _answers(found: Found, beyond: Mapping[str, Flags]) -> Answers:
         contact_point=found.point,
         normal=found.normal,
         distance=found.distance,
-        force=found.force,
+        force=ratio * found.force,
         converged=converged,
         iterations=found.iterations.astype(np.int64),
         in_range=~outside,

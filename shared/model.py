@@ -30,7 +30,14 @@ from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH
 from palpate.shared.mechanics.tip import EDGE_FIELD, dented, held
 from palpate.shared.near_field import Contact
-from palpate.shared.query import check_place, checked_load, out_of_range, tip_beyond, vector
+from palpate.shared.query import (
+    check_place,
+    checked_load,
+    out_of_range,
+    stiffness,
+    tip_beyond,
+    vector,
+)
 from palpate.shared.reduced import press, touch
 from palpate.shared.reduced.features import UNFITTED, near_rim, total_errors
 from palpate.shared.reduced.outcome import Outcome
@@ -209,6 +216,7 @@ class ReducedModel:
         direction: ArrayLike | None = None,
         radius: float | None = None,
         *,
+        young: float | None = None,
         past: Past | None = None,
         dt: float = 0.0,
         warm: Warm | None = None,
@@ -226,6 +234,9 @@ class ReducedModel:
             Of the load; the inward normal if absent.
         radius : float, optional
             Of the footprint, mm; the scene's if absent.
+        young : float, optional
+            Young's modulus of the tissue, kPa; the scene's if absent.  Exact, since stresses of all
+            laws go with it: tissue twice as stiff moves as far under twice the load.
         past : Past, optional
             What visco-elastic tissue remembers; ``REST`` is nothing.  Without it the tissue answers
             at once.  It is not changed.
@@ -249,9 +260,11 @@ class ReducedModel:
         lifted = position is None
         if position is None:
             position, pressure = self.surface.vertices[0] if last is None else last, 0.0
+        ratio = stiffness(self.scene.tissue.young, young)
         at, towards, radius = checked_load(
-            self.scene.endoscope, self.pressure_max, position, pressure, direction, radius
+            self.scene.endoscope, ratio * self.pressure_max, position, pressure, direction, radius
         )
+        pressure = float(pressure) / ratio
         own = self._memory(False, warm, past, dt)
         press.place(own.solver, at, towards)
         check_place(self.scene.endoscope, self.surface, own.outcome)
@@ -260,7 +273,7 @@ class ReducedModel:
         if past is not None:
             own.begin_step(self.scene.tissue.prony, dt)
             moves = self.transfer.begin(own, answering, past)
-        press.press(own.solver, float(pressure), radius)
+        press.press(own.solver, pressure, radius)
         found = own.outcome
         outside = out_of_range(self.scene.endoscope, at, found, pressure, radius)
         after: Past | None = None
@@ -276,7 +289,7 @@ class ReducedModel:
         unknown = bool(outside) or not converged
         reduction = _UNKNOWN if unknown else found.errors.copy()
         total, mesh = _total(reduction, self.estimators.mesh, pressure, found)
-        return Answer(
+        answer = Answer(
             contact_point=found.foot.copy(),
             normal=found.upward.copy(),
             distance=found.distance.item(),
@@ -309,11 +322,13 @@ class ReducedModel:
             active=active,
             solve_seconds=time.perf_counter() - started,
         )
+        return answer if ratio == 1.0 else answer.stiffened(ratio)
 
     def touch(
         self,
         position: ArrayLike,
         *,
+        young: float | None = None,
         past: Past | None = None,
         dt: float = 0.0,
         warm: Warm | None = None,
@@ -324,7 +339,7 @@ class ReducedModel:
         ----------
         position : array_like, shape (3,), mm
             Centre of the tip, outside the body.
-        past, dt, warm
+        young, past, dt, warm
             As in ``press``; the tip moved evenly since the end of the past.
 
         Raises
@@ -333,7 +348,7 @@ class ReducedModel:
             If the position is not finite, or the tip's centre lies below the surface.
         """
         started = time.perf_counter()
-        at = vector("position", position)
+        ratio, at = stiffness(self.scene.tissue.young, young), vector("position", position)
         own = self._memory(True, warm, past, dt)
         touch.place(own.solver, at)
         found, radius = own.outcome, self.body.tip.radius
@@ -380,7 +395,7 @@ class ReducedModel:
         else:
             reduction = _UNKNOWN if outside or not converged else found.errors.copy()
             total, mesh = _total(reduction, self.estimators.mesh_tip, depth, found)
-        return Answer(
+        answer = Answer(
             contact_point=found.point.copy(),
             normal=found.normal.copy(),
             distance=found.distance.item(),
@@ -412,6 +427,7 @@ class ReducedModel:
             active=active,
             solve_seconds=time.perf_counter() - started,
         )
+        return answer if ratio == 1.0 else answer.stiffened(ratio)
 
     def check(
         self,
@@ -419,33 +435,39 @@ class ReducedModel:
         pressure: float,
         direction: ArrayLike | None = None,
         radius: float | None = None,
+        young: float | None = None,
     ) -> tuple[float, tuple[str, ...]]:
         """Largest trained pressure (kPa) for a load, and its fields that are out of range.
 
         See ``press``, which raises the same.
         """
+        ratio = stiffness(self.scene.tissue.young, young)
         at, towards, radius = checked_load(
-            self.scene.endoscope, self.pressure_max, position, pressure, direction, radius
+            self.scene.endoscope, ratio * self.pressure_max, position, pressure, direction, radius
         )
         own = self._memory(False, None, None, 0.0)
         found = own.outcome
         press.place(own.solver, at, towards)
         check_place(self.scene.endoscope, self.surface, found)
-        return found.limit.item(), out_of_range(self.scene.endoscope, at, found, pressure, radius)
+        beyond = out_of_range(self.scene.endoscope, at, found, pressure / ratio, radius)
+        return ratio * found.limit.item(), beyond
 
     def solve_many(
         self,
         positions: ArrayLike,
         pressures: ArrayLike,
         directions: ArrayLike | None = None,
+        young: float | None = None,
         threads: int | None = None,
     ) -> Answers:
         """Answer many loads, each as ``press`` does from rest, on many threads; see ``many``."""
-        return many.solve(self, positions, pressures, directions, threads)
+        return many.solve(self, positions, pressures, directions, young, threads)
 
-    def touch_many(self, positions: ArrayLike, threads: int | None = None) -> Answers:
+    def touch_many(
+        self, positions: ArrayLike, young: float | None = None, threads: int | None = None
+    ) -> Answers:
         """Answer many positions of the tip, each as ``touch`` does from rest; see ``many``."""
-        return many.touch(self, positions, threads)
+        return many.touch(self, positions, young, threads)
 
     def doubts(self, answer: Answer) -> tuple[str, ...]:
         """Why not to trust an answer; nothing for one to be trusted.

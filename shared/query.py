@@ -27,6 +27,26 @@ INWARD = np.zeros(3)
 """Direction that stands for the inward normal."""
 
 
+MOST_YOUNG = 1e6
+"""Largest Young's modulus of a query, kPa; the smallest is its inverse."""
+
+
+def stiffness(trained: float, young: float | None) -> float:
+    """Young's modulus of a query over that of the training, both kPa; None is the latter.
+
+    Raises
+    ------
+    QueryError
+        If it is not that of any tissue.
+    """
+    if young is None:
+        return 1.0
+    if not 1.0 / MOST_YOUNG <= young <= MOST_YOUNG:
+        allowed = f"[{1 / MOST_YOUNG:g}, {MOST_YOUNG:g}] kPa"
+        raise QueryError("young", f"must be in {allowed}, not {young}")
+    return young / trained
+
+
 def checked_load(
     endoscope: Endoscope,
     pressure_max: float,
