@@ -238,6 +238,23 @@ def solve(table: Path | None, out: Path | None, tip: bool, **request: Any) -> Re
     return report
 
 
+@click.command()
+@artifact_argument
+@click.argument("recording", type=TABLE)
+@reporting
+def identify(artifact: Path, recording: Path) -> Report:
+    """Find Young's modulus of tissue from forces measured on a tip that touched it.
+
+    The first line of RECORDING, a CSV file, names its columns: x,y,z (centre of the tip, mm) and
+    force_x,force_y,force_z (mN, on the tool), of tissue that remembers also time (s); others do not
+    matter. The modulus is exact for the tissue law and Poisson's ratio of the ARTIFACT; its
+    interval holds noise of the forces, not errors of the model, of which error_force is the median.
+    """
+    from palpate.offline.identify import identify
+
+    return identify(artifact, recording)
+
+
 def _need(needed: Mapping[str, object], without: Mapping[str, object]) -> None:
     """Refuse options that are missing, and those that make no sense beside the others."""
     for option, value in needed.items():

@@ -33,7 +33,7 @@ def solve_table(artifact: Path, table: Path, out: Path, tip: bool) -> dict[str, 
         If a file cannot be used, or a row makes no sense; it names the line.
     """
     atlas = ReducedModel.load(artifact)
-    names, rows = _read(table)
+    names, rows = read_table(table)
     wanted = (PLACE,) if tip else (PLACE + PRESSURE, PLACE + PRESSURE + DIRECTION)
     if not any(set(names) == set(columns) for columns in wanted):
         ways = " or ".join(",".join(columns) for columns in wanted)
@@ -73,7 +73,7 @@ def solve_table(artifact: Path, table: Path, out: Path, tip: bool) -> dict[str, 
     }
 
 
-def _read(table: Path) -> tuple[list[str], Array]:
+def read_table(table: Path) -> tuple[list[str], Array]:
     """Names of the columns of a CSV file and its numbers (n, columns); empty lines do not count."""
     try:
         with open_regular(table) as file:
