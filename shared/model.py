@@ -28,7 +28,7 @@ from palpate.shared.local_models import (
 )
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH
-from palpate.shared.mechanics.tip import EDGE_FIELD, dented, held
+from palpate.shared.mechanics.tip import EDGE_FIELD, dented, history
 from palpate.shared.near_field import Contact
 from palpate.shared.query import (
     check_place,
@@ -370,7 +370,7 @@ class ReducedModel:
             if past is not None and isinstance(own.past, Remembering):
                 own.begin_step(self.scene.tissue.prony, dt)
                 moves = self.transfer.begin(own, own.answering(), past)
-                law[2:4] = held(self.body.tip, past.dent, own.past.time)
+                law[2], law[5] = history(self.body.tip, past.dent, own.past.time)
             touch.touch(own.solver, at)
             if found.status.item() != touch.ELSEWHERE:
                 break

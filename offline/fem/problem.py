@@ -26,6 +26,7 @@ from palpate.shared.mechanics.tip import (
     bend,
     dented,
     held,
+    history,
     meet_wall,
     tangents_of,
     tip_of,
@@ -159,17 +160,18 @@ class FullProblem:
         return self.body.contact_fields(self.surface)
 
     def tip_at(
-        self, place: Array, centre: Array, normal: Array, *time: float
+        self, place: Array, centre: Array, normal: Array, loss: float = 0.0, past: float = 0.0
     ) -> tuple[TipLoad, Array]:
         """The tip with its centre (3,) mm that touches at a place, and the surface point there.
 
-        It pushes along ``normal`` (3,); ``time`` is ``loss`` and ``held``, see ``tip.held``.
+        It pushes along ``normal`` (3,); for ``loss`` and ``past`` see ``tip.history``.
         """
         x, out, _, at = self.surface.locate(place, self._contact_fields)
         tip, tangents, bent = self.body.tip, np.empty((2, 3)), np.empty((2, 2))
         tangents_of(out, tangents)
         sharpness = bend(at, tangents, tip.radius, bent)
-        law = *tip.local_law(sharpness, at[EDGE_FIELD]), *(time or (0.0, 0.0))
+        beta, relief = tip.local_law(sharpness, at[EDGE_FIELD])
+        law = beta, relief, loss, held(beta, past)
         nodal = np.empty((MEANS, len(self.mesh.nodes)))
         means(self.body.boundary, x, out, tangents, bent, tip.radius, nodal)
         return TipLoad(tip, nodal, tangents, bent, centre - x, normal, law, at[EDGE_FIELD:]), x
@@ -213,10 +215,10 @@ class FullProblem:
     def _settle(self, step: TipPosition, past: Past | None, start: Array | None) -> Equilibrium:
         """Under the tip, where the energy is stationary in the place; see ``mechanics.tip``."""
         weights = step_weights(self.model.prony, step.dt)
-        time = (0.0, 0.0) if past is None else held(self.body.tip, past.dent, weights)
+        time = (0.0, 0.0) if past is None else history(self.body.tip, past.dent, weights)
         known = start if start is not None or past is None else past.displacement
         radius = self.body.tip.radius
-        place, normal = self._nearest(step.position, known)
+        place, normal = self._begin(step.position, known, past.foot if past else None)
         wall, last, largest = np.zeros(3), None, 0.0
         for made in range(MOST_PLACES):
             load, x = self.tip_at(place, step.position, normal, *time)
@@ -246,7 +248,7 @@ class FullProblem:
             if slight or max(np.linalg.norm(moved) / radius, np.linalg.norm(turned)) < NEAREST:
                 exact = self.model.solve(load, past, step.dt, found.displacement).place
                 tangent = (exact or found.place).tangent(barred)
-                return replace(found, tangent=tangent, foot=x)
+                return replace(found, tangent=tangent, foot=x, past=replace(found.past, foot=x))
             wall, last = barred @ load.tangents, (x, normal)
             normal, start = normal + turned, found.displacement
         raise NoEquilibrium("load: the tip finds no place to touch; lower the depth")
@@ -257,9 +259,18 @@ class FullProblem:
         out = centre - foot
         return self.body.tip.radius - float(np.copysign(np.linalg.norm(out), out @ normal))
 
-    def _nearest(self, centre: Array, displacement: Array | None) -> tuple[Array, Array]:
-        """Place whose deformed surface is nearest to the tip, at a displacement; normal there."""
+    def _begin(
+        self, centre: Array, displacement: Array | None, last: Array | None
+    ) -> tuple[Array, Array]:
+        """Where the search for a place begins, at a displacement, and the normal there.
+
+        Where the tip touched last, or where the deformed surface is nearest to it.
+        """
         place, normal, _ = self.surface.project(centre)
+        near = last is not None and np.linalg.norm(last - place) < LONGEST * self.body.tip.radius
+        if last is not None and displacement is not None and near:
+            load, x = self.tip_at(last, centre, normal)
+            return x, load.touch(displacement.ravel()).towards
         for _ in range(MOST_PLACES):
             if displacement is None:
                 break

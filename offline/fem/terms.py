@@ -142,22 +142,26 @@ class TipLoad:
 
     def nearer(self, displacement: Array) -> tuple[Array, Array]:
         """Step (2,) mm towards the place whose deformed surface is nearest; the normal there."""
-        g, H = self._settled(displacement.ravel(), np.zeros((SEEN, SEEN)), 1.0, 0.0)
-        moved, force = np.empty(2), self.touch(displacement.ravel()).towards.copy()
+        rigid, u = np.zeros((SEEN, SEEN)), displacement.ravel()
+        g, H = self._settled(u, rigid, 1.0, 0.0, np.zeros(3))
+        moved, force = np.empty(2), self.touch(u).towards.copy()
         length = next_place(g, H, np.zeros(2), moved)
         share = min(1.0, LONGEST * self.tip.radius / max(length, 1e-12))
         size = pushed(g, H, moved, share, force)
         return share * moved, force / size
 
     def _settled(
-        self, displacement: Array, compliance: Array, force: float, stiffness: float
+        self,
+        displacement: Array,
+        compliance: Array,
+        force: float,
+        stiffness: float,
+        fading: Array,
     ) -> tuple[Array, Array]:
         """See ``tip.settle``."""
         found, u = self.touch(displacement), displacement.reshape(-1, 3)
         one, both, two = self.nodal[3:] @ u @ self.normal
-        g, H, fading = np.empty(SEEN), np.empty((SEEN, SEEN)), np.empty(3)
-        self.tip.fading(self.edge[0], np.array(self.law), force, stiffness, fading)
-        fading *= stiffness > 0.0
+        g, H = np.empty(SEEN), np.empty((SEEN, SEEN))
         settle(
             compliance, force, stiffness, found.gap, self.normal, found.towards,
             self.tangents + self.nodal[1:3] @ u, np.array([[one, both], [both, two]]) - self.bent,
@@ -173,7 +177,9 @@ class TipLoad:
         turned = np.einsum("an,i->nia", self.nodal[1:3], self.normal)
         seen = np.concatenate([means, turned], axis=2).reshape(-1, SEEN)[potential.free]
         compliance = potential.compliance(displacement[potential.free], seen)
-        g, H = self._settled(displacement, compliance, found.force, found.stiffness)
+        fading = np.empty(3)
+        self.tip.fading(self.edge[0], self.law, found.penetration, fading)
+        g, H = self._settled(displacement, compliance, found.force, found.stiffness, fading)
         place = Place(g, H, found.force * found.towards)
         return Reaction(place.pushes, place.tangent(np.zeros(2)), found.penetration, place)
 
@@ -222,6 +228,7 @@ class Past:
     displacement: Array  # (nodes, 3) mm, the last
     points: Array  # (terms + 1, e, q, 6), at quadrature points
     dent: Array = field(default_factory=lambda: np.zeros(1))  # see ``mechanics.tip``
+    foot: Array | None = None  # (3,) mm, where the tip touched last, if it did
 
 
 class PastStress:

@@ -26,7 +26,8 @@ with ``exp(-s / (EDGE R))``, and the energy is ``e(d, s)``: the place lies away 
 of which the force leans.  Blunter edges have a share of the image, see ``geometry.edges``.
 
 Tissue that remembers relaxes: the law's force is its elastic one less what the past takes off it,
-``F = (1 - loss) F_e(d) - held`` (Lee & Radok, J. Appl. Mech. 27 (1960) 438-444).
+``F = (1 - loss) F_e(d) - held`` (Lee & Radok, J. Appl. Mech. 27 (1960) 438-444).  Near an edge it
+leans as that of tissue at rest does, ``de/ds = F (de/ds)_e / F_e``, since all stresses relax alike.
 
 The place ``X`` is where ``c - m(X)`` is normal to the smoothed surface.  It is sought in rounds:
 the body is brought to equilibrium with the force along a given normal ``n`` at a given place, where
@@ -85,6 +86,10 @@ ROUND_OFF = 1e-12
 LEAST_KEPT = 0.1
 """Share of a force that a step to the next place must leave for its prediction to be believed."""
 
+REMEMBERED = 0.6
+"""Power of ``beta`` by which a force is remembered: what the past takes off then changes with the
+place as it does in an energy, as long as ``relief`` does little."""
+
 SEEN = 5
 """Of the body by the contact: three means, and the slopes along the normal of two tangents."""
 
@@ -108,17 +113,26 @@ class Tip(NamedTuple):
         beta = (0.75 * images / self.modulus) ** (2.0 / 3.0) * sharpness ** (1.0 / 3.0)
         return softer * beta, softer * images * RELIEF / (self.modulus * self.radius)
 
-    def fading(self, edge, law, force, stiffness, changes):
-        """Write how the law changes ``edge`` mm away from an edge, at a given penetration.
+    def fading(self, edge, law, d, changes):
+        """Write how the law changes ``edge`` mm away from an edge, at a penetration (mm).
 
         Derivatives ``changes`` (3,) in that distance: of the energy (mN), of the force (mN/mm), and
-        second of the energy (mN/mm).  ``law`` is beta, relief, loss, held; see ``push``.  What a
-        past takes off the force is remembered as a force, of the place where it was, so in time the
-        place does not know of the edge.
+        second of the energy (mN/mm).  ``law`` is beta, relief, loss, held; see ``push``.
         """
-        changes[:] = 0.0
-        if law[2] != 0.0 or law[3] != 0.0:
+        elastic, stiffness, _ = squeeze(law[0], law[1], d)
+        if elastic == 0.0:
+            changes[:] = 0.0
             return
+        energy, change, second = self.faded(edge, law[0], law[1], elastic, stiffness)
+        lean = energy / elastic
+        more = (change - lean * stiffness) / elastic  # of the lean with the penetration
+        force = (1.0 - law[2]) * elastic - law[3]
+        changes[0] = force * lean
+        changes[1] = (1.0 - law[2]) * change - law[3] * more
+        changes[2] = changes[1] * lean + force * (second - lean * change) / elastic
+
+    def faded(self, edge, beta, relief, force, stiffness):
+        """Derivatives as those of ``fading``, of tissue at rest."""
         length, more = EDGE * self.radius, 0.5 * (self.psi - 1.0)
         fade = math.exp(-edge / length)
         images, softer = fade / (1.0 + fade), more * fade / (1.0 + more * fade)
@@ -127,12 +141,11 @@ class Tip(NamedTuple):
         soft = softer * (1.0 - softer)
         bb = (2.0 / 3.0 * images * (1.0 - images) + soft) / length**2
         rr = (images * (1.0 - images) + soft) / length**2
-        dent, eased = law[0] * force ** (2.0 / 3.0), law[1] * force
+        dent, eased = beta * force ** (2.0 / 3.0), relief * force
         shift = b * dent - r * eased  # of the penetration at this force
-        changes[0] = -force * (0.6 * b * dent - 0.5 * r * eased)
-        changes[1] = -shift * stiffness
-        changes[2] = shift**2 * stiffness
-        changes[2] -= force * (0.6 * (b * b + bb) * dent - 0.5 * (r * r + rr) * eased)
+        second = shift**2 * stiffness
+        second -= force * (0.6 * (b * b + bb) * dent - 0.5 * (r * r + rr) * eased)
+        return -force * (0.6 * b * dent - 0.5 * r * eased), -shift * stiffness, second
 
     def image_distance(self, away, share):
         """Distance from a right angle that does as much as one ``away`` mm with a share of it."""
@@ -154,20 +167,26 @@ def plane_modulus(shear: float, bulk: float) -> float:
     return 4.0 * shear * (3.0 * bulk + shear) / (3.0 * bulk + 4.0 * shear)
 
 
-def held(tip: Tip, dent: Array, time: Weights) -> tuple[float, float]:
-    """``loss`` and ``held`` (mN) of the law in a time step.
+def history(tip: Tip, dent: Array, time: Weights) -> tuple[float, float]:
+    """``loss`` of the law in a time step, and its past, of which it is ``held`` at a place.
 
-    ``dent`` (terms + 1,) mN is what it remembers: the means over the past of its elastic force, and
-    the last; of tissue at rest (1,) will do.
+    ``dent`` (terms + 1,) is what it remembers: the means over the past of its elastic force, and
+    the last, times ``beta ** REMEMBERED``; of tissue at rest (1,) will do.
     """
     share = tip.lost * time.share
     return float(share @ time.new), float(share @ _kept(dent, time))
 
 
+@njit(cache=True, error_model="numpy", nogil=True)
+def held(beta, past):
+    """Force (mN) that the past takes off; see ``history``."""
+    return past * beta**-REMEMBERED
+
+
 def dented(dent: Array, time: Weights, law: Iterable[float], force: float) -> Array:
-    """What the law (..., loss, held) remembers after a step that ends with a force (mN)."""
-    *_, loss, held = law
-    elastic = (force + held) / (1.0 - loss)
+    """What the law (beta, relief, loss, held) remembers after a step that ends with a force."""
+    beta, _, loss, held = law
+    elastic = (force + held) / (1.0 - loss) * beta**REMEMBERED
     return np.append(_kept(dent, time) + time.new * elastic, elastic)
 
 
@@ -362,7 +381,8 @@ def next_place(g, H, wall, moved):
 
     ``wall`` (2,) points out of the surface where the place lies on its rim, and is zero elsewhere:
     where the energy, largest at the place sought, grows that way a step goes along the rim.  It is
-    zeroed where it does not bar.
+    zeroed where it does not bar; a step out of the surface all the same, as where the energy curves
+    upwards, is turned round.
     """
     a, b, c = H[0, 0], 0.5 * (H[0, 1] + H[1, 0]), H[1, 1]
     det = a * c - b * b
@@ -373,6 +393,8 @@ def next_place(g, H, wall, moved):
         along = -(g[0] * x + g[1] * y) / (a * x * x + 2.0 * b * x * y + c * y * y)
         moved[0], moved[1] = along * x, along * y
     else:
+        if moved[0] * wall[0] + moved[1] * wall[1] > 0.0:
+            moved *= -1.0
         wall[:] = 0.0
     return math.sqrt(moved[0] ** 2 + moved[1] ** 2)
 

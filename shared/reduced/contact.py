@@ -11,7 +11,7 @@ from numba import njit
 from palpate.shared.compiled import bind_compiled
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, means
-from palpate.shared.mechanics.tip import EDGE_FIELD, bend, settle, squeeze, tangents_of
+from palpate.shared.mechanics.tip import EDGE_FIELD, bend, held, settle, squeeze, tangents_of
 from palpate.shared.reduced.blend import MAX_ACTIVE
 from palpate.shared.reduced.corrections import Secants, TouchedSecants, forget_secants
 from palpate.shared.reduced.points import superpose
@@ -53,6 +53,7 @@ def press_at_place(solver, x, sure):
     contact.law[0], contact.law[1] = solver.tip.local_law(
         sharpness, outcome.limits[LIMIT_FIELDS + EDGE_FIELD]
     )
+    contact.law[3] = held(contact.law[0], contact.law[5])
     contact.law[4] = radius
     for i in range(3):
         contact.away[i] = x[i] - outcome.foot[i]
@@ -245,7 +246,7 @@ def _look(solver, k, slot):
     for s in range(len(seen)):
         superpose(solver.warm.inverse[slot], seen[s], tip.answered[s])
     law, found, edge = contact.law, contact.found, outcome.limits[LIMIT_FIELDS + EDGE_FIELD :]
-    solver.tip.fading(edge[0], law, found[0], found[1], contact.fading)
+    solver.tip.fading(edge[0], law, found[2], contact.fading)
     for a in range(2):
         tip.inwards[a] = np.dot(tip.tangents[a], edge[1:4])
     settle(

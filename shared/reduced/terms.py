@@ -30,7 +30,7 @@ class Contact(NamedTuple):
     normal: Annotated[Array, "3"]  # along which the tip pushes
     along: Annotated[Array, "r"]  # the mean's component along that
     away: Annotated[Array, "3"]  # mm, from the place at rest to the tip's centre
-    law: Annotated[Array, "5"]  # beta, relief, loss, held; penetration (mm) of tissue at rest
+    law: Annotated[Array, "6"]  # beta, relief, loss, held; penetration (mm) of tissue at rest, past
     found: Annotated[Array, "3"]  # force, stiffness, penetration of the last state
     fading: Annotated[Array, "3"]  # see ``Tip.fading``
 

@@ -76,7 +76,7 @@ class Past(NamedTuple):
         Of the error estimate so far, see ``estimate_history``.
     tip : bool
         Whether it is of the rigid tip; loads do not go on from there.
-    dent : ndarray, shape (terms + 1,), mN
+    dent : ndarray, shape (terms + 1,)
         What the tip's law remembers; see ``mechanics.tip``.
     """
 
