@@ -118,16 +118,18 @@ class Client:
         radius: float | None = None,
         outputs: Sequence[str] = ("displacement", "von_mises"),
         region: str = "none",
+        young: float | None = None,
     ) -> Answer:
         """Press the tissue at a position (mm) with a pressure (kPa).
 
         The direction is by default the inward normal, the radius (mm) the scene's. `outputs` are
         the fields to return, for the nodes of `region`: ``none``, ``surface`` or ``all``; with
-        ``peak`` among them the answer has the largest values of the whole body as well.
+        ``peak`` among them the answer has the largest values of the whole body as well. The
+        tissue has the scene's Young's modulus unless `young` (kPa) is given, here and below.
         Raises `ServiceError` if the service refuses.
         """
         contact = _contact(position, pressure, direction, radius)
-        asked = {"contacts": [contact], "outputs": list(outputs), "region": region}
+        asked = {"contacts": [contact], "outputs": list(outputs), "region": region, "young": young}
         head, fields = self._document("POST", name, "/solve", json.dumps(asked).encode())
         return _answer(head, **fields)
 
@@ -137,6 +139,7 @@ class Client:
         steps: Sequence[tuple[float, Sequence[float] | None, float]],
         outputs: Sequence[str] = ("displacement", "von_mises"),
         region: str = "none",
+        young: float | None = None,
     ) -> list[Answer]:
         """Press visco-elastic tissue over time: times (s), positions (mm) and pressures (kPa).
 
@@ -149,6 +152,7 @@ class Client:
             ],
             "outputs": list(outputs),
             "region": region,
+            "young": young,
         }
         head, fields = self._document("POST", name, "/history", json.dumps(asked).encode())
         *before, last = head["steps"]
@@ -160,18 +164,26 @@ class Client:
         positions: ArrayLike,
         pressures: ArrayLike,
         directions: ArrayLike | None = None,
+        young: float | None = None,
     ) -> Answers:
         """Press with many loads: positions (n, 3) mm, pressures (n,) kPa, directions (n, 3)."""
         asked = {"positions": positions, "pressures": pressures, "directions": directions}
-        return self._many(name, "/solve-many", asked)
+        return self._many(name, "/solve-many", asked, young)
 
-    def touch(self, name: str, positions: ArrayLike) -> Answers:
+    def touch(self, name: str, positions: ArrayLike, young: float | None = None) -> Answers:
         """Touch with the rigid tip at many positions (n, 3) mm of its centre, each from rest."""
-        return self._many(name, "/touch", {"positions": positions})
+        return self._many(name, "/touch", {"positions": positions}, young)
 
-    def _many(self, name: str, rest: str, asked: Mapping[str, ArrayLike | None]) -> Answers:
+    def _many(
+        self,
+        name: str,
+        rest: str,
+        asked: Mapping[str, ArrayLike | None],
+        young: float | None,
+    ) -> Answers:
         given = {key: np.array(rows, float) for key, rows in asked.items() if rows is not None}
-        found = self._document("POST", name, rest, layout.encode({}, given), BINARY)[1]
+        body = layout.encode({"young": young}, given)
+        found = self._document("POST", name, rest, body, BINARY)[1]
         return Answers(**found)
 
     def session(self, name: str, record: Path | None = None, reconnect: float = 0.0) -> Session:

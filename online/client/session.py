@@ -352,16 +352,20 @@ class Session:
         """Go back to a state that was kept; see `snapshot`."""
         self._command("restore", number)
 
-    def _command(self, name: str, number: int) -> None:
+    def young(self, young: float) -> None:
+        """Give the tissue another Young's modulus, kPa, from the next position on."""
+        self._command("young", float(young))
+
+    def _command(self, name: str, value: float) -> None:
         """Send a command and wait until the service confirms it by echoing it."""
-        command = {name: number}
+        command = {name: value}
         self._connection.send(json.dumps(command))
         while isinstance(message := self._connection.receive(), bytes) or (
             json.loads(message) != command
         ):
             self._decoded(message)
         if self._recorder is not None:
-            self._recorder.obeyed(name == "restore", number)
+            self._recorder.obeyed(name, value)
 
     def _decoded(self, message: str | bytes) -> Reply:
         """Read a reply, or raise the error that the service sent instead."""

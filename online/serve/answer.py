@@ -47,7 +47,7 @@ def answer(
     if isinstance(request, HistoryRequest):
         answers = _follow(model, request)
     else:
-        answers = [_press(model, request.contacts[0], "contacts.0")]
+        answers = [_press(model, request.contacts[0], "contacts.0", young=request.young)]
     solved = perf_counter()
     fields, more = _recover(model, answers[-1], request)
     recovered = perf_counter()
@@ -70,16 +70,17 @@ def _follow(model: ReducedModel, request: HistoryRequest) -> list[Answer]:
         raise Refusal("no_time", "name", "The tissue of this scene is elastic; ask it to solve")
     warm, now, answers = model.new_warm(), 0.0, [Answer(past=REST)]
     for number, step in enumerate(request.steps):
-        time = {"past": answers[-1].past, "dt": step.time - now, "warm": warm}
-        answers.append(_press(model, step.contact, f"steps.{number}.contact", **time))
+        more = {"young": request.young, "past": answers[-1].past, "dt": step.time - now}
+        contact = f"steps.{number}.contact"
+        answers.append(_press(model, step.contact, contact, warm=warm, **more))
         now = step.time
     return answers[1:]
 
 
-def _press(model: ReducedModel, contact: Contact | None, path: str, **time: Any) -> Answer:
-    """Answer a load that the request has at `path`, at once or, for `time`, after a past."""
+def _press(model: ReducedModel, contact: Contact | None, path: str, **more: Any) -> Answer:
+    """Answer a load that the request has at `path`, at once or, with `more`, after a past."""
     with _refused(path):
-        found = model.press(*_load(contact), **time)
+        found = model.press(*_load(contact), **more)
     if not found.converged:
         limit = found.pressure_limit
         message = (
@@ -95,7 +96,7 @@ def _press(model: ReducedModel, contact: Contact | None, path: str, **time: Any)
 def checked(model: ReducedModel, request: SolveRequest) -> tuple[float, tuple[str, ...]]:
     """Largest trained pressure (kPa) for a load that could be solved, and what is out of range."""
     with _refused("contacts.0"):
-        return model.check(*_load(request.contacts[0]))
+        return model.check(*_load(request.contacts[0]), young=request.young)
 
 
 def _load(contact: Contact | None) -> tuple[Any, ...]:

@@ -227,19 +227,22 @@ async def _listed(
 
 
 def _positions(body: bytes, fields: Collection[str]) -> dict[str, Any]:
-    """Arrays of a binary request, by the names of fields."""
+    """Arrays of a binary request, by the names of fields, and the head's Young's modulus."""
     try:
-        _, arrays = layout.decode(body)
+        head, arrays = layout.decode(body)
     except PalpateError as error:
         raise Refusal("invalid_value", "body", str(error)) from None
-    if strange := sorted(arrays.keys() - set(fields)):
+    young, names = head.get("young"), set(fields) - {"young"}
+    if not (young is None or type(young) in (int, float)):
+        raise Refusal("invalid_value", "young", "Input should be a valid number")
+    if strange := sorted(arrays.keys() - names):
         raise Refusal("invalid_value", printable(strange[0]), "Not a field", sorted(fields))
-    for name in fields:
+    for name in names:
         if len(arrays.get(name, ())) > schemas.MOST_MANY:
             raise Refusal("invalid_value", name, "Too many", {"max_length": schemas.MOST_MANY})
         if name not in arrays and name != "directions":
             raise Refusal("invalid_value", name, "Missing", sorted(fields))
-    return {name: arrays.get(name) for name in fields}
+    return {"young": young} | {name: arrays.get(name) for name in names}
 
 
 queries = APIRouter(prefix="/scenes", tags=["scenes"], route_class=QueryRoute)
@@ -303,7 +306,7 @@ async def solve_many(request: Request, name: SceneName, asked: ManyRequest) -> R
     """Press the tissue with many loads, each from rest, on all cores.
 
     The body may be in the binary layout, too: arrays positions (n, 3), pressures (n,) and maybe
-    directions (n, 3). What is refused names the row, from 0.
+    directions (n, 3), and young in its head. What is refused names the row, from 0.
     """
     loads: Any = asked
     return await _listed(

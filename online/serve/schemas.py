@@ -78,7 +78,19 @@ class Contact(Strict):
     )
 
 
+Young = Annotated[
+    float | None,
+    Field(
+        ge=1e-6,
+        le=1e6,
+        description="Young's modulus of the tissue, kPa. Default: the scene's. Any other is as "
+        "exact: tissue twice as stiff moves as far under twice the load, limits included.",
+    ),
+]
+
+
 class _Asking(Strict):
+    young: Young = None
     outputs: list[Output] = Field(
         ["displacement", "von_mises"],
         max_length=3,
@@ -147,6 +159,7 @@ class TouchRequest(Strict):
     positions: list[Position] = Field(
         min_length=1, max_length=MOST_MANY, description="Of the tip's centre, mm."
     )
+    young: Young = None
 
 
 class ManyRequest(Strict):
@@ -165,6 +178,7 @@ class ManyRequest(Strict):
     directions: list[Direction] | None = Field(
         None, max_length=MOST_MANY, description="Default: the inward normals."
     )
+    young: Young = None
 
 
 _TABLES = {

@@ -37,8 +37,13 @@ ASKED = (
     Field("received", "float64", "s", "when the reply came, on the client's clock"),
 )
 
-_COMMAND = "a row per snapshot: number of replies before it; 0 if taken, 1 if restored; its number"
-COMMANDS = Field("commands", "uint32", "", _COMMAND, (3,))
+ORDERS = "snapshot", "restore", "young"
+"""Commands of a session by their numbers in a recording."""
+
+_COMMAND = (
+    f"a row per command: number of replies before it; {', '.join(ORDERS)}: 0, 1, 2; its value"
+)
+COMMANDS = Field("commands", "float64", "", _COMMAND, (3,))
 
 
 class Recorder:
@@ -74,10 +79,10 @@ class Recorder:
         if len(self._replies) >= CHUNK:
             self._write()
 
-    def obeyed(self, restores: bool, number: int) -> None:
-        """Note that a snapshot was taken or gone back to, after the replies received so far."""
+    def obeyed(self, command: str, value: float) -> None:
+        """Note that a command was obeyed after the replies received so far."""
         replies = len(self._file["seq"]) + len(self._replies)
-        _append(self._file[COMMANDS.name], [(replies, restores, number)])
+        _append(self._file[COMMANDS.name], [(replies, ORDERS.index(command), value)])
 
     def close(self) -> None:
         """Write what is left and close the file."""
@@ -108,7 +113,7 @@ class Recording(NamedTuple):
     requests: list[Request]  # those that were answered
     replies: NDArray[Any]  # (n,), of `session.frames.REPLY`
     received: Array  # (n,), s on the client's clock
-    commands: list[tuple[int, int, int]]  # as `COMMANDS`
+    commands: list[tuple[int, str, float]]  # replies before it, its name and value
 
 
 def read_recording(path: Path) -> Recording:
@@ -126,7 +131,8 @@ def read_recording(path: Path) -> Recording:
                 replies[name] = file[name][:]
             asked = (file[n] for n in ("seq", "client_time", "asked_position", "asked_outputs"))
             requests = list(map(Request, *(column[:].tolist() for column in asked)))
-            commands = [tuple(row) for row in file[COMMANDS.name][:].tolist()]
+            rows = file[COMMANDS.name][:].tolist()
+            commands = [(int(before), ORDERS[int(kind)], value) for before, kind, value in rows]
             scene = str(file.attrs["scene"])
             return Recording(scene, requests, replies, file["received"][:], commands)
     except (OSError, KeyError, ValueError) as error:

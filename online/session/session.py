@@ -11,14 +11,14 @@ import logging
 from collections.abc import Sequence
 from contextlib import suppress
 from time import perf_counter
-from typing import Literal
+from typing import Any, Literal
 
 import orjson
 import pydantic
 from starlette.types import Message, Receive, Scope, Send
 
 from palpate.online.serve.errors import Refusal, as_refusal, check_json_size
-from palpate.online.serve.schemas import Position, Strict, parse
+from palpate.online.serve.schemas import Position, Strict, Young, parse
 from palpate.online.serve.service import ServedModel, Service
 from palpate.online.session import frames
 from palpate.online.session.frames import Flag, Output, Request
@@ -242,19 +242,16 @@ class Session:
         self._service.metrics.count_frame(start - received, borders, answer.flags, dropped)
         return frame
 
-    def _obey(self, given: dict[str, int]) -> str:
-        """Keep the state of the tissue or go back to one that was kept; echo the command."""
+    def _obey(self, given: dict[str, Any]) -> str:
+        """Obey a command about the tissue; echo it."""
         if len(given) != 1:
-            message, allowed = "One of snapshot and restore is wanted", [*TextCommand.model_fields]
-            raise Refusal("invalid_value", "snapshot", message, allowed)
-        ((command, number),) = given.items()
-        if command == "snapshot":
-            self._tracker.snapshot(number)
-        elif number in self._tracker.snapshots:
-            self._tracker.restore(number)
-        else:
+            allowed = [*TextCommand.model_fields]
+            raise Refusal("invalid_value", "snapshot", "One command is wanted", allowed)
+        ((command, value),) = given.items()
+        if command == "restore" and value not in self._tracker.snapshots:
             kept = sorted(self._tracker.snapshots)
             raise Refusal("unknown_snapshot", "restore", "None was kept by this number", kept)
+        self._tracker.obey(command, value)
         return orjson.dumps(given).decode()
 
     def _greeting(self) -> str:
@@ -288,15 +285,19 @@ class TextRequest(Strict):
 
 
 class TextCommand(Strict):
-    """A request to keep the state of a session's tissue, or to go back to one that was kept."""
+    """A request about the tissue of a session: keep its state, go back to one, or make it as stiff.
+
+    Another Young's modulus (kPa) holds from the next frame on; a past is that of the displacements.
+    """
 
     snapshot: int | None = pydantic.Field(None, ge=0, lt=MOST_SNAPSHOTS)
     restore: int | None = pydantic.Field(None, ge=0, lt=MOST_SNAPSHOTS)
+    young: Young = None
 
 
 def is_command(text: str | None) -> bool:
     """Whether a message is a `TextCommand` rather than a position."""
-    return text is not None and ('"snapshot"' in text or '"restore"' in text)
+    return text is not None and any(f'"{name}"' in text for name in TextCommand.model_fields)
 
 
 def write_reply(frame: bytes) -> str:

@@ -68,20 +68,26 @@ class ToolTracker:
         self.snapshots: dict[int, tuple[Past | None, Answer | None]] = {}
         self._past: Past | None = self._rest
         self._good: Answer | None = None
+        self._young: float | None = None
         self._lost = False
         self._warm.forget()
         self._clock: float | None = None
         self._span = self._reached = 0.0
 
-    def snapshot(self, number: int) -> None:
-        """Keep the state of the tissue by a number."""
-        self.snapshots[number] = self._past, self._good
+    def obey(self, command: str, value: float) -> None:
+        """Keep the state of the tissue by a number, go back to one, or make the tissue as stiff.
 
-    def restore(self, number: int) -> None:
-        """Go back to a snapshot and search from there; the client's time goes on."""
-        self._past, self._good = self.snapshots[number]
-        self._lost = False
-        self._warm.forget()
+        After ``restore`` the search goes on from there, and so does the client's time; ``young`` is
+        in kPa, from the next position on.
+        """
+        if command == "young":
+            self._young = value
+        elif command == "snapshot":
+            self.snapshots[int(value)] = self._past, self._good
+        else:
+            self._past, self._good = self.snapshots[int(value)]
+            self._lost = False
+            self._warm.forget()
 
     def follow(
         self, position: Sequence[float], budget: float, now: float = 0.0, most: float = math.inf
@@ -138,7 +144,9 @@ class ToolTracker:
         """Solve a position at a share of the way; keep its answer or return why there is none."""
         dt = 0.0 if self._past is None else (share - self._reached) * self._span
         try:
-            touch = self._model.touch(position, past=self._past, dt=dt, warm=self._warm)
+            touch = self._model.touch(
+                position, young=self._young, past=self._past, dt=dt, warm=self._warm
+            )
         except QueryError:
             return _BELOW_SURFACE
         if not (touch.converged and _is_finite(touch)):
@@ -209,8 +217,7 @@ def replay(recording: Recording, model: ReducedModel) -> dict[str, Any]:
         if recording.replies["flags"][i] & _FIRST:  # of one of the sessions of a client
             tracker.restart()
         while commands and commands[0][0] <= i:
-            _, restores, number = commands.pop(0)
-            (tracker.restore if restores else tracker.snapshot)(number)
+            tracker.obey(*commands.pop(0)[1:])
         steps = int(recording.replies["steps"][i])
         answer = tracker.follow(request.position, math.inf, request.client_time, steps)
         extras = recover(model, answer.touch, request.outputs)

@@ -11,7 +11,7 @@ from palpate.shared.errors import QueryError
 from palpate.shared.fields import Composition
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH
-from palpate.shared.query import ABSURD, rows
+from palpate.shared.query import ABSURD, rows, stiffness
 from palpate.shared.reduced.transfer import Past
 from palpate.shared.scene import load_scene
 
@@ -83,7 +83,14 @@ class FakeModel:
 
     def press(
         self, position: Any, pressure: float, direction: Any = None, radius: float | None = None,
-        *, past: Past | None = None, dt: float = 0.0, warm: Memory | None = None,
+        *, young: float | None = None, **time: Any,
+    ) -> Answer:  # fmt: skip
+        ratio = stiffness(self.scene.tissue.young, young)
+        return self._press(position, pressure / ratio, direction, radius, **time).stiffened(ratio)
+
+    def _press(
+        self, position: Any, pressure: float, direction: Any, radius: float | None,
+        past: Past | None = None, dt: float = 0.0, warm: Memory | None = None,
     ) -> Answer:  # fmt: skip
         if position is None:
             position, pressure = (5.0, 5.0, 5.0), 0.0
@@ -125,8 +132,12 @@ class FakeModel:
     def new_warm(self) -> Memory:
         return Memory()
 
-    def touch(
-        self, position: Any, *, past: Past | None = None, dt: float = 0.0,
+    def touch(self, position: Any, *, young: float | None = None, **time: Any) -> Answer:
+        ratio = stiffness(self.scene.tissue.young, young)
+        return self._touch(position, **time).stiffened(ratio)
+
+    def _touch(
+        self, position: Any, past: Past | None = None, dt: float = 0.0,
         warm: Memory | None = None,
     ) -> Answer:  # fmt: skip
         if not self.has_tip:
@@ -171,22 +182,27 @@ class FakeModel:
             past=after if converged else past,
         )
 
-    def check(self, *load: Any) -> tuple[float, tuple[str, ...]]:
-        answer = self.press(*load)
+    def check(self, *load: Any, young: float | None = None) -> tuple[float, tuple[str, ...]]:
+        answer = self.press(*load, young=young)
         return answer.pressure_limit, answer.out_of_range
 
-    def solve_many(self, positions: Any, pressures: Any, directions: Any = None) -> Answers:
+    def solve_many(
+        self, positions: Any, pressures: Any, directions: Any = None, young: float | None = None
+    ) -> Answers:
         at = rows("positions", positions, 3)
         pressed = rows("pressures", pressures, 1, len(at))[:, 0]
         along = (
             [None] * len(at) if directions is None else rows("directions", directions, 3, len(at))
         )
         return _answers(
-            [self.press(*load) for load in zip(at, pressed.tolist(), along, strict=True)]
+            [
+                self.press(*load, young=young)
+                for load in zip(at, pressed.tolist(), along, strict=True)
+            ]
         )
 
-    def touch_many(self, positions: Any) -> Answers:
-        return _answers([self.touch(x) for x in rows("positions", positions, 3)])
+    def touch_many(self, positions: Any, young: float | None = None) -> Answers:
+        return _answers([self.touch(x, young=young) for x in rows("positions", positions, 3)])
 
     def _field(self, value: Any, answer: Answer, region: str) -> np.ndarray:
         """Fade a value at the contact point away with the distance and towards the bottom."""

@@ -67,7 +67,7 @@ def test_a_recording_holds_what_was_asked_and_answered(recorded):
             assert file[field.name].attrs["description"]
 
 
-def test_snapshots_are_recorded_and_replayed(opening, tmp_path, rng):
+def test_commands_are_recorded_and_replayed(opening, tmp_path, rng):
     model, path = FakeModel(in_time=True, stride=0.3), tmp_path / "session.h5"
     places = rng.uniform([0, 0, 4.5], [10, 10, 8], (60, 3))
     with opening(model, record=path) as session:
@@ -78,6 +78,8 @@ def test_snapshots_are_recorded_and_replayed(opening, tmp_path, rng):
                 session.snapshot(number % 2)
             if number in (15, 30, 31):
                 session.restore(1 - number % 2 if number != 15 else 1)
+            if number in (10, 40):
+                session.young(4.0 * number)
             session.step(place)
         session.snapshot(3)
         for depth in np.linspace(0.0, 0.5, 20):  # without waiting, so that some are superseded
@@ -89,7 +91,7 @@ def test_snapshots_are_recorded_and_replayed(opening, tmp_path, rng):
         assert refused.value.allowed == [0, 1, 3]
         session.step((5.0, 5.0, 6.5))
     recording = read_recording(path)
-    assert len(recording.commands) == 7
+    assert len(recording.commands) == 9
     report = replay(recording, model)
     assert (report["different"], report["force_difference"]) == (0, 0.0)
 

@@ -116,10 +116,10 @@ def test_a_snapshot_brings_back_the_state(model):
     tracker = ToolTracker(model)
     for now in (0.0, 0.05):
         tracker.follow((5.0, 5.0, 6.5), 0.0, now)
-    tracker.snapshot(0)
+    tracker.obey("snapshot", 0)
     first = tracker.follow((5.0, 5.0, 6.4), 0.0, 0.07)
     tracker.follow((5.0, 5.0, 6.3), 0.0, 0.09)
-    tracker.restore(0)
+    tracker.obey("restore", 0)
     again = tracker.follow((5.0, 5.0, 6.4), 0.0, 0.11)
     np.testing.assert_array_equal(again.touch.force, first.touch.force)
 
