@@ -15,7 +15,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from palpate.offline.table import PLACE, read_table
-from palpate.shared.arrays import Array
+from palpate.shared.arrays import Array, Flags
 from palpate.shared.errors import PalpateError, QueryError
 from palpate.shared.model import ReducedModel
 from palpate.shared.reduced.transfer import REST
@@ -82,7 +82,7 @@ def slope(answered: Array, measured: Array) -> tuple[float, float]:
     return ratio, float(student.ppf(0.5 + CONFIDENCE / 2.0, len(own) - 1) * error)
 
 
-def _answered(atlas: ReducedModel, at: Array, times: Array | None) -> tuple[Array, Array, Array]:
+def _answered(atlas: ReducedModel, at: Array, times: Array | None) -> tuple[Array, Array, Flags]:
     """Forces (n, 3) mN of the trained tissue, their estimated errors, and which are known."""
     if times is None or not atlas.scene.tissue.prony:
         found = atlas.touch_many(at)

@@ -80,7 +80,7 @@ def _follow(model: ReducedModel, request: HistoryRequest) -> list[Answer]:
 def _press(model: ReducedModel, contact: Contact | None, path: str, **more: Any) -> Answer:
     """Answer a load that the request has at `path`, at once or, with `more`, after a past."""
     with _refused(path):
-        found = model.press(*_load(contact), **more)
+        found = model.press(**_load(contact), **more)
     if not found.converged:
         limit = found.pressure_limit
         message = (
@@ -96,14 +96,12 @@ def _press(model: ReducedModel, contact: Contact | None, path: str, **more: Any)
 def checked(model: ReducedModel, request: SolveRequest) -> tuple[float, tuple[str, ...]]:
     """Largest trained pressure (kPa) for a load that could be solved, and what is out of range."""
     with _refused("contacts.0"):
-        return model.check(*_load(request.contacts[0]), young=request.young)
+        return model.check(**_load(request.contacts[0]), young=request.young)
 
 
-def _load(contact: Contact | None) -> tuple[Any, ...]:
+def _load(contact: Contact | None) -> dict[str, Any]:
     """What a model is asked for a contact, or its absence."""
-    if contact is None:
-        return None, 0.0
-    return contact.position, contact.pressure, contact.direction, contact.radius
+    return {"position": None, "pressure": 0.0} if contact is None else dict(contact)
 
 
 @contextmanager

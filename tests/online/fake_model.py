@@ -182,8 +182,8 @@ class FakeModel:
             past=after if converged else past,
         )
 
-    def check(self, *load: Any, young: float | None = None) -> tuple[float, tuple[str, ...]]:
-        answer = self.press(*load, young=young)
+    def check(self, **load: Any) -> tuple[float, tuple[str, ...]]:
+        answer = self.press(**load)
         return answer.pressure_limit, answer.out_of_range
 
     def solve_many(
