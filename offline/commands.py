@@ -95,6 +95,11 @@ def count_option(name: str, default: int | None, help: str, least: int = 1) -> O
 seed_option = count_option("--seed", 0, "Number that the random loads follow from.", least=0)
 
 
+young_option = click.option(
+    "--young", type=NUMBER, help="Young's modulus of the tissue, kPa.  [default: the scene's]"
+)
+
+
 def vector_option(*names: str, help: str, required: bool = False) -> Option:
     """Option of a point or a direction."""
     return click.option(*names, type=VECTOR, required=required, metavar="X Y Z", help=help)
@@ -200,6 +205,7 @@ def info(artifact: Path, errors: bool, as_json: bool) -> None:
 @artifact_argument
 @load_options
 @click.option("--radius", type=NUMBER, help="Of the footprint, mm.  [default: the scene's]")
+@young_option
 @click.option("--tip", is_flag=True, help="Press with the rigid tip, its centre --at a place.")
 @click.option("--full-model", is_flag=True, help="Solve the full model as well and compare.")
 @click.option("--vtu", type=_Output(".vtu"), metavar="OUT.vtu", help="Write mesh and fields.")
@@ -220,8 +226,9 @@ def solve(table: Path | None, out: Path | None, tip: bool, **request: Any) -> Re
     if table is not None:
         from palpate.offline.table import solve_table
 
-        _need({"--out": out}, {key: value for key, value in request.items() if key != "artifact"})
-        return solve_table(request["artifact"], table, out or table, tip)
+        artifact, young = request.pop("artifact"), request.pop("young")
+        _need({"--out": out}, request)
+        return solve_table(artifact, table, out or table, tip, young)
     _need({"--at": request["position"]}, {"out": out})
     if tip:
         _need({}, {key: request[key] for key in ("pressure", "direction", "radius")})
@@ -288,6 +295,7 @@ def picture(**request: Any) -> None:
 @click.option("--tip", is_flag=True, help="Press with the rigid tip instead of pressures.")
 @count_option("--histories", None, "Follow so many histories of visco-elastic tissue instead.")
 @click.option("--csv", type=OUTPUT, metavar="OUT", help="Write one row for each load.")
+@young_option
 @reporting
 def validate(tip: bool, queries: int, histories: int | None, **settings: Any) -> Report:
     """Compare an artifact with the full model.

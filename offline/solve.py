@@ -34,6 +34,7 @@ def solve(
     pressure: float | None,
     direction: Sequence[float] | None = None,
     radius: float | None = None,
+    young: float | None = None,
     full_model: bool = False,
     vtu: Path | None = None,
 ) -> dict[str, Any]:
@@ -50,6 +51,8 @@ def solve(
         The inward normal if absent.
     radius : float, mm, optional
         Of the footprint; the scene's if absent.
+    young : float, kPa, optional
+        Young's modulus of the tissue; the scene's if absent.
     full_model : bool
         Solve the full model too and add its answer and the errors of the reduced one against it:
         relative L2 norms over all nodes (displacement) and all nodes outside the clamped layer
@@ -66,11 +69,13 @@ def solve(
     """
     atlas = ReducedModel.load(artifact)
     if pressure is None:
-        solution, solve_us = _timed(lambda: atlas.touch(position))
+        solution, solve_us = _timed(lambda: atlas.touch(position, young=young))
         limit = f"depth: no equilibrium found; trained for up to {solution.depth_limit:.3g} mm"
         step: Step = TipPosition(np.asarray(position, float))
     else:
-        solution, solve_us = _timed(lambda: atlas.press(position, pressure, direction, radius))
+        solution, solve_us = _timed(
+            lambda: atlas.press(position, pressure, direction, radius, young=young)
+        )
         limit = (
             "pressure: no equilibrium found under this load; the model was trained for up to "
             f"{solution.pressure_limit:.3g} kPa"
@@ -92,7 +97,7 @@ def solve(
         return report
     if radius not in (None, atlas.scene.endoscope.radius):
         raise QueryError("radius", "the full model presses with the scene's")
-    problem = FullProblem.of_artifact(artifact)
+    problem = FullProblem.of_artifact(artifact, young)
     if full_model:
         exact, full_us = _timed(lambda: problem.solve(step))
         contact = problem.footprint(step, exact)

@@ -21,9 +21,12 @@ FOUND = (
 """Of ``Answers``; vectors have three columns, such as ``force_x``."""
 
 
-def solve_table(artifact: Path, table: Path, out: Path, tip: bool) -> dict[str, Any]:
+def solve_table(
+    artifact: Path, table: Path, out: Path, tip: bool, young: float | None = None
+) -> dict[str, Any]:
     """Answer every row of a table, each from rest; write them with what was found.
 
+    The tissue has another Young's modulus (kPa) if one is given.
     Its first line names the columns: ``x,y,z`` (mm), and of loads ``pressure`` (kPa), and if wanted
     ``dx,dy,dz``, the direction.
 
@@ -43,11 +46,11 @@ def solve_table(artifact: Path, table: Path, out: Path, tip: bool) -> dict[str, 
     started = time.perf_counter()
     try:
         if tip:
-            answers = atlas.touch_many(at)
+            answers = atlas.touch_many(at, young)
         else:
             along = [columns[name] for name in DIRECTION if name in columns]
             towards = np.column_stack(along) if along else None
-            answers = atlas.solve_many(at, columns["pressure"], towards)
+            answers = atlas.solve_many(at, columns["pressure"], towards, young)
     except QueryError as error:
         field, _, row = error.field.partition(".")
         where = f", line {int(row) + 2}" if row else ""

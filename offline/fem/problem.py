@@ -98,12 +98,19 @@ class FullProblem:
         self._nodal = np.zeros(len(self.mesh.nodes))
 
     @classmethod
-    def of_artifact(cls, path: Path) -> FullProblem:
-        """Full model on the very mesh and surface that an artifact was trained on."""
+    def of_artifact(cls, path: Path, young: float | None = None) -> FullProblem:
+        """Full model on the very mesh and surface that an artifact was trained on.
+
+        Of its tissue, or of one with another Young's modulus (kPa).
+        """
         artifact = read_artifact(path, Mesh, Surface)
         arrays = artifact.arrays
         mesh, surface = Mesh(**values_of(Mesh, arrays)), Surface(**values_of(Surface, arrays))
-        return cls(parse_scene(artifact.scene), mesh, surface)
+        scene = parse_scene(artifact.scene)
+        if young is not None:
+            tissue = scene.tissue.model_copy(update={"young": young})
+            scene = scene.model_copy(update={"tissue": tissue})
+        return cls(scene, mesh, surface)
 
     @cached_property
     def body(self) -> Body:

@@ -59,11 +59,11 @@ def open_scene(text: str, folder: str) -> None:
     _problem = FullProblem(parse_scene(text, Path(folder)))
 
 
-def open_artifact(path: Path) -> None:
-    """Initialize a worker process on the mesh of an artifact."""
+def open_artifact(path: Path, young: float | None = None) -> None:
+    """Initialize a worker process on the mesh of an artifact; see ``FullProblem.of_artifact``."""
     global _problem
     _end_with_parent()
-    _problem = FullProblem.of_artifact(path)
+    _problem = FullProblem.of_artifact(path, young)
 
 
 def run(task: Callable[..., object], *args: object) -> object:

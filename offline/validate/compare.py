@@ -24,6 +24,7 @@ from palpate.shared.answer import Answer
 from palpate.shared.arrays import Array
 from palpate.shared.errors import PalpateError, QueryError
 from palpate.shared.model import ReducedModel
+from palpate.shared.query import stiffness
 from palpate.shared.reduced.transfer import REST
 from palpate.shared.scene import Errors, Tolerance
 
@@ -32,17 +33,20 @@ OTHER_EQUILIBRIUM = 0.1
 the tip or not, and where it just does not in one model, it does in the other."""
 
 
-def play(model: ReducedModel, query: Sequence[Step]) -> list[Answer]:
-    """Answers of the reduced model at the ends of time steps; a single one may take no time."""
+def play(model: ReducedModel, query: Sequence[Step], young: float | None = None) -> list[Answer]:
+    """Answers of the reduced model at the ends of time steps; a single one may take no time.
+
+    Of tissue with another Young's modulus (kPa), if one is given.
+    """
     in_time = len(query) > 1 or query[0].dt > 0.0
     past, warm = (REST, model.new_warm()) if in_time else (None, None)
     answers: list[Answer] = []
     for step in query:
-        time: dict[str, Any] = {"past": past, "dt": step.dt, "warm": warm}
+        more: dict[str, Any] = {"young": young, "past": past, "dt": step.dt, "warm": warm}
         if isinstance(step, Load):
-            answers.append(model.press(step.position, step.pressure, step.direction, **time))
+            answers.append(model.press(step.position, step.pressure, step.direction, **more))
         else:
-            answers.append(model.touch(step.position, **time))
+            answers.append(model.touch(step.position, **more))
         past = answers[-1].past
     return answers
 
@@ -106,7 +110,8 @@ def compare(
     kind: Kind, problem: FullProblem, model: ReducedModel, query: Sequence[Step], full: Reference
 ) -> Row:
     """Answer a query with the reduced model and compare with full solutions."""
-    answers, kept = play(model, query), problem.beyond_clamped_layer
+    answers = play(model, query, problem.scene.tissue.young)
+    kept = problem.beyond_clamped_layer
     fields = {
         "displacement": ([model.displacement(answer) for answer in answers], full.u),
         "von_mises": ([model.von_mises(answer)[kept] for answer in answers], full.s[:, kept]),
@@ -240,8 +245,10 @@ def write_rows(path: Path, kind: Kind, rows: Sequence[Row]) -> None:
     write_csv(path, [row.table | own for row, own in zip(rows, estimated, strict=True)])
 
 
-def opened(artifact: Path, *kinds: Kind) -> tuple[ReducedModel, FullProblem]:
-    """Reduced and full model of an artifact.
+def opened(
+    artifact: Path, *kinds: Kind, young: float | None = None
+) -> tuple[ReducedModel, FullProblem]:
+    """Reduced and full model of an artifact; see ``FullProblem.of_artifact``.
 
     Raises
     ------
@@ -252,13 +259,20 @@ def opened(artifact: Path, *kinds: Kind) -> tuple[ReducedModel, FullProblem]:
     for kind in kinds:
         if lack := kind.lacks(model.scene):
             raise QueryError("scene", f"{model.name!r} {lack}")
-    return model, FullProblem.of_artifact(artifact)
+    return model, FullProblem.of_artifact(artifact, young)
 
 
 def against_full(
-    artifact: Path, kind: Kind, count: int, seed: int, csv: Path | None = None
+    artifact: Path,
+    kind: Kind,
+    count: int,
+    seed: int,
+    csv: Path | None = None,
+    young: float | None = None,
 ) -> dict[str, Any]:
     """Compare an artifact with its full model on new random queries, written one by one to a CSV.
+
+    The tissue of both has another Young's modulus (kPa) if one is given.
 
     Returns
     -------
@@ -273,10 +287,11 @@ def against_full(
     QueryError
         If the artifact has none to this kind.
     """
-    model, problem = opened(artifact, kind)
+    model, problem = opened(artifact, kind, young=young)
     queries = kind.random(model, count, held_out(model, seed))
-    tasks = [reference_task(model, query) for query in queries]
-    with worker_pool(open_artifact, artifact) as pool:
+    queries = kind.of_young(queries, stiffness(model.scene.tissue.young, young))
+    tasks = [reference_task(model, query, young) for query in queries]
+    with worker_pool(open_artifact, artifact, young) as pool:
         solved = tqdm(pool.map(run, *zip(*tasks, strict=True)), "full solutions", count)
         rows = [
             compare(kind, problem, model, query, full)
@@ -290,7 +305,9 @@ def against_full(
     return summarise(kind, rows, model.scene.tolerance) | {"without_equilibrium": count - len(rows)}
 
 
-def reference_task(model: ReducedModel, query: Sequence[Step]) -> tuple[Any, ...]:
+def reference_task(
+    model: ReducedModel, query: Sequence[Step], young: float | None = None
+) -> tuple[Any, ...]:
     """Task of a query's full solutions.
 
     A single one is sought near the reduced answer: that is quicker, and under the tip a free edge
@@ -298,12 +315,12 @@ def reference_task(model: ReducedModel, query: Sequence[Step]) -> tuple[Any, ...
     """
     if len(query) > 1:
         return FullProblem.reference, query
-    return FullProblem.reference, query, reduced_guess(model, query[0])
+    return FullProblem.reference, query, reduced_guess(model, query[0], young)
 
 
-def reduced_guess(model: ReducedModel, step: Step) -> Array:
+def reduced_guess(model: ReducedModel, step: Step, young: float | None = None) -> Array:
     """Displacement (n, 3) mm of the reduced answer to a single step, at the nodes of the mesh."""
-    (answer,) = play(model, [step])
+    (answer,) = play(model, [step], young)
     return model.fields.of_mesh(answer).astype(float)
 
 

@@ -1,6 +1,7 @@
 """Random queries of every kind, over the whole surface and range of loads."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -198,6 +199,14 @@ class Kind(NamedTuple):
             return [*random_histories(model, count, rng, self.tip)]
         steps = random_positions if self.tip else random_loads
         return [[step] for step in steps(model, count, rng)]
+
+    def of_young(self, queries: list[Sequence[Any]], ratio: float) -> list[Sequence[Any]]:
+        """The same for tissue so many times as stiff, which moves as far under as much more."""
+        if self.tip:
+            return queries
+        return [
+            [replace(load, pressure=ratio * load.pressure) for load in query] for query in queries
+        ]
 
     def lacks(self, scene: Scene) -> str | None:
         """What a scene lacks for queries of this kind."""

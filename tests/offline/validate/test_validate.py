@@ -46,6 +46,19 @@ def test_the_table_is_that_of_its_rows_and_they_are_those_of_the_loads(validated
     np.testing.assert_allclose(positions, [load.position for load in loads], atol=1e-4)
 
 
+def test_stiffer_tissue_is_as_right_as_that_of_the_training(validated, artifact, atlas, validate):
+    """Beside a full model of that tissue, under loads that are as much larger."""
+    report, rows = validate(
+        artifact, "--queries", QUERIES, "--seed", 3, "--young", 3.0 * atlas.scene.tissue.young
+    )
+    known, before = validated
+    for own, other in zip(rows, before, strict=True):
+        assert float(own["pressure"]) == pytest.approx(3.0 * float(other["pressure"]), rel=1e-4)
+        for name in ("displacement", "von_mises"):
+            assert float(own[name]) == pytest.approx(float(other[name]), rel=0.02, abs=1e-5)
+    assert report["covered"] == known["covered"]
+
+
 def test_loads_differ_by_seed_and_from_those_of_training(atlas):
     def positions(loads):
         return {tuple(load.position) for load in loads}
