@@ -56,9 +56,9 @@ def process_time(pid):
 class Tally:
     """The mutations of a kind, what became of them, and what they took of a process."""
 
-    def __init__(self, kind, most, pid=None):
+    def __init__(self, kind, most, pid=None, slowest=SLOWEST):
         self.kind, self.count, self.pid = kind, max(1, round(SHARE * most)), pid or os.getpid()
-        self.outcomes, self.slowest = Counter(), 0.0
+        self.limit, self.slowest, self.outcomes = slowest, 0.0, Counter()
 
     def __iter__(self):
         """Go through the mutations; each has a generator of its own."""
@@ -72,7 +72,7 @@ class Tally:
                 raise
             took = process_time(self.pid) - start
             self.slowest = max(self.slowest, took)
-            assert took < SLOWEST, f"{self.kind} {number} took {took:.1f} s"
+            assert took < self.limit, f"{self.kind} {number} took {took:.1f} s"
             before = before or process_memory(self.pid)  # the first may load and compile
         grown = process_memory(self.pid) - before
         told = ", ".join(f"{number} {what}" for what, number in sorted(self.outcomes.items()))
@@ -105,7 +105,8 @@ def whole(artifact):
 
 
 def test_artifacts_that_are_sealed_anew(whole, atlas, tmp_path, rng):
-    path, tally = tmp_path / "resealed.h5", Tally("artifacts", 2000)
+    # of this, loading takes 0.4 s, and kernels for another kind of model as much again
+    path, tally = tmp_path / "resealed.h5", Tally("artifacts", 2000, slowest=3.0)
     assert answers(atlas, rng)  # once all is compiled
     for rng in tally:
         arrays, scene, documents = dict(whole.arrays), whole.scene, whole.documents
