@@ -16,7 +16,7 @@ pip := $(bin)/pip --disable-pip-version-check --quiet
 .PHONY: help serve test lint format bench lock clean
 
 help:
-	@echo "make serve   train the turbinate if needed, then serve it on http://$(HOST):$(PORT)"
+	@echo "make serve   train the turbinate if needed, then serve it; open http://$(HOST):$(PORT)"
 	@echo "make test    style, types, import rules and every test"
 	@echo "make lint    the same without the tests"
 	@echo "make format  put the code in the project's style"

@@ -2,7 +2,9 @@
 
 import base64
 import json
+import os
 import shutil
+import signal
 import subprocess
 import time
 from contextlib import contextmanager
@@ -14,8 +16,9 @@ NAMES = "chromium-headless-shell", "chromium", "chromium-browser", "google-chrom
 OPTIONS = (
     "--headless", "--no-sandbox", "--disable-dev-shm-usage", "--remote-debugging-port=0",
     "--enable-unsafe-swiftshader", "--no-first-run", "--disable-background-networking",
+    "--single-process",  # starts on a busy machine as well
 )  # fmt: skip
-PATIENCE = 30.0
+PATIENCE = 60.0
 
 
 def find():
@@ -112,6 +115,7 @@ def browsing(folder: Path):
         [find(), *OPTIONS, f"--user-data-dir={folder}", "about:blank"],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
+        start_new_session=True,  # what is started may be a script that starts the browser
     )
     try:
         told, end = folder / "DevToolsActivePort", time.monotonic() + PATIENCE
@@ -142,5 +146,5 @@ def browsing(folder: Path):
 
             yield new_tab
     finally:
-        process.kill()
+        os.killpg(process.pid, signal.SIGKILL)
         process.wait()
