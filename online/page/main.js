@@ -45,6 +45,7 @@ class Page {
     element("whole").onclick = () => this.lookAtAll();
     element("level").oninput = (event) => this.tool.setLevel(Number(event.target.value));
     for (const id of ["tilt", "towards"]) element(id).oninput = () => this.showLevel();
+    element("young").oninput = () => this.stiffen();
     element("keep").onchange = ({ target }) => {
       this.tool.keeps = target.checked;
       if (!target.checked) this.tool.held = false;
@@ -145,6 +146,9 @@ class Page {
     this.tool.reset(body, (TRAINED * most) / 1.25, most);
     this.tool.keeps = element("keep").checked;
     element("level").max = most;
+    this.ratio = 1;
+    element("young").value = said.get("young") ?? 0;
+    this.stiffen();
     this.fit();
     if (!this.camera.fromText(said.get("view") ?? "")) this.lookAtAll();
     const tool = (said.get("tool") ?? "").split(",").map(Number);
@@ -169,6 +173,7 @@ class Page {
   /** A session is open; where the scene has been trained anew, its body is another. */
   greeted(greeting) {
     this.sentAt = null;
+    if (this.ratio !== 1) this.session.command("young", this.young);
     if (greeting.artifact !== this.scene.artifact) this.open(this.name, new URLSearchParams(this.told));
   }
 
@@ -201,6 +206,7 @@ class Page {
       if (element("colouring").value !== "stress") said.set("colours", element("colouring").value);
       if (element("lock").checked) said.set("range", element("range").value);
       if (element("server-field").checked) said.set("field", "server");
+      if (this.ratio !== 1) said.set("young", element("young").value);
       const { held, place, level } = this.tool;
       if (held && place) said.set("tool", [...place.point, level].map((x) => x.toFixed(3)).join());
       this.told = said.toString();
@@ -208,8 +214,29 @@ class Page {
     }, 300);
   }
 
+  /** Young's modulus (kPa) that the slider is set to: in its middle that of the training. */
+  get young() {
+    return this.scene.young * 10 ** Number(element("young").value);
+  }
+
+  /** Make the tissue as stiff as the slider says; a footprint presses as much harder. */
+  stiffen() {
+    if (!this.scene) return;
+    const ratio = this.young / this.scene.young;
+    if (!this.scene.serves.sessions) {
+      this.tool.most *= ratio / this.ratio;
+      element("level").max = this.tool.most;
+      this.tool.setLevel((this.tool.level * ratio) / this.ratio);
+    }
+    this.ratio = ratio;
+    this.session?.command("young", this.young);
+    this.sentAt = null;
+    this.showLevel();
+  }
+
   showLevel() {
     if (!this.scene) return;
+    element("young-value").textContent = `${digits(this.young)} kPa`;
     const { sessions } = this.scene.serves, { level } = this.tool;
     element("level-name").textContent = sessions ? "Depth" : "Pressure";
     element("level").value = level;
@@ -249,7 +276,7 @@ class Page {
   level() {
     const { answer, tool, scene } = this, { sessions } = scene.serves;
     const value = answer ? Math.max(sessions ? answer.depth : answer.pressure, 0) : 0;
-    const limit = sessions ? answer?.depth_limit || tool.place?.depthLimit : answer?.pressure_limit || tool.place?.pressureLimit;
+    const limit = sessions ? answer?.depth_limit || tool.place?.depthLimit : answer?.pressure_limit || this.ratio * tool.place?.pressureLimit;
     return {
       name: sessions ? "Depth" : "Pressure",
       unit: sessions ? "mm" : "kPa", value, limit: limit ?? 0, most: tool.most,
@@ -366,15 +393,13 @@ class Page {
       return;
     }
     const contact = { position: tool.place.point, pressure: tool.level, direction: this.direction() };
-    const key = JSON.stringify(contact);
+    const asked = { contacts: [contact], region: "surface", young: this.young }, key = JSON.stringify(asked);
     if (key === this.pressed) return;
     this.pressed = key;
     this.solving = true;
     const start = performance.now();
     try {
-      const { head, arrays } = await postForArrays(`scenes/${encodeURIComponent(name)}/solve`, {
-        contacts: [contact], region: "surface",
-      });
+      const { head, arrays } = await postForArrays(`scenes/${encodeURIComponent(name)}/solve`, asked);
       if (this.scene === scene) this.solved(contact, head, arrays, performance.now() - start);
       this.linked("open", "");
     } catch (error) {

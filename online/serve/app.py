@@ -414,6 +414,7 @@ async def scene(name: SceneName, request: Request) -> Any:
                 "reach": endoscope.reach,
             },
             "serves": {"sessions": model.has_tip, "histories": bool(model.scene.tissue.prony)},
+            "young": model.scene.tissue.young,
             "tolerance": model.scene.tolerance.model_dump(),
             "size": {
                 "nodes": len(model.nodes),

@@ -377,6 +377,7 @@ class SceneSummary(SceneEntry):
     serves: dict[Literal["sessions", "histories"], bool] = Field(
         description="Whether the tip has been trained, and whether the tissue knows time."
     )
+    young: float = Field(description="Young's modulus of the training, kPa.")
     tolerance: dict[str, float] = Field(
         description="Largest relative errors of trusted answers, as fractions."
     )

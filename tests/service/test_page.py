@@ -136,6 +136,25 @@ def test_the_wheel_presses_deeper_and_the_lamp_says_what_is_wrong(page):
     release(page, x, y)
 
 
+def test_the_slider_makes_the_tissue_as_stiff(page, server, atlas):
+    x, y = MIDDLE
+    press(page, x, y)
+    page.wait("palpate.answer?.CONTACT && palpate.tool.now === palpate.tool.level")
+    soft = np.linalg.norm(page.run("palpate.answer.force"))
+    page.run("""(() => {
+        const slider = document.getElementById("young");
+        slider.value = "0.3";
+        slider.dispatchEvent(new Event("input"));
+    })()""")
+    page.wait(f"Math.abs(Math.hypot(...palpate.answer.force) / {soft} - 10 ** 0.3) < 1e-6")
+    last = page.run("palpate.log.at(-1)")
+    with Session(server.url, "quick") as session:
+        session.young(atlas.scene.tissue.young * 10**0.3)
+        np.testing.assert_allclose(last["force"], session.step(last["asked"]).force, rtol=1e-9)
+    page.wait("location.hash.includes('young=0.3')")
+    release(page, x, y)
+
+
 def test_a_drag_beside_the_tissue_turns_it_and_the_address_says_how(page):
     before = page.run("palpate.camera.yaw")
     page.mouse("pressed", 60, 600, button="left", buttons=1, clickCount=1)
