@@ -262,8 +262,8 @@ class Page {
       this.changed = false;
       this.draw();
       this.readings.countFrame(now);
-      if (!this.session || this.session.reader) this.opened ??= now; // s since the address was given
     }
+    if (!this.session || this.session.reader) this.opened ??= now; // s since the address was given
     this.readings.show(now, this.scene.tolerance, this.level());
   }
 

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 
 from palpate.online.client.session import Session
+from palpate.shared.mechanics.footprint import TIP_DEPTH
 
 pytestmark = pytest.mark.service
 
 MIDDLE = 480, 330
 """Where the tissue is seen on a page of 1280 x 720."""
 
-OPENED = "window.palpate?.session?.reader && palpate.readings.drawn.length > 0"
+OPENED = "window.palpate?.session?.reader && palpate.opened"
 
 
 def press(tab, x, y):
@@ -91,7 +92,7 @@ def test_the_shader_makes_the_servers_displacement(page, atlas, rng):
     """At contacts all over the surface, so that local models come and go."""
     radius = atlas.scene.endoscope.radius
     at = rng.integers(len(atlas.surface.vertices), size=50)
-    depth = rng.uniform(0.2, 1.0, 50) * atlas.limits[at, 2]
+    depth = rng.uniform(0.2, 1.0, 50) * atlas.limits[at, TIP_DEPTH]
     away = (radius - depth)[:, None] * atlas.surface.normals[at]
     positions = (atlas.surface.vertices[at] + away).tolist()
     found = np.array(page.run(f"({COMPARE})({json.dumps(positions)})"), float)
@@ -161,7 +162,7 @@ def test_a_drag_beside_the_tissue_turns_it_and_the_address_says_how(page):
     page.mouse("moved", 160, 600, button="left", buttons=1)
     release(page, 160, 600)
     page.wait(f"palpate.camera.yaw < {before} - 0.1")
-    page.wait("location.hash.includes('view=')")
+    page.wait("decodeURIComponent(location.hash).includes(palpate.camera.toText())")
     view, address = page.run("palpate.camera.toText()"), page.run("location.href")
     page.open("about:blank")
     page.open(address)
@@ -223,7 +224,7 @@ def test_it_comes_back_when_the_service_does(tab, serve, artifact):
 def test_a_scene_that_is_not_served_is_told(tab, server):
     tab.open("about:blank")
     tab.open(f"{server.url}/#scene=nowhere")
-    tab.wait("document.getElementById('message').textContent.includes('No such scene')")
+    tab.wait("document.getElementById('message')?.textContent.includes('No such scene')")
 
 
 def test_without_webgl_it_says_what_to_do(new_tab, server):
@@ -233,7 +234,7 @@ def test_without_webgl_it_says_what_to_do(new_tab, server):
         source="HTMLCanvasElement.prototype.getContext = () => null",
     )
     tab.open(server.url)
-    tab.wait("document.getElementById('message').textContent.includes('hardware acceleration')")
+    tab.wait("document.getElementById('message')?.textContent.includes('hardware acceleration')")
 
 
 def test_the_endpoints_are_described_without_another_host(tab, server):
