@@ -22,6 +22,7 @@ from palpate.shared.local_models import Body, Mesh
 from palpate.shared.mechanics.footprint import MEANS, footprint, means
 from palpate.shared.mechanics.tip import (
     EDGE_FIELD,
+    LIFTED,
     LONGEST,
     bend,
     dented,
@@ -234,7 +235,7 @@ class FullProblem:
                 dent = dented(past.dent, weights, load.law, float(np.linalg.norm(found.force)))
                 found = replace(found, past=replace(found.past, dent=dent))
             if found.place is None:
-                if last is not None:  # a step too long
+                if last is not None and not (past is not None and made > LIFTED):  # too far
                     place, normal = (last[0] + x) / 2, last[1]
                     continue
                 if past is None and self._depth(step.position) > 0.0:

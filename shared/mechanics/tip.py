@@ -83,6 +83,10 @@ BARRED = 0.1
 ROUND_OFF = 1e-12
 """Millimetres of a step that are none."""
 
+LIFTED = 8
+"""Rounds after which a tip that loses contact on the way to its place has none, on tissue with a
+past: what that takes off the force changes with the place, too."""
+
 LEAST_KEPT = 0.1
 """Share of a force that a step to the next place must leave for its prediction to be believed."""
 

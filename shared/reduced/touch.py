@@ -25,7 +25,7 @@ from palpate.shared.compiled import bind_compiled
 from palpate.shared.geometry.surface import UPRIGHT, locate
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import TIP_DEPTH
-from palpate.shared.mechanics.tip import LONGEST, follow, meet_wall, next_place, pushed
+from palpate.shared.mechanics.tip import LIFTED, LONGEST, follow, meet_wall, next_place, pushed
 from palpate.shared.reduced.blend import MAX_ACTIVE, activate, weight_gradients
 from palpate.shared.reduced.contact import press_at_place
 from palpate.shared.reduced.features import estimate_errors, log_residual, near_rim
@@ -165,7 +165,7 @@ def _settle(solver, x):
         if outcome.status[0] != newton.CONVERGED:
             break
         if outcome.touched[0] == 0.0:
-            if made > 0:
+            if made > 0 and not (solver.past.in_time and made > LIFTED):
                 _go_back(solver)
                 continue
             # right off the tissue, or above the dent that the past has left

@@ -27,6 +27,7 @@ namespace Palpate
         VonMises = 4,
         Stress = 8,
         Half = 16,
+        Parts = 32,
     }
 
     [Flags]
@@ -40,6 +41,8 @@ namespace Palpate
         Fallback = 16,
         Stalled = 32,
         First = 64,
+        TooDeep = 128,
+        Beside = 256,
     }
 
     public enum Reason : uint

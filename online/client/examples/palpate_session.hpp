@@ -31,6 +31,7 @@ enum Output : std::uint16_t {
     von_mises = 4,
     stress = 8,
     half = 16,
+    parts = 32,
 };
 
 enum Flag : std::uint16_t {
@@ -41,6 +42,8 @@ enum Flag : std::uint16_t {
     fallback = 16,
     stalled = 32,
     first = 64,
+    too_deep = 128,
+    beside = 256,
 };
 
 enum Reason : std::uint32_t {
