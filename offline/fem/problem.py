@@ -24,6 +24,7 @@ from palpate.shared.mechanics.tip import (
     EDGE_FIELD,
     LIFTED,
     LONGEST,
+    TURNED,
     bend,
     dented,
     held,
@@ -241,7 +242,7 @@ class FullProblem:
                 if past is None and self._depth(step.position) > 0.0:
                     break
                 return found
-            newton, barred = found.place.step(load.tangents @ wall)
+            newton, barred = found.place.step(load.tangents @ wall, TURNED * radius)
             length = max(float(np.linalg.norm(newton)), 1e-12)
             wanted = newton * min(1.0, LONGEST * radius / length) * (0.5 if made > 6 else 1.0)
             place = self.surface.project(x + wanted @ load.tangents)[0]

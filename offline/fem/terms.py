@@ -145,7 +145,7 @@ class TipLoad:
         rigid, u = np.zeros((SEEN, SEEN)), displacement.ravel()
         g, H = self._settled(u, rigid, 1.0, 0.0, np.zeros(3))
         moved, force = np.empty(2), self.touch(u).towards.copy()
-        length = next_place(g, H, np.zeros(2), moved)
+        length = next_place(g, H, np.zeros(2), 0.0, moved)
         share = min(1.0, LONGEST * self.tip.radius / max(length, 1e-12))
         size = pushed(g, H, moved, share, force)
         return share * moved, force / size
@@ -202,10 +202,13 @@ class Place(NamedTuple):
     H: Array  # (SEEN, SEEN) mN/mm
     pushes: Array  # (3,) mN, force on the tool now
 
-    def step(self, wall: Array) -> tuple[Array, Array]:
-        """Newton's step (2,) mm of the place along the tangents, and the wall that bars it."""
+    def step(self, wall: Array, least: float) -> tuple[Array, Array]:
+        """Newton's step (2,) mm of the place along the tangents, and the wall that bars it.
+
+        See ``tip.next_place``.
+        """
         moved, barred = np.empty(2), wall.copy()
-        next_place(self.g, self.H, barred, moved)
+        next_place(self.g, self.H, barred, least, moved)
         return moved, barred
 
     def force(self, step: Array, share: float) -> Array:

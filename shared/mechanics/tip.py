@@ -77,6 +77,9 @@ distance (mm) from a sharp edge and the gradient (3,) of that."""
 LONGEST = 0.3
 """Longest step from place to place, in radii of the tip."""
 
+TURNED = 0.1
+"""Shortest step away from the rim, in radii of the tip, where one off it has been turned round."""
+
 BARRED = 0.1
 """Share of a step that is lost where the surface ends, and not for its curvature."""
 
@@ -380,13 +383,13 @@ def fade(normal, slopes, inwards, fading, g, H, L):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def next_place(g, H, wall, moved):
+def next_place(g, H, wall, least, moved):
     """Write Newton's step (2,) mm of the place along the two tangents; return its length.
 
     ``wall`` (2,) points out of the surface where the place lies on its rim, and is zero elsewhere:
     where the energy, largest at the place sought, grows that way a step goes along the rim.  It is
     zeroed where it does not bar; a step out of the surface all the same, as where the energy curves
-    upwards, is turned round.
+    upwards, is turned round and made at least ``least`` mm long, or the next would lead back.
     """
     a, b, c = H[0, 0], 0.5 * (H[0, 1] + H[1, 0]), H[1, 1]
     det = a * c - b * b
@@ -398,7 +401,7 @@ def next_place(g, H, wall, moved):
         moved[0], moved[1] = along * x, along * y
     else:
         if moved[0] * wall[0] + moved[1] * wall[1] > 0.0:
-            moved *= -1.0
+            moved *= -max(1.0, least / math.sqrt(moved[0] ** 2 + moved[1] ** 2))
         wall[:] = 0.0
     return math.sqrt(moved[0] ** 2 + moved[1] ** 2)
 

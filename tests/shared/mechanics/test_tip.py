@@ -280,7 +280,7 @@ def test_a_step_leads_to_the_place(away, rng):
         tip.settle(
             M, force, stiffness, gap, normal, towards, slopes, bent, body.inwards, fading, g, H
         )
-        tip.next_place(g, H, np.zeros(2), moved)
+        tip.next_place(g, H, np.zeros(2), 0.0, moved)
         errors.append(np.linalg.norm(X + moved - exact))
     assert errors[1] < 0.3 * errors[0] < 0.3 * 0.001
 
@@ -288,13 +288,13 @@ def test_a_step_leads_to_the_place(away, rng):
 @pytest.mark.parametrize("bend", [-2.0, 0.5])
 def test_a_wall_bars_where_the_energy_grows_beyond_it(bend):
     g, H, moved = np.array([0.4, 0.2]), np.diag([bend, -1.0]), np.empty(2)
-    tip.next_place(g, H, np.zeros(2), moved)
+    tip.next_place(g, H, np.zeros(2), 0.0, moved)
     np.testing.assert_allclose(moved, [-0.4 / bend, 0.2])
     wall = np.array([1.0, 0.0])
-    tip.next_place(g, H, wall, moved)
+    tip.next_place(g, H, wall, 0.0, moved)
     np.testing.assert_allclose(moved, [0.0, 0.2])
     assert wall.any()
-    tip.next_place(-g, H, wall, moved)
+    tip.next_place(-g, H, wall, 0.0, moved)
     turned = -1.0 if bend > 0.0 else 1.0  # away from the wall at any rate
     np.testing.assert_allclose(moved, turned * np.array([0.4 / bend, -0.2]))
     assert not wall.any()
