@@ -247,7 +247,7 @@ def solve(table: Path | None, out: Path | None, tip: bool, **request: Any) -> Re
 
 @click.command()
 @artifact_argument
-@click.argument("recording", type=TABLE)
+@click.argument("recording", type=click.Path(dir_okay=False, path_type=Path))
 @reporting
 def identify(artifact: Path, recording: Path) -> Report:
     """Find Young's modulus of tissue from forces measured on a tip that touched it.
