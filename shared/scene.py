@@ -302,6 +302,10 @@ class Scene(Part):
         """Where the files named by the scene lie; None for a scene without files at hand."""
         return self._folder
 
+    def of_tissue(self, **changes: Any) -> Self:
+        """The same scene of tissue that differs in what is given."""
+        return self.model_copy(update={"tissue": self.tissue.model_copy(update=changes)})
+
     @field_validator("support", "surface")
     @classmethod
     def _side_exists(cls, patch: Patch, info: ValidationInfo) -> Patch:

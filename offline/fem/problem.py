@@ -109,10 +109,7 @@ class FullProblem:
         arrays = artifact.arrays
         mesh, surface = Mesh(**values_of(Mesh, arrays)), Surface(**values_of(Surface, arrays))
         scene = parse_scene(artifact.scene)
-        if young is not None:
-            tissue = scene.tissue.model_copy(update={"young": young})
-            scene = scene.model_copy(update={"tissue": tissue})
-        return cls(scene, mesh, surface)
+        return cls(scene if young is None else scene.of_tissue(young=young), mesh, surface)
 
     @cached_property
     def body(self) -> Body:

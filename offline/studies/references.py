@@ -85,8 +85,7 @@ def of_tissue(problem: FullProblem, **changes: Any) -> FullProblem:
     scene = problem.scene
     if all(getattr(scene.tissue, key) == value for key, value in changes.items()):
         return problem
-    other = scene.tissue.model_copy(update=changes)
-    return FullProblem(scene.model_copy(update={"tissue": other}), problem.mesh, problem.surface)
+    return FullProblem(scene.of_tissue(**changes), problem.mesh, problem.surface)
 
 
 def kept_results(artifact: Path, scene: Scene, name: str, settings: object) -> Checkpoint:

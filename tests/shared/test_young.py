@@ -84,9 +84,7 @@ def test_many_are_as_stiff(atlas, rng):
 def test_the_full_model_of_that_tissue_agrees(artifact, atlas, ratio):
     problem, middle = FullProblem.of_artifact(artifact), atlas.nodes.max(axis=0) * [0.5, 0.5, 1.0]
     young = ratio * problem.scene.tissue.young
-    tissue = problem.scene.tissue.model_copy(update={"young": young})
-    scene = problem.scene.model_copy(update={"tissue": tissue})
-    stiff = FullProblem(scene, problem.mesh, problem.surface)
+    stiff = FullProblem.of_artifact(artifact, young)
     load = Load(middle, np.array([0.0, 0.0, -1.0]), 0.5 * atlas.press(middle, 0.0).pressure_limit)
     one = problem.solve(load).displacement
     other = stiff.solve(replace(load, pressure=ratio * load.pressure)).displacement
