@@ -20,6 +20,7 @@ from palpate.shared.local_models import LocalModels, ViscousModels
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import pressure_limit
 from palpate.shared.mechanics.tip import EDGE_FIELD
+from palpate.shared.reduced import touch
 from palpate.shared.reduced.features import (
     CHANGES,
     CHANGING,
@@ -149,6 +150,13 @@ class LocalTrainer:
         found = warm.q[0], scratch.load, warm.inverse[0], scratch.features, scratch.tangent_features
         return Sample(*map(np.copy, found))
 
+    def lift(self, position: Array) -> None:
+        """Ask for a tip off the tissue, centred at a position (3,) mm."""
+        solver = self._workspace.solver
+        touch.place(solver, position)
+        touch.begin(solver, position, position)
+        touch.touch(solver, position)
+
     def answers(self, draw: Callable[[], Load], count: int) -> list[Sample]:
         """Answers to drawn loads; those that it does not solve are left out."""
         return [sample for _ in range(count) if (sample := self.solve(draw())) is not None]
@@ -171,7 +179,10 @@ def compile_query(problem: FullProblem) -> None:
     stored, factors = np.zeros((LANES, LANES), np.int16), np.zeros((LANES, LANES), np.float32)
     basis = np.zeros((len(problem.model.free), LANES))
     models = _untrained(problem, basis, Footprint(x, normal, 1.0), 1.0, stored, factors)
-    LocalTrainer(problem, models).solve(Load(x, normal, 0.0))
+    trainer = LocalTrainer(problem, models)
+    trainer.solve(Load(x, normal, 0.0))
+    if problem.scene.endoscope.tip:
+        trainer.lift(x + 2.0 * problem.scene.endoscope.radius * normal)
 
 
 def train_patch(problem: FullProblem, region: Region, patch: Patch) -> LocalModels:

@@ -26,6 +26,7 @@ class Stage(IntEnum):
     BODY_MODES = 14
     MESH_PART = 15
     FOLDING = 16
+    UNANSWERED = 17
     UNSEEN = 100
     SNAPSHOTS = 101
     HARD_CASES = 102

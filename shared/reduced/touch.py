@@ -52,8 +52,8 @@ SHALLOW = 4e-3
 """Depth, in radii of the tip, up to which the place is that at rest: the triangles that say where
 the surface is cut its curves by as much."""
 
-RAMP = 8
-"""Steps of the way in where an equilibrium cannot be found in one jump."""
+RAMPS = 8, 16, 32
+"""Steps of the way in where an equilibrium cannot be found in one jump, one after the other."""
 
 LEAST_FACING = 0.1
 """Cosine between force and surface normal below which a place is none."""
@@ -151,7 +151,10 @@ def touch(solver, x):
     outcome.iterations[0] = 0.0
     _settle(solver, x)
     if outcome.status[0] not in (newton.CONVERGED, ELSEWHERE) and depth > 0.0:
-        _walk_in(solver, x, depth)
+        for steps in RAMPS:
+            _walk_in(solver, x, depth, steps)
+            if outcome.status[0] in (newton.CONVERGED, ELSEWHERE):
+                break
     if outcome.status[0] == newton.CONVERGED:
         _end_step(solver)
     # or ``transfer.estimate_history`` estimates
@@ -201,15 +204,15 @@ def _settle(solver, x):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _walk_in(solver, x, depth):
+def _walk_in(solver, x, depth, steps):
     """Go the way in step by step, from where the tip does not touch: for where a jump fails."""
     outcome = solver.outcome
     place(solver, x)
     way, at = depth * outcome.upward, np.empty(3)
     solver.warm.number[:] = -1
-    for i in range(1, RAMP + 1):
+    for i in range(1, steps + 1):
         for j in range(3):
-            at[j] = x[j] + (1.0 - i / RAMP) * way[j]
+            at[j] = x[j] + (1.0 - i / steps) * way[j]
         place(solver, at)
         begin(solver, at, outcome.foot)
         if not _choose(solver):

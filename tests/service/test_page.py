@@ -149,7 +149,9 @@ def test_the_slider_makes_the_tissue_as_stiff(page, server, atlas):
     last = page.run("palpate.log.at(-1)")
     with Session(server.url, "quick") as session:
         session.young(atlas.scene.tissue.young * 10**0.3)
-        np.testing.assert_allclose(last["force"], session.step(last["asked"]).force, rtol=1e-9)
+        force = session.step(last["asked"]).force
+    # the page's search began at softer tissue's answer, and ended within the tolerance of this one
+    assert np.linalg.norm(force - last["force"]) < 1e-3 * np.linalg.norm(force)
     page.wait("location.hash.includes('young=0.3')")
     release(page, x, y)
 

@@ -17,6 +17,7 @@ from palpate.offline.reduce.load_range import (
     GIVING_WAY,
     MARGIN,
     SLIPPING_OFF,
+    UNANSWERED,
     LoadPath,
     bearable_shares,
     firm_share,
@@ -248,6 +249,9 @@ class Edge(Plate):
     loose = np.inf
     """Depth from which on a tip that is pressed in at once slips off."""
 
+    lost = np.inf
+    """Depth from which on there is no answer over the edge, nor any place below it for the tip."""
+
     def __init__(self, slip):
         super().__init__(np.inf)
         self.limits[:, TIP_DEPTH] = 1.0
@@ -261,6 +265,10 @@ class Edge(Plate):
         if self.blind and warm is not None and position[0] < EDGE:
             raise QueryError("position", "below the surface")
         depth, beyond = RADIUS - position[2], position[0] - EDGE
+        if depth > self.lost and abs(beyond) < 1.0:
+            if beyond > 0.0:
+                raise QueryError("position", "below the surface")
+            return SimpleNamespace(converged=False)
         side = np.sign(beyond) or 1.0
         if warm is not None:
             carried = warm.side is not None and depth > self.slip and abs(beyond) < 1.0
@@ -279,6 +287,16 @@ def test_the_depth_ends_where_the_way_to_a_contact_matters_and_only_there(rng):
     assert not lowered[away > FAR + SLIPPING_OFF.reach].any()
     assert (shares[lowered] <= 0.5).all()
     assert (shares[lowered] > 0.3).all()
+
+
+def test_the_depth_ends_before_positions_without_an_answer(rng):
+    plate = Edge(slip=np.inf)
+    plate.lost = 0.8
+    shares = borne(UNANSWERED, plate, rng)
+    beyond = plate.surface.vertices[:, 0] - EDGE
+    assert (shares[(beyond > -0.9) & (beyond < -0.1)] < 0.8).all()
+    assert (shares >= 0.8 / MARGIN).all()
+    assert (shares[np.abs(beyond) > 1.0 + UNANSWERED.reach] == 1.0).all()
 
 
 def test_the_range_ends_before_loads_without_an_answer():
