@@ -45,6 +45,9 @@ from palpate.shared.model import ReducedModel
 
 logger = logging.getLogger(__name__)
 
+LOOKED = 1.0
+"""Seconds between looks for artifacts that have been added, replaced or removed."""
+
 DECODING = "palpate.decoding"
 """Key in the ASGI scope of when the decoding of the body began, s of `time.perf_counter`."""
 
@@ -60,10 +63,12 @@ def create_app(here: Service, on_ready: Callable[[], None] = lambda: None) -> Fa
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        _prepare(here, sessions, on_ready)
+        ended = threading.Event()
+        _prepare(here, sessions, on_ready, ended)
         if settings.workers > 1:
             await here.ready.wait()
         yield
+        ended.set()
 
     app = FastAPI(
         title="Palpate",
@@ -105,9 +110,14 @@ async def _nothing_here(client: WebSocket) -> None:
     await response(client.scope, client.receive, client.send)
 
 
-def _prepare(here: Service, sessions: Sessions, on_ready: Callable[[], None]) -> None:
-    """Begin to load and warm the models in a thread."""
+def _prepare(
+    here: Service, sessions: Sessions, on_ready: Callable[[], None], ended: threading.Event
+) -> None:
+    """Load and warm the models in a thread, which then looks for others until the service ends."""
     loop = asyncio.get_running_loop()
+
+    def warm_up(served: ServedModel) -> None:
+        warm(sessions, served)
 
     def finish() -> None:
         gc.collect()
@@ -116,9 +126,11 @@ def _prepare(here: Service, sessions: Sessions, on_ready: Callable[[], None]) ->
         on_ready()
 
     def load() -> None:
-        here.open(lambda served: warm(sessions, served))
+        here.open(warm_up)
         with suppress(RuntimeError):  # the service has ended meanwhile
             loop.call_soon_threadsafe(finish)
+        while not ended.wait(LOOKED):
+            here.look(warm_up)
 
     logger.info("loading models; where kernels are compiled for the first time, it takes minutes")
     # a daemon: a service that has to stop does not wait for it

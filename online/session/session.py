@@ -59,8 +59,6 @@ class Sessions:
     def __init__(self, service: Service) -> None:
         self._service = service
         self._open = 0
-        # a new tracker takes longer than most solves
-        self._spare: dict[str, list[ToolTracker]] = {}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Refuse a session or run it until it ends."""
@@ -78,20 +76,20 @@ class Sessions:
         count = self._service.metrics.count
         count("sessions")
         count("sessions_opened_total")
-        spare = self._spare.setdefault(served.model.name, [])
-        tracker = spare.pop() if spare else ToolTracker(served.model)
+        # a new tracker takes longer than most solves
+        tracker = served.spare.pop() if served.spare else ToolTracker(served.model)
         try:
             await Session(self._service, served, tracker, scope, receive, send).run()
         finally:
             self._open -= 1
             count("sessions", by=-1.0)
             tracker.restart()
-            spare.append(tracker)
+            served.spare.append(tracker)
 
     def prepare(self, served: ServedModel, path: Sequence[Sequence[float]]) -> None:
         """Call everything once and make spare trackers; the tip follows `path` (mm)."""
         request = Request(0, 0.0, served.tip, sum(Output))
-        spare = self._spare[served.model.name] = []
+        served.spare.clear()
         for _ in range(SPARE):
             tracker = ToolTracker(served.model)
             for number, position in enumerate([*path, request.position]):
@@ -99,7 +97,7 @@ class Sessions:
             extras = recover(served.model, answer.touch, request.outputs)
             write_reply(frames.encode_reply(request, answer, extras))
             tracker.restart()
-            spare.append(tracker)
+            served.spare.append(tracker)
 
 
 class Session:

@@ -37,7 +37,9 @@ def fake_service(tmp_path, monkeypatch):
             return model
 
         monkeypatch.setattr(ReducedModel, "load", load)
-        return Service(Settings(tmp_path, **dict(settings)))
+        service = Service(Settings(tmp_path, **dict(settings)))
+        service.loads = models  # may be changed, as files are
+        return service
 
     return make
 

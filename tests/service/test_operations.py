@@ -3,11 +3,13 @@
 import json
 import os
 import re
+import shutil
 import signal
 import time
 import urllib.request
 from contextlib import ExitStack
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 from prometheus_client.parser import text_string_to_metric_families
@@ -16,7 +18,9 @@ from palpate.online.client.http import Client
 from palpate.online.client.session import ServiceError, SessionClosed
 from palpate.online.loadtest.run import run
 from palpate.online.settings import Plan
+from palpate.shared.artifact import Dataset, read_artifact, write_artifact
 from palpate.shared.cli import main
+from palpate.shared.model import STORED, ReducedModel
 
 pytestmark = pytest.mark.service
 
@@ -141,3 +145,54 @@ def test_a_service_under_too_much_load_sheds_it_and_recovers(serve, artifact):
             assert float(counted[1]) == queries["refused"].get(status, 0)
         assert server.stop() == 0
         assert "Traceback" not in server.log
+
+
+def stiffer(artifact, path):
+    """Write an artifact of the same scene, but of tissue a third as stiff again."""
+    whole = read_artifact(artifact, *STORED)
+    scene = re.sub(r"tissue\.young = 15\.0", "tissue.young = 20.0", whole.scene)
+    assert scene != whole.scene
+    arrays = {name: Dataset(values, "", "") for name, values in whole.arrays.items()}
+    write_artifact(path, scene, whole.documents, arrays)
+    return path
+
+
+def test_an_artifact_replaced_under_load_loses_no_answer_and_mixes_none(
+    serve, artifact, atlas, tmp_path
+):
+    times = int(os.environ.get("PALPATE_REPLACED", "4"))
+    folder, made = tmp_path / "served", tmp_path / "made"
+    folder.mkdir()
+    made.mkdir()
+    files = [artifact, stiffer(artifact, made / "stiffer.h5")]
+    position, pressure = atlas.surface.vertices[40], 1.0
+    models = [ReducedModel.load(file) for file in files]
+    moved = [m.press(position, pressure).contact_displacement.tolist() for m in models]
+    tip = position + 0.8 * atlas.scene.endoscope.radius * atlas.surface.normals[40]
+    felt = atlas.touch(tip).force
+
+    def feels_the_first(session):
+        away = np.linalg.norm(session.step(tip).force - felt)
+        assert away < 1e-3 * np.linalg.norm(felt)  # the other's is a third larger
+
+    shutil.copy(artifact, folder / "quick.h5")
+    with serve(folder) as server, Client(server.url) as client, client.session("quick") as session:
+        served, answers = 0, 0
+        for replaced in range(1, times + 1):
+            shutil.copy(files[replaced % 2], folder / "quick.part")
+            (folder / "quick.part").rename(folder / "quick.h5")
+            end = time.monotonic() + 30
+            while served != replaced % 2:
+                assert time.monotonic() < end, "it is not taken up"
+                answer = client.solve("quick", position, pressure)
+                served = moved.index(answer.contact_displacement.tolist())
+                feels_the_first(session)
+                answers += 1
+        (folder / "quick.h5").unlink()
+        end = time.monotonic() + 30
+        while "quick" in get(f"{server.url}/scenes"):
+            assert time.monotonic() < end, "it is still served"
+        with pytest.raises(ServiceError, match="No such scene"):
+            client.solve("quick", position, pressure)
+        feels_the_first(session)
+    print(f"{times} times replaced, {answers} answers")
