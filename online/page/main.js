@@ -14,6 +14,7 @@ const COLOURINGS = ["stress", "displacement", "plain"];
 const STILL = 15; // s after which a position is sent again, so that the session does not end
 const CHECKED = 0.25; // s between comparisons of the two fields
 const NEAR = 3; // local models whose modes are fetched as the tip comes near
+const LISTED = 5; // s between looks for scenes that have been added or removed
 const LOGGED = 2000; // answers that are remembered for tests and for people who look
 const TRAINED = 0.5; // share of the range that the level begins with
 
@@ -71,22 +72,30 @@ class Page {
   async begin() {
     for (;;) {
       try {
-        const { scenes, refused } = await getJson("scenes");
-        element("scene").replaceChildren(...scenes.map(({ name, description }) => (
-          Object.assign(new Option(name), { title: description })
-        )));
-        if (!scenes.length) {
-          this.say(`No scene is served. ${refused.map((r) => r.reason).join(" ")}`);
-          return;
-        }
-        break;
+        const { scenes, refused } = await this.list();
+        if (scenes.length) break;
+        this.say(`No scene is served yet. ${refused.map((r) => r.reason).join(" ")}`);
       } catch (error) {
         this.linked("waiting", error.code === "not_ready"
           ? "The models are being loaded …" : `${error.message} Trying again …`);
-        await new Promise((done) => { setTimeout(done, 1000); });
       }
+      await new Promise((done) => { setTimeout(done, 1000); });
     }
+    setInterval(() => document.hidden || this.list().catch(() => {}), 1000 * LISTED);
     await this.follow();
+  }
+
+  /** Offer the scenes that are served now. */
+  async list() {
+    const found = await getJson("scenes"), select = element("scene");
+    const offered = [...select.options].map(({ value }) => value);
+    if (found.scenes.map(({ name }) => name).join() !== offered.join()) {
+      select.replaceChildren(...found.scenes.map(({ name, description }) => (
+        Object.assign(new Option(name), { title: description })
+      )));
+      if (this.name) select.value = this.name;
+    }
+    return found;
   }
 
   /** Do what the address says. */

@@ -1,6 +1,7 @@
 """The page in a browser without a window, as its user meets it."""
 
 import json
+import shutil
 import signal
 import socket
 import time
@@ -10,7 +11,9 @@ import numpy as np
 import pytest
 
 from palpate.online.client.session import Session
+from palpate.shared.artifact import Dataset, read_artifact, write_artifact
 from palpate.shared.mechanics.footprint import TIP_DEPTH
+from palpate.shared.model import STORED
 
 pytestmark = pytest.mark.service
 
@@ -245,3 +248,22 @@ def test_the_endpoints_are_described_without_another_host(tab, server):
         assert words.lower() in text.lower(), words
     assert all(address.startswith(server.url) for address in tab.requests)
     assert tab.complaints == []
+
+
+def test_a_scene_that_is_added_is_offered_and_one_that_goes_is_not(tab, serve, artifact, tmp_path):
+    whole = read_artifact(artifact, *STORED)
+    arrays = {name: Dataset(values, "", "") for name, values in whole.arrays.items()}
+    shutil.copy(artifact, tmp_path / "quick.h5")
+    offered = "[...document.getElementById('scene').options].map((o) => o.value).join()"
+    with serve(tmp_path) as server:
+        tab.open(server.url)
+        tab.wait(OPENED)
+        scene = whole.scene.replace('name = "quick"', 'name = "another"')
+        write_artifact(tmp_path / "another.h5", scene, whole.documents, arrays)
+        tab.wait(f"{offered} === 'another,quick'")
+        assert tab.run("document.getElementById('scene').value") == "quick"
+        (tmp_path / "another.h5").unlink()
+        tab.wait(f"{offered} === 'quick'")
+        press(tab, *MIDDLE)
+        tab.wait("palpate.answer?.CONTACT")
+        release(tab, *MIDDLE)
