@@ -49,6 +49,7 @@ from palpate.offline.reduce.window import (
     stored_modes,
     window_elements,
 )
+from palpate.offline.run.progress import Teller
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.workers import Checkpoint, Tasks, content_key, open_scene, run, worker_pool
 from palpate.offline.scenes import default_artifact, find_scene
@@ -67,6 +68,7 @@ from palpate.shared.arrays import Array, Numbers
 from palpate.shared.local_models import Estimators, LoadRange, LocalModels
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.model import ReducedModel
+from palpate.shared.progress import training_folder
 from palpate.shared.scene import Scene, Size, divisions_of
 
 MODEL, MODEL_AND_DOF = 0.35, 1.75e-4
@@ -111,7 +113,9 @@ def train(
         tqdm.write(f"{path}: up to date; --force trains it again", file=sys.stderr)
         return path
     path.parent.mkdir(parents=True, exist_ok=True)
-    checkpoint = Checkpoint(path.parent / f".{path.stem}.training", key)
+    folder = training_folder(path)
+    teller = Teller(untrained.name, folder)
+    checkpoint = Checkpoint(folder, key, teller)
     try:
         trained, mesh_choice = with_mesh(untrained)
         pool = worker_pool(open_scene, trained.text, str(trained.folder), count=workers)
@@ -122,6 +126,7 @@ def train(
             pipeline.run(path, mesh_choice)
         checkpoint.remove()
     finally:
+        teller.end()
         checkpoint.leave()
     return path
 

@@ -109,12 +109,15 @@ def content_key(scene: Scene) -> str:
 class Checkpoint:
     """Named results of one training run, in the folder where runs of this artifact keep theirs.
 
-    The key is from ``content_key``; results of other keys are removed.  Raises ``PalpateError`` if
-    another process works there.
+    The key is from ``content_key``; results of other keys are removed.  ``told`` is called with a
+    title, the number of its tasks that are done, and of all.  Raises ``PalpateError`` if another
+    process works there.
     """
 
-    def __init__(self, folder: Path, key: str) -> None:
-        self.key = key
+    def __init__(
+        self, folder: Path, key: str, told: Callable[[str, int, int], None] = lambda *_: None
+    ) -> None:
+        self.key, self._told = key, told
         self._parent = folder
         self._folder = folder / key
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -164,6 +167,8 @@ class Checkpoint:
         try:
             for future in tqdm(as_completed(missing), title, len(tasks), initial=done):
                 self.store(missing[future], future.result())
+                done += 1
+                self._told(title, done, len(tasks))
         finally:
             for future in missing:
                 future.cancel()

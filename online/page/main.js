@@ -95,6 +95,10 @@ class Page {
       )));
       if (this.name) select.value = this.name;
     }
+    element("training").textContent = found.training.map(({ scene, stage, share, seconds_left }) => (
+      `${scene} is being trained: ${Math.round(100 * share)} %, ${stage}${
+        seconds_left === null ? "" : `, about ${Math.ceil(seconds_left / 60)} min left`}`
+    )).join("; ");
     return found;
   }
 

@@ -405,7 +405,8 @@ async def served_scenes(request: Request) -> Any:
         {"name": name, "description": served.model.scene.description}
         for name, served in here.models.items()
     ]
-    return _json({"scenes": served, "refused": here.refused})
+    training = [progress._asdict() for progress in here.trainings]
+    return _json({"scenes": served, "refused": here.refused, "training": training})
 
 
 @scenes.get("/{name}", response_model=schemas.SceneSummary, responses=_problems(404, 422))

@@ -348,11 +348,23 @@ class SceneEntry(BaseModel):
     description: str
 
 
+class Training(BaseModel):
+    """A training whose artifact will be served when it is there."""
+
+    scene: str
+    stage: str
+    done: int = Field(description="Tasks of the stage that are done.")
+    of: int
+    share: float = Field(description="Of the whole training that is done, about.")
+    seconds_left: float | None = Field(description="Null while it is not known.")
+
+
 class SceneList(BaseModel):
-    """What is served and what could not be."""
+    """What is served, what could not be, and what is being trained."""
 
     scenes: list[SceneEntry]
     refused: list[dict[Literal["file", "reason"], str]]
+    training: list[Training]
 
 
 class Ranges(BaseModel):

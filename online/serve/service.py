@@ -13,6 +13,7 @@ from palpate.online.settings import Settings
 from palpate.shared.errors import PalpateError
 from palpate.shared.files import printable
 from palpate.shared.model import ReducedModel
+from palpate.shared.progress import Progress, trainings
 
 logger = logging.getLogger(__name__)
 
@@ -52,6 +53,7 @@ class Service:
         self.settings, self.metrics = settings, metrics or Metrics()
         self.models: dict[str, ServedModel] = {}  # replaced as a whole, never changed
         self.refused: list[dict[str, str]] = []  # `file` and `reason` of those that are not served
+        self.trainings: list[Progress] = []  # whose artifacts will be served
         self.ready = asyncio.Event()
         self.working = asyncio.Lock()  # on a list of queries
 
@@ -83,6 +85,7 @@ class Service:
             if path not in self._files or self._files[path].stamp != stamp:
                 self._take(path, stamp, warm)
         self.refused = [file.refused for file in self._files.values() if file.refused]
+        self.trainings = trainings(directory)
 
     def _take(self, path: Path, stamp: Stamp, warm: Callable[[ServedModel], Any]) -> None:
         """Serve a file, or say why not."""

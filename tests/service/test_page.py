@@ -14,6 +14,7 @@ from palpate.online.client.session import Session
 from palpate.shared.artifact import Dataset, read_artifact, write_artifact
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.model import STORED
+from palpate.shared.progress import Progress, tell, training_folder
 
 pytestmark = pytest.mark.service
 
@@ -258,6 +259,11 @@ def test_a_scene_that_is_added_is_offered_and_one_that_goes_is_not(tab, serve, a
     with serve(tmp_path) as server:
         tab.open(server.url)
         tab.wait(OPENED)
+        folder = training_folder(tmp_path / "another.h5")
+        folder.mkdir()
+        tell(folder, Progress("another", "local models", 3, 10, 0.4, 100.0))
+        tab.wait("document.getElementById('training').textContent.includes('40 %, local models')")
+        assert "2 min left" in tab.run("document.getElementById('training').textContent")
         scene = whole.scene.replace('name = "quick"', 'name = "another"')
         write_artifact(tmp_path / "another.h5", scene, whole.documents, arrays)
         tab.wait(f"{offered} === 'another,quick'")

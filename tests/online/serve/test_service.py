@@ -1,9 +1,12 @@
 import logging
+import os
+import time
 
 import pytest
 
 from palpate.online.serve.errors import Refusal
 from palpate.shared.errors import PalpateError
+from palpate.shared.progress import FILE, SILENT, Progress, tell, training_folder
 
 from ..fake_model import FakeModel
 
@@ -132,3 +135,23 @@ def test_a_directory_out_of_reach_takes_nothing_away(fake_service, tmp_path):
     tmp_path.rename(tmp_path.with_name("elsewhere"))
     service.look(ignore)
     assert list(service.models) == ["toy"]
+
+
+def test_trainings_are_told_while_they_go_on(fake_service, tmp_path):
+    service = fake_service(toy=FakeModel())
+    service.open(ignore)
+    assert service.trainings == []
+    folder = training_folder(tmp_path / "other.h5")
+    folder.mkdir()
+    told = Progress("other", "local models", 3, 10, 0.4, 60.0)
+    tell(folder, told)
+    service.look(ignore)
+    assert service.trainings == [told]
+    (folder / FILE).write_text("[")
+    service.look(ignore)
+    assert service.trainings == []
+    tell(folder, told)
+    long_ago = time.time() - SILENT - 1.0
+    os.utime(folder / FILE, (long_ago, long_ago))
+    service.look(ignore)
+    assert service.trainings == []
