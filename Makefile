@@ -16,7 +16,7 @@ pip := $(bin)/pip --disable-pip-version-check --quiet
 .PHONY: help serve test lint format bench lock clean
 
 help:
-	@echo "make serve   train the turbinate if needed, then serve it; open http://$(HOST):$(PORT)"
+	@echo "make serve   serve a slab, train the turbinate beside it; open http://$(HOST):$(PORT)"
 	@echo "make test    style, types, import rules and every test"
 	@echo "make lint    the same without the tests"
 	@echo "make format  put the code in the project's style"
@@ -24,9 +24,8 @@ help:
 	@echo "make lock    resolve the dependencies anew"
 	@echo "make clean   remove .venv and the caches; artifacts stay"
 
-serve: .venv/run | $(artifact)
-	@$(bin)/palpate info $(artifact) > /dev/null || $(bin)/palpate train turbinate --out $(artifact)
-	$(bin)/palpate serve --artifacts artifacts --host $(HOST) --port $(PORT)
+serve: .venv/run
+	$(bin)/palpate demo --beside turbinate --no-browser --host $(HOST) --port $(PORT)
 
 # A file of tests stays in one process, which has its set-ups.
 test: lint

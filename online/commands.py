@@ -14,6 +14,12 @@ Examples:
   PALPATE_TOKEN=$(openssl rand -hex 32) palpate serve --host 0.0.0.0 --workers 2
 """
 
+_DEMO_EXAMPLES = """\b
+Examples:
+  palpate demo
+  palpate demo --beside turbinate --port 8080
+"""
+
 _LOADTEST_EXAMPLES = """\b
 Examples:
   palpate loadtest http://127.0.0.1:8000 --sessions 4 --queries-per-second 20
@@ -35,6 +41,29 @@ def serve(**settings: Any) -> None:
     from palpate.online.serve.process import serve
 
     serve(Settings(**settings))
+
+
+@click.command(epilog=_DEMO_EXAMPLES, context_settings={"auto_envvar_prefix": "PALPATE"})
+@click.option(
+    "--beside",
+    multiple=True,
+    metavar="SCENE",
+    show_envvar=True,
+    help="Train this scene meanwhile; it is served as soon as it is there. May be repeated.",
+)
+@click.option(
+    "--browser/--no-browser", default=True, show_default=True, show_envvar=True,
+    help="Open the page.",
+)  # fmt: skip
+@options(Settings)
+def demo(beside: tuple[str, ...], browser: bool, **settings: Any) -> None:
+    """Press a first piece of tissue: train a small slab, serve it and open its page.
+
+    The other options are those of palpate serve.
+    """
+    from palpate.online.demo import demo
+
+    demo(Settings(**settings), beside, browser)
 
 
 @click.command(epilog=_LOADTEST_EXAMPLES)

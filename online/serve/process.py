@@ -218,8 +218,12 @@ def _forked(config: uvicorn.Config, target: Callable[..., None], sockets: list[s
     return get_context("fork").Process(target=subprocess_started, kwargs=inherited)
 
 
-def serve(settings: Settings) -> None:
-    """Serve until a signal says to end.
+def serve(
+    settings: Settings,
+    opened: Callable[[str], None] = lambda url: None,
+    ended: Callable[[], None] = lambda: None,
+) -> None:
+    """Serve until a signal says to end; tell when the page can be opened, and the end.
 
     Raises `PalpateError` if there is nothing to serve, or no token for other machines.
     """
@@ -263,13 +267,14 @@ def serve(settings: Settings) -> None:
         with tempfile.TemporaryDirectory(prefix="palpate-") as directory:
             table = Path(directory) / "metrics"
             make_table(table, settings.workers)
-            config.app = partial(_work, settings, url, table, None)
+            config.app = partial(_work, settings, url, table, None, opened)
             if settings.workers > 1:
-                config.app = partial(_work, settings, url, table, _loaded(settings))
+                config.app = partial(_work, settings, url, table, _loaded(settings), opened)
                 Supervisor(config, [bound]).run()
             else:
                 uvicorn.Server(config).run([bound])
     finally:
+        ended()
         if any(thread.daemon for thread in threading.enumerate()):
             # Models are being loaded. The interpreter's own end would wait for ever for locks of
             # the compiler, which the thread that loads holds while it is halted.
@@ -292,7 +297,13 @@ def _loaded(settings: Settings) -> "Service":
     return service
 
 
-def _work(settings: Settings, url: str, table: Path, shared: "Service | None") -> FastAPI:
+def _work(
+    settings: Settings,
+    url: str,
+    table: Path,
+    shared: "Service | None",
+    opened: Callable[[str], None],
+) -> FastAPI:
     """Make the application of one worker, in its own process."""
     # Not before: a supervisor that starts no workers has no use for the models' code.
     from palpate.online.serve.app import create_app
@@ -312,6 +323,7 @@ def _work(settings: Settings, url: str, table: Path, shared: "Service | None") -
         if metrics.worker or metrics.restarted:
             return  # the first worker says it once
         click.echo(f"Open {url}/ in a browser (API: {url}/docs)")
+        opened(f"{url}/")
         for refused in service.refused:
             click.echo(f"Refused {refused['reason']}")
         click.echo(f"Serving {', '.join(service.models) or 'nothing'}")
