@@ -4,6 +4,7 @@ import { Body } from "./body.js";
 import { Camera } from "./camera.js";
 import { roundUp } from "./colours.js";
 import { Readings, digits } from "./readings.js";
+import { Player, Recording } from "./recording.js";
 import { Refused, getArrays, getJson, postForArrays } from "./service.js";
 import { Session } from "./session.js";
 import { Tool } from "./tool.js";
@@ -32,6 +33,7 @@ class Page {
       level: () => this.showLevel(),
     });
     this.log = [];
+    this.recording = this.player = null;
     this.fetching = new Set();
     this.dark = matchMedia("(prefers-color-scheme: dark)");
     this.dark.onchange = () => { this.changed = true; };
@@ -57,6 +59,13 @@ class Page {
     element("server-field").onchange = () => { this.sentAt = null; this.tell(); };
     element("snapshot").onclick = () => { this.session?.command("snapshot"); element("restore").disabled = false; };
     element("restore").onclick = () => { this.session?.command("restore"); this.sentAt = null; };
+    element("record").onclick = () => this.record();
+    element("play").onchange = ({ target }) => this.play(target.files[0]);
+    document.addEventListener("dragover", (event) => event.preventDefault());
+    document.addEventListener("drop", (event) => {
+      event.preventDefault();
+      this.play(event.dataTransfer.files[0]);
+    });
     document.addEventListener("visibilitychange", () => {
       this.last = seconds();
       this.changed = true;
@@ -152,6 +161,8 @@ class Page {
     this.view.setBody(body);
     this.readings.clear();
     this.log.length = 0;
+    this.player = null;
+    if (this.recording) this.record(); // of another scene
     Object.assign(this, { answer: null, sentAt: null, placed: null, checkedAt: 0, stress: null });
     this.readings.answer = null;
     const most = sessions
@@ -265,7 +276,8 @@ class Page {
     if (document.hidden || !this.scene) return;
     this.fit();
     const before = this.tool.now;
-    this.tool.step(passed, !this.scene.serves.sessions);
+    if (this.player) this.playOn(now);
+    else this.tool.step(passed, !this.scene.serves.sessions);
     const place = this.tool.place;
     if (before !== this.tool.now || place !== this.placed) this.changed = true;
     this.placed = place;
@@ -305,7 +317,8 @@ class Page {
     if (!session?.ready) return;
     if (tool.place) this.approach(tool.place.point);
     let position = null;
-    if (tool.place && tool.now > AWAY_ENOUGH) position = tool.centre(scene.ranges.radius);
+    if (this.player) position = this.played;
+    else if (tool.place && tool.now > AWAY_ENOUGH) position = tool.centre(scene.ranges.radius);
     else if (this.sentAt) position = this.lifted;
     if (tool.place) this.lifted = add(tool.place.point, tool.place.normal, scene.ranges.radius + 1);
     if (!position) return;
@@ -331,7 +344,55 @@ class Page {
       },
     };
     this.answered(answer, now, this.sentAt);
+    if (this.recording && this.sentAt) {
+      this.recording.take(now, this.sentAt, reply);
+      element("record").textContent = `Save ${this.recording.rows.length} answers`;
+    }
     this.shape(reply, now);
+  }
+
+  /** Begin to record answers, or end it and save them as CSV. */
+  record() {
+    if (this.recording?.rows.length) {
+      const file = new Blob([this.recording.text()], { type: "text/csv" });
+      const link = Object.assign(document.createElement("a"), {
+        href: URL.createObjectURL(file), download: `${this.recording.scene}.csv`,
+      });
+      link.click();
+      setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+    }
+    this.recording = this.recording ? null : Object.assign(new Recording(seconds()), { scene: this.name });
+    element("record").textContent = this.recording ? "Recording …" : "Record";
+  }
+
+  /** Play a recording: the tip goes where it was, and the tissue answers anew. */
+  async play(file) {
+    if (!file) return;
+    try {
+      if (!this.scene?.serves.sessions) throw new Error("Only scenes with a tip play recordings.");
+      this.player = new Player(await file.text());
+      this.playedSince = seconds();
+      this.tool.held = false;
+      this.say("");
+    } catch (error) {
+      this.say(`${file.name}: ${error.message}`);
+    }
+    element("play").value = "";
+  }
+
+  /** Put the tool where the recording that is played has it now. */
+  playOn(now) {
+    const { tool, body, scene } = this, position = this.player.at(now - this.playedSince);
+    this.played = position;
+    if (!position) {
+      this.player = tool.place = null;
+      tool.now = -1;
+      return;
+    }
+    tool.place = body.touchNear(position);
+    if (!tool.place) return;
+    const { point, normal } = tool.place;
+    tool.now = scene.ranges.radius - add(position, point, -1).reduce((sum, x, i) => sum + x * normal[i], 0);
   }
 
   /** Show the displacement of a reply: by its parts if their modes are here, else the server's. */

@@ -10,6 +10,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 
+from palpate.offline.identify import identify
 from palpate.online.client.session import Session
 from palpate.shared.artifact import Dataset, read_artifact, write_artifact
 from palpate.shared.mechanics.footprint import TIP_DEPTH
@@ -273,3 +274,53 @@ def test_a_scene_that_is_added_is_offered_and_one_that_goes_is_not(tab, serve, a
         press(tab, *MIDDLE)
         tab.wait("palpate.answer?.CONTACT")
         release(tab, *MIDDLE)
+
+
+PLAY = """async (text) => {
+    await palpate.play(new File([text], "played.csv"));
+    return document.getElementById("message").textContent;
+}"""
+
+
+def test_what_is_recorded_is_played_again_and_tells_the_modulus(page, atlas, artifact, tmp_path):
+    x, y = MIDDLE
+    page.run("palpate.record()")
+    press(page, x, y)
+    page.wait("palpate.answer?.CONTACT && palpate.tool.now === palpate.tool.level")
+    for step in range(1, 9):
+        page.mouse("moved", x + 6 * step, y, button="left", buttons=1)
+        time.sleep(0.05)
+    release(page, x + 48, y)
+    page.wait("palpate.tool.now < -0.9 && !palpate.answer.CONTACT")
+    text = page.run("palpate.recording.text()")
+    page.run("palpate.record()")
+    assert page.run("palpate.recording") is None
+    (tmp_path / "recorded.csv").write_text(text)
+    found = identify(artifact, tmp_path / "recorded.csv")
+    assert found["young"] == pytest.approx(atlas.scene.tissue.young, rel=1e-3)
+    rows = np.genfromtxt(text.splitlines(), delimiter=",", names=True)
+    recorded = {(r["asked_x"], r["asked_y"], r["asked_z"]): r["force_z"] for r in rows}
+    page.run("palpate.log.length = 0")
+    assert page.run(f"({PLAY})({json.dumps(text)})") == ""
+    page.wait("palpate.player === null && !palpate.answer.CONTACT")
+    log = [entry for entry in page.run("palpate.log") if tuple(entry["asked"]) in recorded]
+    assert len(log) > 5
+    most = max(recorded.values())
+    for entry in log:
+        assert abs(entry["force"][2] - recorded[tuple(entry["asked"])]) < 1e-3 * most
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("time,x,y\n0,1,2\n", "lacks z"),
+        ("time,x,y,z\n", "no positions"),
+        ("time,x,y,z\n0,1,2,3\n1,1,,3\n", "Line 3"),
+        ("time,x,y,z\n1,1,2,3\n0,1,2,3\n", "Line 3"),
+    ],
+)
+def test_a_recording_that_makes_no_sense_is_told(page, text, why):
+    said = page.run(f"({PLAY})({json.dumps(text)})")
+    assert said.startswith("played.csv: ")
+    assert why in said
+    assert page.run("palpate.player") is None

@@ -1,0 +1,56 @@
+// Recordings: what a session answers, as CSV, and positions of one that are played again.
+
+const COLUMNS = [
+  "time", "asked_x", "asked_y", "asked_z", "x", "y", "z", "force_x", "force_y", "force_z",
+  "flags", "error_displacement", "error_von_mises", "error_force",
+];
+const MOST = 500000; // rows: some two hours of a page
+const AFTER = 0.2; // s that the last position of a recording is played
+
+/** Answers as they come; a file of them is what `palpate identify` reads, in s, mm and mN. */
+export class Recording {
+  constructor(now) {
+    this.start = now;
+    this.rows = [];
+  }
+
+  take(now, asked, reply) {
+    if (this.rows.length >= MOST) return;
+    this.rows.push([
+      now - this.start, ...asked, ...reply.position, ...reply.force, reply.flags,
+      reply.error_displacement, reply.error_von_mises, reply.error_force,
+    ]);
+  }
+
+  text() {
+    return [COLUMNS, ...this.rows].map((row) => `${row.join()}\n`).join("");
+  }
+}
+
+/** Positions (mm) of the tip over time, of a recording's text; throws what is wrong with it. */
+export class Player {
+  constructor(text) {
+    const [names, ...rows] = text.trim().split(/\r?\n/).map((line) => line.split(","));
+    const place = names.includes("asked_x") ? ["asked_x", "asked_y", "asked_z"] : ["x", "y", "z"];
+    const wanted = ["time", ...place], missing = wanted.filter((name) => !names.includes(name));
+    if (missing.length) throw new Error(`The recording's first line lacks ${missing.join(", ")}.`);
+    const numbers = (row) => wanted.map((name) => Number(row[names.indexOf(name)] || NaN));
+    this.rows = rows.map(numbers);
+    const wrong = this.rows.findIndex((row, i) => (
+      !row.every(Number.isFinite) || (i > 0 && row[0] < this.rows[i - 1][0])
+    ));
+    if (wrong >= 0) throw new Error(`Line ${wrong + 2} of the recording makes no sense.`);
+    if (!rows.length) throw new Error("The recording has no positions.");
+    this.next = 0;
+  }
+
+  /** Position so many seconds after the first one; null when all have been played. */
+  at(passed) {
+    const first = this.rows[0][0], last = this.rows.at(-1)[0];
+    if (passed > last - first + AFTER) return null;
+    while (this.next + 1 < this.rows.length && this.rows[this.next + 1][0] - first <= passed) {
+      this.next += 1;
+    }
+    return this.rows[this.next].slice(1);
+  }
+}
