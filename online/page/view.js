@@ -108,10 +108,19 @@ precision highp float;
 out vec4 colour;
 void main() { colour = vec4(0.0); }`];
 
+/** Whether the processor draws, for which smooth edges take as long again as the picture. */
+function drawsByItself() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  const info = gl?.getExtension("WEBGL_debug_renderer_info");
+  const name = gl?.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER) ?? "";
+  gl?.getExtension("WEBGL_lose_context")?.loseContext();
+  return /SwiftShader|llvmpipe|softpipe|Basic Render|software/i.test(name);
+}
+
 export class View {
   /** Of a canvas; throws where there is no WebGL2. */
   constructor(canvas) {
-    const gl = canvas.getContext("webgl2", { antialias: true, alpha: true });
+    const gl = canvas.getContext("webgl2", { antialias: !drawsByItself(), alpha: true });
     if (!gl) throw new Error("no WebGL2");
     this.canvas = canvas;
     this.gl = gl;
