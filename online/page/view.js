@@ -1,5 +1,5 @@
-// Draws body, tool and force with WebGL2. The displacement is made in the vertex shader, from the
-// reduced coordinates of a frame and the modes of local models.
+// Draws body, tool and force with WebGL2. A vertex shader makes the displacement of every node from
+// the reduced coordinates of a frame and the modes of local models, once for all pictures of it.
 
 import { TABLE } from "./colours.js";
 import { add, placing, scale, unit } from "./vectors.js";
@@ -8,38 +8,44 @@ const WIDTH = 1024; // of the textures that hold a number for every node
 export const MOST_PARTS = 32; // local models that can take part in a displacement
 const MOST_BYTES = 64 * 2 ** 20; // of the graphics memory for modes
 
-const DISPLACEMENT = `#version 300 es
+const NODES = `#version 300 es
 precision highp float; precision highp int;
 precision highp sampler2D; precision highp isampler2DArray;
+ivec2 at(int node) { return ivec2(node % ${WIDTH}, node / ${WIDTH}); }
+`;
+
+const DISPLACEMENT = [`${NODES}
 uniform sampler2D field;         // mm, by node: what is not in the modes, or all of it
 uniform isampler2DArray modes;   // in steps: mode, node, place
 uniform sampler2D states;        // mm a step: mode, part
 uniform int places[${MOST_PARTS}];
 uniform int parts, modesEach;
-ivec2 at(int node) { return ivec2(node % ${WIDTH}, node / ${WIDTH}); }
-vec3 displacement(int node) {
-  vec3 u = texelFetch(field, at(node), 0).xyz;
+out vec3 moved;
+void main() {
+  vec3 u = texelFetch(field, at(gl_VertexID), 0).xyz;
   for (int part = 0; part < parts; part++)
     for (int m = 0; m < modesEach; m++)
       u += texelFetch(states, ivec2(m, part), 0).x
-         * vec3(texelFetch(modes, ivec3(m, node, places[part]), 0).xyz);
-  return u;
-}
-`;
+         * vec3(texelFetch(modes, ivec3(m, gl_VertexID, places[part]), 0).xyz);
+  moved = u;
+}`, `#version 300 es
+precision highp float;
+out vec4 colour;
+void main() { colour = vec4(0.0); }`];
 
-const BODY = [`${DISPLACEMENT}
+const BODY = [`${NODES}
 layout(location = 0) in vec3 rest;
 layout(location = 1) in vec3 normal;
 layout(location = 2) in uint node;
 layout(location = 3) in vec2 kind;
 uniform mat4 camera;
-uniform sampler2D stress;        // kPa, by node
+uniform sampler2D displacement, stress; // mm and kPa, by node
 uniform int colouring;
 out vec3 restAt, movedAt, restNormal;
 out vec2 kinds;
 out float value;
 void main() {
-  vec3 u = displacement(int(node));
+  vec3 u = texelFetch(displacement, at(int(node)), 0).xyz;
   restAt = rest; movedAt = rest + u; restNormal = normal; kinds = kind;
   value = colouring == 0 ? texelFetch(stress, at(int(node)), 0).x : length(u);
   gl_Position = camera * vec4(movedAt, 1.0);
@@ -101,13 +107,6 @@ uniform vec4 paint;
 out vec4 colour;
 void main() { colour = paint; }`];
 
-const READ_BACK = [`${DISPLACEMENT}
-out vec3 moved;
-void main() { moved = displacement(gl_VertexID); }`, `#version 300 es
-precision highp float;
-out vec4 colour;
-void main() { colour = vec4(0.0); }`];
-
 /** Whether the processor draws, for which smooth edges take as long again as the picture. */
 function drawsByItself() {
   const gl = document.createElement("canvas").getContext("webgl2");
@@ -127,7 +126,7 @@ export class View {
     this.body = this.program(...BODY);
     this.solid = this.program(...SOLID);
     this.line = this.program(...LINE);
-    this.reader = this.program(...READ_BACK, ["moved"]);
+    this.reader = this.program(...DISPLACEMENT, ["moved"]);
     this.colours = this.texture(gl.RGBA8, 256, 1, gl.RGBA, gl.UNSIGNED_BYTE, TABLE);
     this.shapes = { sphere: this.shape(sphere()), rod: this.shape(turned(ROD)), cone: this.shape(turned(CONE)) };
     this.outlineArray = this.lines(new Float32Array());
@@ -220,7 +219,8 @@ export class View {
     this.height = height;
     this.field = this.texture(gl.RGB32F, WIDTH, height);
     this.stress = this.texture(gl.R32F, WIDTH, height);
-    this.moved = this.buffer(12 * body.count, gl.DYNAMIC_READ);
+    this.displacement = this.texture(gl.RGB32F, WIDTH, height);
+    this.moved = this.buffer(12 * WIDTH * height, gl.DYNAMIC_COPY); // the same
     this.showField(null);
     this.showStress(null);
   }
@@ -228,7 +228,7 @@ export class View {
   /** Give the graphics memory of a body back. */
   forget() {
     const { gl } = this;
-    for (const name of ["field", "stress", "modes", "states"]) {
+    for (const name of ["field", "displacement", "stress", "modes", "states"]) {
       gl.deleteTexture(this[name] ?? null);
       this[name] = null;
     }
@@ -309,6 +309,7 @@ export class View {
   /** Show a displacement (mm) given at the nodes. */
   showField(field) {
     this.parts = 0;
+    this.made = false;
     this.put(this.field, 3, this.gl.RGB, field);
   }
 
@@ -325,29 +326,28 @@ export class View {
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, this.height, format, gl.FLOAT, all);
   }
 
-  /** Give a program what it makes the displacement of. */
-  useDisplacement({ program, uniforms }) {
+  /** Use a program with textures: name, kind and texture of each. */
+  use({ program, uniforms }, textures) {
     const { gl } = this;
     gl.useProgram(program);
-    const textures = [
-      ["field", gl.TEXTURE_2D, this.field], ["modes", gl.TEXTURE_2D_ARRAY, this.modes],
-      ["states", gl.TEXTURE_2D, this.states ?? this.field], ["stress", gl.TEXTURE_2D, this.stress],
-      ["colours", gl.TEXTURE_2D, this.colours],
-    ];
     textures.forEach(([name, target, texture], unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);
       gl.bindTexture(target, texture);
-      if (uniforms[name]) gl.uniform1i(uniforms[name], unit);
+      gl.uniform1i(uniforms[name], unit);
     });
+  }
+
+  /** Make the displacement of every node, unless it is there. */
+  deform() {
+    if (this.made) return;
+    const { gl } = this, { uniforms } = this.reader;
+    this.use(this.reader, [
+      ["field", gl.TEXTURE_2D, this.field], ["modes", gl.TEXTURE_2D_ARRAY, this.modes ?? null],
+      ["states", gl.TEXTURE_2D, this.states ?? this.field],
+    ]);
     gl.uniform1i(uniforms.parts, this.parts);
     gl.uniform1i(uniforms.modesEach, this.modesEach ?? 0);
     if (this.parts) gl.uniform1iv(uniforms.places, this.used);
-  }
-
-  /** The displacement that the shader makes, read back: mm, three numbers for every node. */
-  readBack() {
-    const { gl } = this;
-    this.useDisplacement(this.reader);
     gl.bindVertexArray(null);
     gl.bindBuffer(gl.ARRAY_BUFFER, null);
     gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, this.moved);
@@ -356,9 +356,22 @@ export class View {
     gl.drawArrays(gl.POINTS, 0, this.shown.count);
     gl.endTransformFeedback();
     gl.disable(gl.RASTERIZER_DISCARD);
-    const moved = new Float32Array(3 * this.shown.count);
-    gl.getBufferSubData(gl.TRANSFORM_FEEDBACK_BUFFER, 0, moved);
     gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, null);
+    gl.bindBuffer(gl.PIXEL_UNPACK_BUFFER, this.moved);
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, this.displacement);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, this.height, gl.RGB, gl.FLOAT, 0);
+    gl.bindBuffer(gl.PIXEL_UNPACK_BUFFER, null);
+    this.made = true;
+  }
+
+  /** The displacement that the shader makes, read back: mm, three numbers for every node. */
+  readBack() {
+    this.deform();
+    const { gl } = this, moved = new Float32Array(3 * this.shown.count);
+    gl.bindBuffer(gl.COPY_READ_BUFFER, this.moved);
+    gl.getBufferSubData(gl.COPY_READ_BUFFER, 0, moved);
+    gl.bindBuffer(gl.COPY_READ_BUFFER, null);
     return moved;
   }
 
@@ -377,8 +390,12 @@ export class View {
     gl.viewport(0, 0, this.canvas.width, this.canvas.height);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    this.deform();
     const { uniforms } = this.body;
-    this.useDisplacement(this.body);
+    this.use(this.body, [
+      ["displacement", gl.TEXTURE_2D, this.displacement], ["stress", gl.TEXTURE_2D, this.stress],
+      ["colours", gl.TEXTURE_2D, this.colours],
+    ]);
     gl.uniformMatrix4fv(uniforms.camera, false, matrix);
     gl.uniform3fv(uniforms.eye, eye);
     gl.uniform1f(uniforms.range, scene.range);

@@ -53,6 +53,8 @@ def test_it_is_up_without_complaints_and_asks_nobody_else(page, server):
         assert address.startswith((server.url, server.url.replace("http:", "ws:"))), address
     assert page.complaints == []
     assert page.run("document.getElementById('link').textContent") == "connected"
+    press(page, *MIDDLE)
+    page.wait("palpate.answer?.CONTACT && palpate.tool.now === palpate.tool.level")
     # colours of some pixels, read before they are shown
     different = page.run("""(() => {
         const { view } = palpate, { gl, canvas } = view;
@@ -61,6 +63,7 @@ def test_it_is_up_without_complaints_and_asks_nobody_else(page, server):
         gl.readPixels(0, 0, canvas.width, canvas.height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
         return new Set(new Uint32Array(pixels.buffer)).size;
     })()""")
+    release(page, *MIDDLE)
     assert different > 100
     assert not page.run("palpate.view.gl.isContextLost()")
     assert page.run("palpate.view.gl.getError()") == 0
