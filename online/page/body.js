@@ -84,9 +84,9 @@ export class Body {
     const { vertices, normals } = this.limits, cells = new Map();
     for (let i = 0; i < vertices.length / 3; i++) {
       const at = row(vertices, i), normal = row(normals, i);
-      for (const dx of [-0.5, 0.5]) {
-        for (const dy of [-0.5, 0.5]) {
-          for (const dz of [-0.5, 0.5]) cells.set(key(add(at, [dx, dy, dz], TOGETHER)), normal);
+      for (const dx of [-0.4, 0.4]) {
+        for (const dy of [-0.4, 0.4]) {
+          for (const dz of [-0.4, 0.4]) cells.set(key(add(at, [dx, dy, dz], TOGETHER)), normal);
         }
       }
     }
