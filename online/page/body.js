@@ -84,6 +84,7 @@ export class Body {
     const { vertices, normals } = this.limits, cells = new Map();
     for (let i = 0; i < vertices.length / 3; i++) {
       const at = row(vertices, i), normal = row(normals, i);
+      // less than half a cell to either side, so that its own is among them
       for (const dx of [-0.4, 0.4]) {
         for (const dy of [-0.4, 0.4]) {
           for (const dz of [-0.4, 0.4]) cells.set(key(add(at, [dx, dy, dz], TOGETHER)), normal);

@@ -8,7 +8,7 @@ import { Player, Recording } from "./recording.js";
 import { Refused, getArrays, getJson, postForArrays } from "./service.js";
 import { Session } from "./session.js";
 import { Tool } from "./tool.js";
-import { add, across, cross, norm, scale, unit } from "./vectors.js";
+import { add, across, cross, dot, norm, scale, unit } from "./vectors.js";
 import { MOST_PARTS, View } from "./view.js";
 
 const COLOURINGS = ["stress", "displacement", "plain"];
@@ -361,7 +361,7 @@ class Page {
       link.click();
       setTimeout(() => URL.revokeObjectURL(link.href), 10000);
     }
-    this.recording = this.recording ? null : Object.assign(new Recording(seconds()), { scene: this.name });
+    this.recording = this.recording ? null : new Recording(this.name, seconds());
     element("record").textContent = this.recording ? "Recording …" : "Record";
   }
 
@@ -392,7 +392,7 @@ class Page {
     tool.place = body.touchNear(position);
     if (!tool.place) return;
     const { point, normal } = tool.place;
-    tool.now = scene.ranges.radius - add(position, point, -1).reduce((sum, x, i) => sum + x * normal[i], 0);
+    tool.now = scene.ranges.radius - dot(add(position, point, -1), normal);
   }
 
   /** Show the displacement of a reply: by its parts if their modes are here, else the server's. */

@@ -9,9 +9,8 @@ const AFTER = 0.2; // s that the last position of a recording is played
 
 /** Answers as they come; a file of them is what `palpate identify` reads, in s, mm and mN. */
 export class Recording {
-  constructor(now) {
-    this.start = now;
-    this.rows = [];
+  constructor(scene, now) {
+    Object.assign(this, { scene, start: now, rows: [] });
   }
 
   take(now, asked, reply) {

@@ -6,6 +6,7 @@ import logging
 import threading
 from collections.abc import AsyncIterator, Callable, Collection, Coroutine
 from contextlib import asynccontextmanager, suppress
+from functools import partial
 from importlib.metadata import version
 from time import perf_counter, time
 from typing import Annotated, Any, get_args, get_type_hints
@@ -114,10 +115,7 @@ def _prepare(
     here: Service, sessions: Sessions, on_ready: Callable[[], None], ended: threading.Event
 ) -> None:
     """Load and warm the models in a thread, which then looks for others until the service ends."""
-    loop = asyncio.get_running_loop()
-
-    def warm_up(served: ServedModel) -> None:
-        warm(sessions, served)
+    loop, warm_up = asyncio.get_running_loop(), partial(warm, sessions)
 
     def finish() -> None:
         gc.collect()

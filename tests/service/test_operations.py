@@ -18,9 +18,10 @@ from palpate.online.client.http import Client
 from palpate.online.client.session import ServiceError, SessionClosed
 from palpate.online.loadtest.run import run
 from palpate.online.settings import Plan
-from palpate.shared.artifact import Dataset, read_artifact, write_artifact
 from palpate.shared.cli import main
-from palpate.shared.model import STORED, ReducedModel
+from palpate.shared.model import ReducedModel
+
+from .conftest import rewritten
 
 pytestmark = pytest.mark.service
 
@@ -147,16 +148,6 @@ def test_a_service_under_too_much_load_sheds_it_and_recovers(serve, artifact):
         assert "Traceback" not in server.log
 
 
-def stiffer(artifact, path):
-    """Write an artifact of the same scene, but of tissue a third as stiff again."""
-    whole = read_artifact(artifact, *STORED)
-    scene = re.sub(r"tissue\.young = 15\.0", "tissue.young = 20.0", whole.scene)
-    assert scene != whole.scene
-    arrays = {name: Dataset(values, "", "") for name, values in whole.arrays.items()}
-    write_artifact(path, scene, whole.documents, arrays)
-    return path
-
-
 def test_an_artifact_replaced_under_load_loses_no_answer_and_mixes_none(
     serve, artifact, atlas, tmp_path
 ):
@@ -164,7 +155,7 @@ def test_an_artifact_replaced_under_load_loses_no_answer_and_mixes_none(
     folder, made = tmp_path / "served", tmp_path / "made"
     folder.mkdir()
     made.mkdir()
-    files = [artifact, stiffer(artifact, made / "stiffer.h5")]
+    files = [artifact, rewritten(artifact, made / "stiffer.h5", "young = 15.0", "young = 20.0")]
     position, pressure = atlas.surface.vertices[40], 1.0
     models = [ReducedModel.load(file) for file in files]
     moved = [m.press(position, pressure).contact_displacement.tolist() for m in models]
