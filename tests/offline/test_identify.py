@@ -53,7 +53,7 @@ def test_the_true_modulus_lies_in_the_interval(atlas, rng):
         forces, true = found.force[part][used], rng.uniform(3.0, 60.0) / atlas.scene.tissue.young
         ratio, half = slope(forces, noisy(true * forces, rng))
         held += abs(ratio - true) < half
-        assert half < 0.1 * true
+        assert half < 0.06 * true
     assert 90 <= held <= 100
     assert CONFIDENCE == 0.95
 
@@ -80,13 +80,13 @@ def test_the_past_counts(visco_artifact, visco_atlas, rng, tmp_path):
     middle = visco_atlas.nodes.max(axis=0) * [0.5, 0.5, 1.0]
     times = np.linspace(0.0, 0.5, 20)
     at = middle + np.outer(visco_atlas.body.tip.radius - 0.3 * np.sqrt(times), [0.0, 0.0, 1.0])
-    forces, past = [], REST
+    forces, past, warm = [], REST, visco_atlas.new_warm()  # as the command asks, to the same bits
     for x, dt in zip(at, np.diff(times, prepend=0.0), strict=True):
-        answer = visco_atlas.touch(x, young=30.0, past=past, dt=dt)
+        answer = visco_atlas.touch(x, young=30.0, past=past, dt=dt, warm=warm)
         forces.append(answer.force)
         past = answer.past
     path = recorded(tmp_path / "a.csv", at, np.array(forces), time=times)
-    assert identified(visco_artifact, path)["young"] == pytest.approx(30.0, rel=1e-3)
+    assert identified(visco_artifact, path)["young"] == pytest.approx(30.0, rel=1e-6)
 
 
 WRONG = {
