@@ -3,10 +3,12 @@
 Pure ASGI: Starlette's BaseHTTPMiddleware would cost a query more than its solve.
 """
 
+import asyncio
 import hmac
 import ipaddress
 import math
 import re
+from collections import deque
 from collections.abc import Mapping
 from contextlib import suppress
 from functools import lru_cache
@@ -53,6 +55,7 @@ class Guard:
         self._secret = f"Bearer {settings.token}".encode() if settings.token else None
         self._rates = RateLimit(settings.rate_limit) if settings.rate_limit else None
         self._max_wait = settings.max_wait
+        self._turns = Turns()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer or refuse, as ASGI asks."""
@@ -61,6 +64,8 @@ class Guard:
                 headers = dict(scope["headers"])
                 self._check_names(headers)
                 self._check_token(scope, headers)
+                if scope["type"] == "http":
+                    await self._turns.wait()
                 if scope["path"] != METRICS:
                     self._check_load(scope, perf_counter())
             except Refusal as refusal:
@@ -131,6 +136,36 @@ def _host(header: bytes) -> str:
     """Read the name or address in a Host header."""
     read = _HOST.fullmatch(header)
     return machine_name((read[1] or read[2]).decode()) if read else ""
+
+
+class Turns:
+    """Lets one request be answered after the other, and the frames of sessions between them.
+
+    An answer is made in one go. Without turns the event loop would make those to all requests that
+    it has read before it reads the next frame.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: deque[asyncio.Future[None]] = deque()
+        self._taken = False
+
+    async def wait(self) -> None:
+        """Wait for a turn, which ends when the event loop has read what came meanwhile."""
+        loop = asyncio.get_running_loop()
+        if self._taken:
+            self._waiting.append(turn := loop.create_future())
+            await turn
+        else:
+            self._taken = True
+            loop.call_soon(self._pass_on, loop)
+
+    def _pass_on(self, loop: asyncio.AbstractEventLoop) -> None:
+        while self._waiting:
+            if not (turn := self._waiting.popleft()).cancelled():
+                turn.set_result(None)  # the one who waits goes on before the call below
+                loop.call_soon(self._pass_on, loop)
+                return
+        self._taken = False
 
 
 class RateLimit:

@@ -70,6 +70,12 @@ MOST_UNREAD = 64 * 1024**2
 UNREAD = 5.0
 """Seconds that a client gets to read more of an answer."""
 
+LINGER = 1.0
+"""Seconds in which nothing more is read of a client that sent too much, before it is cut off.
+
+Cut off at once it would not get to read why, and would be back with the next at once.
+"""
+
 _OF_BODIES = b"content-length", b"transfer-encoding"
 
 LAST_WAIT = 4.0
@@ -97,24 +103,32 @@ class HttpProtocol(HttpToolsProtocol):
         self.patience = self.reading = self.loop.call_later(PATIENCE, transport.abort)
         self.head: int | None = 0  # bytes of it read; None where a body is read
         self.url = b""
+        self.refused = False
         self.asked: list[RequestResponseCycle] = []  # not answered yet
         if len(self.connections) > MOST_CONNECTIONS:
             allowed = {"max_connections": MOST_CONNECTIONS}
             message = "The service has no place for another connection"
             self.refuse(Refusal("overloaded", "", message, allowed, {"Retry-After": "1"}))
+            transport.close()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Forget a connection."""
-        self.patience.cancel()
-        for cycle in self.asked:  # uvicorn tells the last only
-            cycle.disconnected = True
-            cycle.message_event.set()
+        self.give_up()
         self.resume_writing()
         super().connection_lost(exc)
+
+    def give_up(self) -> None:
+        """Leave unanswered what has been asked; uvicorn does so with the last request only."""
+        self.patience.cancel()
+        for cycle in self.asked:
+            cycle.disconnected = True
+            cycle.message_event.set()
 
     def data_received(self, data: bytes) -> None:
         """Read on, little by little so that heads of requests can be counted."""
         for start in range(0, len(data), MOST_HEAD):
+            if self.refused:
+                return
             part = data[start : start + MOST_HEAD]
             super().data_received(part)
             if self.transport.is_closing() or self.transport.get_protocol() is not self:
@@ -123,7 +137,6 @@ class HttpProtocol(HttpToolsProtocol):
                 self.head += len(part)
                 if self.head > MOST_HEAD:
                     self.refuse_head()
-                    return
 
     def refuse_head(self) -> None:
         """Refuse a request whose head is too long."""
@@ -135,13 +148,16 @@ class HttpProtocol(HttpToolsProtocol):
             self.refuse(Refusal("headers_too_large", "headers", message, allowed))
 
     def refuse(self, refusal: Refusal) -> None:
-        """Answer to nothing that could be read, and close."""
+        """Answer to what is not read on, and close soon."""
         response = refusal.response()
         head = b"".join(name + b": " + value + b"\r\n" for name, value in response.raw_headers)
         line = STATUS_LINE[response.status_code]
         close = b"connection: close\r\n\r\n"
         self.transport.write(line + head + close + bytes(response.body))
-        self.transport.close()
+        self.transport.pause_reading()
+        self.give_up()
+        self.refused = True
+        self.loop.call_later(LINGER, self.transport.abort)
 
     def pause_writing(self) -> None:
         """Wait for a client that does not read, but not for ever, and not for too many."""

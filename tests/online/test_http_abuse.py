@@ -71,6 +71,19 @@ def test_a_head_without_an_end_is_refused_at_once(url, status, begin, more):
     assert error["allowed"] == {"max_bytes": server.MOST_HEAD}
 
 
+def test_who_sends_too_much_is_kept_from_sending_more(url):
+    """It would be back with the next at once."""
+    start = time.perf_counter()
+    with connect(url) as connection:
+        connection.sendall(b"GET /" + 20_000 * b"a")
+        connection.settimeout(5.0)
+        assert connection.recv(65536).startswith(b"HTTP/1.1 414 ")
+        with suppress(ConnectionError):
+            while True:
+                connection.sendall(65536 * b"a")
+    assert time.perf_counter() - start > 0.9 * server.LINGER
+
+
 def test_a_long_body_is_no_long_head(serving):
     body = b'{"contacts": [{"position": [5, 5, 5], "pressure": 4}]}' + 50_000 * b" "
     head = (

@@ -153,12 +153,15 @@ def observed(session, server, seconds):
 @click.command()
 @click.argument("artifact", type=click.Path(exists=True, path_type=Path))
 @click.option("--seconds", default=20.0)
-def main(artifact, seconds):
+@click.option("--only", default="", help="Attacks whose names contain this.")
+def main(artifact, seconds, only):
     """Print what was found alone and beside each attack."""
     print(f"{'':29}" + "".join(f"{name:>11}" for name in Found._fields))
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / artifact.name).symlink_to(artifact.resolve())
         for name, (how, first, more) in ATTACKS.items():
+            if only not in name:
+                continue
             os.sched_setaffinity(0, CORES)
             server = Server(folder)
             os.sched_setaffinity(server.process.pid, CORES[-1:])

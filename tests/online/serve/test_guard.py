@@ -1,3 +1,4 @@
+import asyncio
 import http.client
 import json
 from contextlib import closing
@@ -7,7 +8,7 @@ import pytest
 
 from palpate.online.client.session import ServiceError, Session
 from palpate.online.serve import guard
-from palpate.online.serve.guard import RateLimit, machine_name
+from palpate.online.serve.guard import RateLimit, Turns, machine_name
 
 from ..conftest import error_of
 
@@ -184,3 +185,28 @@ def test_opening_sessions_has_a_rate(serving):
         statuses = [handshake(url, url) for _ in range(10)]
     assert statuses[:3] == [101, 101, 101]
     assert 429 in statuses[3:]
+
+
+def test_one_request_is_answered_at_a_time_and_the_loop_reads_between_them():
+    async def rounds(count):
+        """Rounds of the event loop in which requests that came at once had their turns."""
+        turns, loop, now, had = Turns(), asyncio.get_running_loop(), [0], []
+
+        def turn_over():
+            now[0] += 1
+            loop.call_soon(turn_over)
+
+        async def ask():
+            await turns.wait()
+            had.append(now[0])
+
+        loop.call_soon(turn_over)
+        asking = [loop.create_task(ask()) for _ in range(count)]
+        await asyncio.sleep(0)
+        asking[3].cancel()  # as where a service ends
+        await asyncio.wait(asking)
+        await ask()  # later ones wait for nobody
+        return had
+
+    had = asyncio.run(rounds(10))
+    assert len(had) == len(set(had)) == 10  # one of them was cancelled
