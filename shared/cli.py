@@ -43,7 +43,7 @@ class Finite(click.FloatRange):
 
 
 class _UserError(click.ClickException):
-    """Shown as one line; the exit code is that of a wrong command line."""
+    """Shown without a traceback; the exit code is that of a wrong command line."""
 
     exit_code = 2
 
@@ -73,7 +73,8 @@ class _Commands(click.Group):
             if said is None or os.environ.get("PALPATE_DEBUG"):
                 raise
             name = getattr(error, "filename", None)
-            raise _UserError(printable(f"{name}: {said}" if name else said)) from error
+            lines = (f"{name}: {said}" if name else said).split("\n")
+            raise _UserError("\n".join(map(printable, lines))) from error
 
 
 @click.group(

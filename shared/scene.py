@@ -422,8 +422,10 @@ def _explain(detail: dict[str, Any]) -> str:
         return f"{path}: unknown key" + (f"; did you mean {near[0]!r}?" if near else "")
     if table and kind == "missing":
         return f"{path}: missing ({table.model_fields[loc[-1]].description})"
-    if kind == "union_tag_not_found":
+    if kind in ("union_tag_not_found", "union_tag_invalid"):
         kinds = ", ".join(own[-1] for own in tables if own and own[:-1] == loc)
-        return f"{path}.{detail['ctx']['discriminator'].strip(chr(39))}: missing (one of {kinds})"
+        key, given = detail["ctx"]["discriminator"].strip("'"), detail["ctx"].get("tag")
+        wrong = ": missing" if given is None else f" = {given!r}: not known"
+        return f"{path}.{key}{wrong} (one of {kinds})"
     shown = "" if isinstance(detail["input"], dict) else f" = {detail['input']!r}"
     return f"{path}{shown}: {detail['msg']}"

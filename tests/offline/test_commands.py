@@ -1,6 +1,7 @@
 """The offline commands as their user meets them, on an artifact of the quick scene."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -112,6 +113,9 @@ REFUSED = {
     "study stability-in-time A": "is elastic",
     "validate A --histories 2": "is elastic",
     "train lost.toml": "geometry.section: lost.csv cannot be read: No such file",
+    "train pipe.toml": "geometry.section: pipe.csv cannot be read: pipe.csv is not a regular file",
+    "train folder.toml": "geometry.section: . cannot be read: Is a directory",
+    "train same.toml": "surface: the support holds all of it",
     "train nested.toml": "nested.toml: not TOML: maximum recursion depth",
     "train many.toml": "more than 200000 elements in all",
     "train tiny.toml": "endoscope.radius = 1e-09: Input should be greater than or equal to 0.01",
@@ -126,7 +130,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(("command", "reason"), REFUSED.items())
-def test_what_makes_no_sense_is_told_in_a_line(
+def test_what_makes_no_sense_is_told(
     run, artifact, visco_artifact, tmp_path, monkeypatch, command, reason
 ):
     monkeypatch.chdir(tmp_path)
@@ -134,19 +138,36 @@ def test_what_makes_no_sense_is_told_in_a_line(
     quick, turbinate = (find_scene(name).text for name in ("quick", "turbinate"))
     scenes = {
         "lost": turbinate.replace("inferior_turbinate_section.csv", "lost.csv"),
+        "pipe": turbinate.replace("inferior_turbinate_section.csv", "pipe.csv"),
+        "folder": turbinate.replace("inferior_turbinate_section.csv", "."),
+        "same": quick.replace('side = "top"', 'side = "bottom"'),
         "nested": "a = " + 5000 * "[" + 5000 * "]",
         "many": quick.replace("[4, 4, 3]", "[500, 500, 500]"),
         "tiny": quick.replace("radius = 2.0 ", "radius = 1e-9 "),
     }
     (tmp_path / "full.vtu").symlink_to("/dev/full")
+    os.mkfifo(tmp_path / "pipe.csv")
     for name, text in scenes.items():
         (tmp_path / f"{name}.toml").write_text(text)
     named = {"A": artifact, "V": visco_artifact}
     result = run(*(named.get(word, word) for word in command.split()))
     assert result.exit_code == 2
-    told = result.stderr.splitlines()[-1]
-    assert told.startswith("Error: ")
+    _, error, told = result.stderr.rpartition("Error: ")
+    assert error
     assert reason in told
+    assert all(line.startswith("  ") for line in told.splitlines()[1:])
+
+
+def test_all_that_is_wrong_with_a_scene_is_told_a_line_each(run, tmp_path):
+    path = tmp_path / "own.toml"
+    path.write_text('name = "own"\ngeometry.kind = "ball"\nloads.max_indentation = 1\n')
+    result = run("train", path, "--check")
+    assert result.exit_code == 2
+    first, *faults = result.stderr.splitlines()
+    assert first == f"Error: {path}:"
+    assert "  geometry.kind = 'ball': not known (one of extrusion, block)" in faults
+    assert "  loads: unknown key; did you mean 'load'?" in faults
+    assert len(faults) == 8
 
 
 @pytest.mark.parametrize("shape", ["block", "section"])
