@@ -18,13 +18,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from io import BufferedRandom, BufferedReader
 from pathlib import Path
-from types import UnionType
 from typing import Any, NamedTuple, get_args, get_type_hints
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.shared.arrays import number_type
 from palpate.shared.errors import PalpateError
 from palpate.shared.files import open_regular
 
@@ -141,10 +141,8 @@ def _stored_fields(kind: type) -> dict[str, Stored]:
 
 
 def _number_type(kind: Any) -> Any:
-    """Type of the numbers of an annotated array, which may be absent; None if it may be any."""
-    if isinstance(kind, UnionType):
-        kind = get_args(kind)[0]
-    dtype = get_args(get_args(kind)[1])[0] if get_args(kind) else np.float64
+    """Type of the numbers of an annotated array or number; None if it may be any."""
+    dtype = number_type(kind) if get_args(kind) else np.float64
     return None if dtype is Any else dtype
 
 

@@ -70,7 +70,8 @@ class _Commands(click.Group):
             raise _UserError(f"this needs {error.name}: {extra}") from error
         except (PalpateError, OSError) as error:
             said = error.strerror if isinstance(error, OSError) else str(error)
-            if said is None or os.environ.get("PALPATE_DEBUG"):
+            ended = isinstance(error, BrokenPipeError)  # `head`, say: click knows what to do
+            if said is None or ended or os.environ.get("PALPATE_DEBUG"):
                 raise
             name = getattr(error, "filename", None)
             lines = (f"{name}: {said}" if name else said).split("\n")

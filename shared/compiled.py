@@ -16,6 +16,8 @@ from numba.core import imputils
 from numba.experimental import structref
 from numba.extending import intrinsic, overload, overload_method
 
+from palpate.shared.arrays import number_type
+
 T = TypeVar("T")
 
 
@@ -139,5 +141,5 @@ def room(kind: type[T], **sizes: int) -> T:
                 math.prod(int(f) if f.isdigit() else sizes[f] for f in axis.split())
                 for axis in text.split(",")
             ]
-            arrays.append(np.zeros(product, get_args(get_args(array)[1])[0]))
+            arrays.append(np.zeros(product, number_type(array)))
     return kind(*arrays)

@@ -417,7 +417,7 @@ class ReducedModel:
             tip=True,
             position=at,
             contact=touched,
-            footprint=_footprint(found, radius, tip=True) if touched else None,
+            footprint=_footprint(found, radius, tip=True) if touched and found.area > 0.0 else None,
             tangent=found.tangent.copy(),
             depth=depth,
             penetration=found.penetration.item(),

@@ -39,6 +39,7 @@ from palpate.online.serve.wire import BINARY, JSON, MSGPACK, OFFERED, negotiate
 from palpate.online.session import frames, websocket
 from palpate.online.session.session import Sessions
 from palpate.shared.answer import Answers
+from palpate.shared.arrays import number_type
 from palpate.shared.errors import PalpateError, QueryError
 from palpate.shared.files import printable
 from palpate.shared.mechanics.footprint import TIP_DEPTH
@@ -205,9 +206,7 @@ class ManyRoute(APIRoute):
         return handle
 
 
-_OF_ANSWERS = {
-    field: get_args(get_args(hint)[1])[0] for field, hint in get_type_hints(layout.Answers).items()
-}
+_OF_ANSWERS = {field: number_type(hint) for field, hint in get_type_hints(layout.Answers).items()}
 """Types of the arrays that answer a list."""
 
 

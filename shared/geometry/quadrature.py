@@ -48,7 +48,7 @@ def surface_quadrature(
 ) -> SurfaceQuadrature:
     """Gauss points of boundary faces, one to each ``spacing`` mm of an edge, at least two.
 
-    They feed mesh nodes.
+    They feed mesh nodes.  Raises `PalpateError` if a face has no area somewhere.
     """
     X = nodes[faces]
     edges = np.linalg.norm(X[:, [1, 2, 3, 0]] - X[:, :4], axis=2)
@@ -63,6 +63,8 @@ def surface_quadrature(
         tangents = np.einsum("fai,qaj->fqij", X[own], dN)
         normals = np.cross(tangents[..., 0], tangents[..., 1])
         areas = np.linalg.norm(normals, axis=-1)
+        if not areas.min() > 0.0:
+            raise PalpateError("mesh: a face of the boundary has no area somewhere")
         parts.append(
             (
                 np.einsum("qa,fai->fqi", N, X[own]).reshape(-1, 3),

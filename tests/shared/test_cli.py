@@ -1,3 +1,4 @@
+import errno
 import os
 import subprocess
 import sys
@@ -60,6 +61,15 @@ def test_our_errors_are_one_line_and_show_their_origin_when_asked(run, monkeypat
     assert result.output == "Error: pressure: must be 0 to 9 kPa, not -1\n"
     monkeypatch.setenv("PALPATE_DEBUG", "1")
     assert isinstance(run("fail").exception, PalpateError)
+
+
+def test_who_reads_no_more_of_what_is_printed_is_told_nothing(run, monkeypatch):
+    def fail():
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+
+    entry = SimpleNamespace(load=lambda: click.Command("fail", callback=fail))
+    monkeypatch.setattr(cli, "entry_points", lambda **_: [entry])
+    assert run("fail").output == ""
 
 
 HIDE = """
