@@ -62,12 +62,11 @@ class Body(Mesh):
 
     @classmethod
     def of(cls, arrays: Mapping[str, NDArray[Any]], scene: Scene) -> Self:
-        """Body of an artifact of this scene; raises `PalpateError` if a face has no area."""
+        """Body of an artifact of this scene."""
         law = law_of(scene.tissue, len(arrays["elements"]))
-        tip = tip_of(scene.endoscope.radius, scene.tissue)
-        body = cls(**values_of(cls, arrays), law=law, tip=tip)
-        _ = body.boundary  # which refuses
-        return body
+        return cls(
+            **values_of(cls, arrays), law=law, tip=tip_of(scene.endoscope.radius, scene.tissue)
+        )
 
     @cached_property
     def gradients(self) -> Array:

@@ -120,16 +120,20 @@ class ReducedModel:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Load an artifact.
+        """Load an artifact, and make all that queries need of it.
 
         Raises
         ------
         ArtifactError
+            Also where its contents do not fit together.
         """
         path = Path(path)
         artifact = read_artifact(path, *STORED)
         try:
-            return cls.from_artifact(artifact)
+            model = cls.from_artifact(artifact)
+            for in_time in {False, bool(model.scene.tissue.prony)}:
+                model._own.workspace(False, in_time)
+            return model
         except Exception as error:  # whatever its contents lead to
             what = error if isinstance(error, PalpateError) else repr(error)
             raise ArtifactError(f"{path}: incomplete or inconsistent: {what}") from error

@@ -7,6 +7,7 @@ import { Readings, digits } from "./readings.js";
 import { Player, Recording } from "./recording.js";
 import { Refused, getArrays, getJson, postForArrays } from "./service.js";
 import { Session } from "./session.js";
+import { Task } from "./task.js";
 import { Tool } from "./tool.js";
 import { add, across, cross, dot, norm, scale, unit } from "./vectors.js";
 import { MOST_PARTS, View } from "./view.js";
@@ -33,7 +34,7 @@ class Page {
       level: () => this.showLevel(),
     });
     this.log = [];
-    this.recording = this.player = null;
+    this.recording = this.recorded = this.player = this.task = null;
     this.fetching = new Set();
     this.dark = matchMedia("(prefers-color-scheme: dark)");
     this.dark.onchange = () => { this.changed = true; };
@@ -60,11 +61,16 @@ class Page {
     element("snapshot").onclick = () => { this.session?.command("snapshot"); element("restore").disabled = false; };
     element("restore").onclick = () => { this.session?.command("restore"); this.sentAt = null; };
     element("record").onclick = () => this.record();
+    for (const kind of ["csv", "h5"]) element(`save-${kind}`).onclick = () => this.save(kind);
     element("play").onchange = ({ target }) => this.play(target.files[0]);
+    element("task").onchange = ({ target }) => this.set(target.files[0]);
+    element("again").onclick = () => { this.task.again(); this.changed = true; };
     document.addEventListener("dragover", (event) => event.preventDefault());
     document.addEventListener("drop", (event) => {
       event.preventDefault();
-      this.play(event.dataTransfer.files[0]);
+      const [file] = event.dataTransfer.files;
+      if (file?.name.endsWith(".json")) this.set(file);
+      else this.play(file);
     });
     document.addEventListener("visibilitychange", () => {
       this.last = seconds();
@@ -184,19 +190,27 @@ class Page {
     }
     this.showLevel();
     if (sessions) {
-      this.session = new Session(this.name, {
-        greeting: (greeting) => this.greeted(greeting),
-        reply: (reply, trip) => this.replied(reply, trip),
-        state: (state, words) => this.linked(state, words),
-      });
+      this.connect();
     } else {
       this.linked("open", "");
     }
   }
 
+  /** Begin a session. */
+  connect() {
+    this.session?.close();
+    this.session = new Session(this.name, {
+      greeting: (greeting) => this.greeted(greeting),
+      reply: (reply, trip, frames) => this.replied(reply, trip, frames),
+      obeyed: (command, value) => this.recording?.obeyed(command, value),
+      state: (state, words) => this.linked(state, words),
+    });
+  }
+
   /** A session is open; where the scene has been trained anew, its body is another. */
   greeted(greeting) {
     this.sentAt = null;
+    if (this.recording) this.recording.greeting ??= greeting;
     if (this.ratio !== 1) this.session.command("young", this.young);
     if (greeting.artifact !== this.scene.artifact) this.open(this.name, new URLSearchParams(this.told));
   }
@@ -290,6 +304,8 @@ class Page {
     }
     if (!this.session || this.session.reader) this.opened ??= now; // s since the address was given
     this.readings.show(now, this.scene.tolerance, this.level());
+    element("again").hidden = !this.task;
+    element("score").textContent = this.task?.words() ?? "";
   }
 
   fit() {
@@ -334,7 +350,7 @@ class Page {
     session.send(position, outputs);
   }
 
-  replied(reply, trip) {
+  replied(reply, trip, frames) {
     const now = seconds();
     const answer = {
       ...reply, trip_ms: trip, solve_ms: 1e3 * reply.solve_time, largest_stress: reply.max_von_mises,
@@ -344,25 +360,49 @@ class Page {
       },
     };
     this.answered(answer, now, this.sentAt);
-    if (this.recording && this.sentAt) {
-      this.recording.take(now, this.sentAt, reply);
-      element("record").textContent = `Save ${this.recording.rows.length} answers`;
+    if (this.recording) {
+      this.recording.take(now, this.sentAt, reply, frames);
+      element("record").textContent = `End after ${this.recording.rows.length} answers`;
     }
     this.shape(reply, now);
   }
 
-  /** Begin to record answers, or end it and save them as CSV. */
+  /** Begin to record, with a session of its own, or end it; then it can be saved. */
   record() {
-    if (this.recording?.rows.length) {
-      const file = new Blob([this.recording.text()], { type: "text/csv" });
-      const link = Object.assign(document.createElement("a"), {
-        href: URL.createObjectURL(file), download: `${this.recording.scene}.csv`,
-      });
-      link.click();
-      setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+    if (this.recording) {
+      this.recorded = this.recording.rows.length ? this.recording : this.recorded;
+      this.recording = null;
+    } else {
+      this.recording = new Recording(this.name, seconds());
+      this.connect();
     }
-    this.recording = this.recording ? null : new Recording(this.name, seconds());
     element("record").textContent = this.recording ? "Recording …" : "Record";
+    element("save").hidden = !this.recorded;
+  }
+
+  /** Save what has been recorded, as "csv" or as "h5". */
+  async save(kind) {
+    try {
+      const address = URL.createObjectURL(await this.recorded[kind]());
+      const link = { href: address, download: `${this.recorded.scene}.${kind}` };
+      Object.assign(document.createElement("a"), link).click();
+      setTimeout(() => URL.revokeObjectURL(address), 10000);
+    } catch (error) {
+      this.say(error.message);
+    }
+  }
+
+  /** Set a task, which is a JSON file. */
+  async set(file) {
+    if (!file) return;
+    try {
+      this.task = new Task(await file.text());
+      this.changed = true;
+      this.say("");
+    } catch (error) {
+      this.say(`${file.name}: ${error.message}`);
+    }
+    element("task").value = "";
   }
 
   /** Play a recording: the tip goes where it was, and the tissue answers anew. */
@@ -506,6 +546,7 @@ class Page {
   }
 
   release() {
+    this.task?.take(seconds(), null, 0);
     this.answer = this.readings.answer = this.pressed = this.stress = null;
     this.view.showField(null);
     this.view.showStress(null);
@@ -519,6 +560,7 @@ class Page {
     this.stress = answer.stress;
     this.readings.take(answer, now);
     this.view.showStress(answer.stress);
+    this.task?.take(now, answer.CONTACT ? answer.contact_point : null, norm(answer.force));
     this.log.push({ asked, force: answer.force, position: answer.position, flags: answer.flags });
     if (this.log.length > LOGGED) this.log.shift();
     this.changed = true;
@@ -548,7 +590,7 @@ class Page {
     const { answer, tool, scene, readings } = this, colouring = element("colouring").value;
     const { radius } = scene.ranges, legend = this.measure(colouring);
     readings.drawLegend(legend);
-    const parts = { tool: null, arrow: null };
+    const parts = { tool: null, arrow: null, task: this.task };
     if (tool.place) {
       const axis = scene.serves.sessions || !tool.active ? tool.place.normal : scale(this.direction(), -1);
       const tip = scene.serves.sessions, ghost = !tool.active && tool.now <= 0;

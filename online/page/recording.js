@@ -1,29 +1,58 @@
-// Recordings: what a session answers, as CSV, and positions of one that are played again.
+// Recordings: what a session answers, as CSV and HDF5, and positions of one that are played again.
+
+import { postArrays } from "./service.js";
 
 const COLUMNS = [
   "time", "asked_x", "asked_y", "asked_z", "x", "y", "z", "force_x", "force_y", "force_z",
   "flags", "error_displacement", "error_von_mises", "error_force",
 ];
-const MOST = 500000; // rows: some two hours of a page
+const MOST = 90000; // answers: some 25 minutes of a page; the service takes 100 000 at once
+const ORDERS = ["snapshot", "restore", "young"]; // by their numbers in the HDF5 file
 const AFTER = 0.2; // s that the last position of a recording is played
 
-/** Answers as they come; a file of them is what `palpate identify` reads, in s, mm and mN. */
+/**
+ * Answers as they come from the beginning of a session: a CSV file of them is what `palpate
+ * identify` reads, in s, mm and mN; an HDF5 file is what `palpate replay` answers again.
+ */
 export class Recording {
   constructor(scene, now) {
-    Object.assign(this, { scene, start: now, rows: [] });
+    const kept = { rows: [], requests: [], replies: [], received: [], commands: [] };
+    Object.assign(this, { scene, start: now, greeting: null, ...kept });
   }
 
-  take(now, asked, reply) {
+  take(now, asked, reply, frames) {
     if (this.rows.length >= MOST) return;
+    this.requests.push(frames.request);
+    this.replies.push(frames.reply);
+    this.received.push(now);
     this.rows.push([
       now - this.start, ...asked, ...reply.position, ...reply.force, reply.flags,
       reply.error_displacement, reply.error_von_mises, reply.error_force,
     ]);
   }
 
-  text() {
-    return [COLUMNS, ...this.rows].map((row) => `${row.join()}\n`).join("");
+  obeyed(name, value) {
+    this.commands.push([this.rows.length, ORDERS.indexOf(name), value]);
   }
+
+  csv() {
+    const lines = [COLUMNS, ...this.rows].map((row) => `${row.join()}\n`);
+    return new Blob(lines, { type: "text/csv" });
+  }
+
+  /** The HDF5 file, which the service makes. */
+  async h5() {
+    const { greeting, commands, requests, replies, received } = this;
+    return postArrays("recordings", { greeting, commands }, {
+      received: Float64Array.from(received), requests: joined(requests), replies: joined(replies),
+    });
+  }
+}
+
+function joined(frames) {
+  const size = frames[0]?.length ?? 0, bytes = new Uint8Array(size * frames.length);
+  frames.forEach((frame, i) => bytes.set(frame, i * size));
+  return bytes;
 }
 
 /** Positions (mm) of the tip over time, of a recording's text; throws what is wrong with it. */

@@ -1,6 +1,7 @@
 // Requests to the service, its refusals, and the binary layout of its answers.
 
 const BINARY = "application/octet-stream";
+const MAGIC = 0x504c5054;
 const TOKEN = "palpate-token";
 const TYPES = {
   float64: Float64Array, float32: Float32Array, int32: Int32Array, int16: Int16Array,
@@ -78,6 +79,13 @@ export async function postForArrays(path, body) {
   return decode(await response.arrayBuffer());
 }
 
+/** Send a document of the binary layout; return the file that comes back. */
+export async function postArrays(path, head, arrays) {
+  const headers = { "Content-Type": BINARY };
+  const response = await send(path, { method: "POST", headers, body: encode(head, arrays) });
+  return response.blob();
+}
+
 /** Address of a session; with a ticket where the service asks for a token. */
 export async function sessionAddress(scene) {
   const address = new URL(`scenes/${encodeURIComponent(scene)}/session`, document.baseURI);
@@ -90,11 +98,31 @@ export async function sessionAddress(scene) {
   return address.href;
 }
 
+/** Write the binary layout; arrays are typed, wider ones first. */
+function encode(head, arrays) {
+  let offset = 0;
+  const entries = Object.entries(arrays).map(([name, array]) => {
+    const [dtype] = Object.entries(TYPES).find(([, Type]) => array instanceof Type);
+    offset += array.byteLength;
+    return { name, dtype, shape: [array.length], offset: offset - array.byteLength };
+  });
+  const text = new TextEncoder().encode(JSON.stringify({ ...head, arrays: entries }));
+  const padded = new Uint8Array(8 * Math.ceil(text.length / 8)).fill(0x20);
+  padded.set(text);
+  const prefix = new DataView(new ArrayBuffer(16));
+  prefix.setUint32(0, MAGIC);
+  prefix.setUint16(4, 1, true);
+  prefix.setUint16(6, entries.length, true);
+  prefix.setUint32(8, padded.length, true);
+  prefix.setUint32(12, offset, true);
+  return new Blob([prefix, padded, ...Object.values(arrays)]);
+}
+
 /** Read the binary layout: a prefix of 16 bytes, a head in JSON, arrays viewed in place. */
 export function decode(buffer) {
   const wrong = new Refused(0, "garbage", "The service's answer makes no sense.");
   const view = new DataView(buffer);
-  if (buffer.byteLength < 16 || view.getUint32(0) !== 0x504c5054) throw wrong;
+  if (buffer.byteLength < 16 || view.getUint32(0) !== MAGIC) throw wrong;
   const start = 16 + view.getUint32(8, true);
   if (start + view.getUint32(12, true) !== buffer.byteLength) throw wrong;
   try {

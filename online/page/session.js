@@ -63,7 +63,8 @@ class Reader {
 /**
  * Keeps a session with a scene open, and says how it stands.
  *
- * `on.greeting(greeting)`, `on.reply(reply, roundTrip)` and `on.state(state, words)` are called;
+ * `on.greeting(greeting)`, `on.reply(reply, roundTrip, frames)`, `on.obeyed(command, value)` and
+ * `on.state(state, words)` are called;
  * states are "open", "waiting" (for the service), "refused" and "closed".
  */
 export class Session {
@@ -108,9 +109,10 @@ export class Session {
 
   take(data) {
     if (typeof data !== "string") {
-      const reply = this.reader.read(data), at = this.sent.get(reply.seq);
+      const reply = this.reader.read(data), { at, request } = this.sent.get(reply.seq);
       this.sent.clear(); // those before it were passed over for it
-      this.on.reply(reply, performance.now() - at);
+      const head = new Uint8Array(data, 0, this.reader.layout.reply.size);
+      this.on.reply(reply, performance.now() - at, { request, reply: head.slice() });
       return;
     }
     const said = JSON.parse(data);
@@ -127,6 +129,8 @@ export class Session {
     } else if (said.error) {
       this.sent.clear();
       this.on.state("open", said.error.message);
+    } else {
+      for (const [name, value] of Object.entries(said)) this.on.obeyed(name, value);
     }
   }
 
@@ -140,7 +144,7 @@ export class Session {
     view.setUint32(4, this.sequence, true);
     view.setFloat64(8, performance.now() / 1000, true);
     position.forEach((x, i) => view.setFloat64(16 + 8 * i, x, true));
-    this.sent.set(this.sequence, performance.now());
+    this.sent.set(this.sequence, { at: performance.now(), request: new Uint8Array(view.buffer) });
     this.socket.send(view.buffer);
   }
 

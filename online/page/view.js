@@ -384,7 +384,7 @@ export class View {
     return true;
   }
 
-  /** Draw `{camera, colouring, range, tool, arrow, dark}`; see `drawTool` for the tool. */
+  /** Draw `{camera, colouring, range, task, tool, arrow, dark}`; see `drawTool` for the tool. */
   draw(scene) {
     const { gl } = this, matrix = scene.camera.matrix(), eye = scene.camera.eye();
     gl.viewport(0, 0, this.canvas.width, this.canvas.height);
@@ -408,6 +408,7 @@ export class View {
     gl.useProgram(this.solid.program);
     gl.uniformMatrix4fv(this.solid.uniforms.camera, false, matrix);
     gl.uniform3fv(this.solid.uniforms.eye, eye);
+    if (scene.task) this.drawTask(scene.task);
     if (scene.tool) this.drawTool(scene.tool);
     if (scene.arrow) this.drawArrow(scene.arrow);
     gl.disable(gl.BLEND);
@@ -453,6 +454,15 @@ export class View {
     this.drawShape(this.shapes.rod, placing(centre, axis, radius, length), [0.75, 0.8, 0.86, 0.5 * paint[3]]);
     gl.disable(gl.CULL_FACE);
     gl.depthMask(true);
+  }
+
+  /** Draw the points of a task: those passed, the next, and those to come. */
+  drawTask({ path, passed, reach }) {
+    path.forEach((point, i) => {
+      const paint = i < passed ? [0.3, 0.8, 0.4, 0.9] : i === passed ? [1, 0.85, 0.1, 1] : [0.9, 0.9, 0.95, 0.8];
+      const radius = (i === passed ? 0.5 : 0.3) * reach;
+      this.drawShape(this.shapes.sphere, placing(point, [0, 0, 1], radius, radius), paint);
+    });
   }
 
   /** Draw an arrow: `{from, along, width}`, seen through whatever is before it. */

@@ -37,6 +37,7 @@ from palpate.online.serve.schemas import (
 from palpate.online.serve.service import ServedModel, Service
 from palpate.online.serve.wire import BINARY, JSON, MSGPACK, OFFERED, negotiate
 from palpate.online.session import frames, websocket
+from palpate.online.session.recording import recorded
 from palpate.online.session.session import Sessions
 from palpate.shared.answer import Answers
 from palpate.shared.arrays import number_type
@@ -49,6 +50,11 @@ logger = logging.getLogger(__name__)
 
 LOOKED = 1.0
 """Seconds between looks for artifacts that have been added, replaced or removed."""
+
+MOST_RECORDED = 32 * 1024**2
+"""Bytes of a recording that a page hands in: 100 000 answers."""
+
+RECORDING = "application/x-hdf5"
 
 DECODING = "palpate.decoding"
 """Key in the ASGI scope of when the decoding of the body began, s of `time.perf_counter`."""
@@ -393,6 +399,30 @@ async def ticket(request: Request) -> Any:
     return _json({"ticket": issued, "valid_s": tickets.VALID})
 
 
+@service.post(
+    "/recordings",
+    response_class=Response,
+    responses={
+        200: {"description": "The file", "content": {RECORDING: {}}},
+        **_problems(413, 415, 422),
+    },
+)
+async def recording(request: Request) -> Response:
+    """Make of the frames that a page kept of a session the file that ``palpate replay`` reads.
+
+    The body is in the binary layout: a head with the session's ``greeting`` and ``commands`` (rows
+    of the number of replies before it, its number and value), and arrays ``requests`` and
+    ``replies``, the bytes of the frames, and ``received``, s.
+    """
+    body = await _read(request, MOST_RECORDED, BINARY)
+    try:
+        # in a thread: answers need not wait for it
+        file = await asyncio.to_thread(lambda: recorded(*layout.decode(body)))
+    except PalpateError as error:
+        raise Refusal("invalid_value", "body", str(error)) from None
+    return Response(file, media_type=RECORDING)
+
+
 @scenes.get("", response_model=schemas.SceneList, responses=_problems())
 async def served_scenes(request: Request) -> Any:
     """List the scenes that are served, and the files that had to be refused."""
@@ -542,12 +572,13 @@ async def _read(request: Request, limit: int, *kinds: str) -> bytes:
     if content_type.split(";", 1)[0].strip().lower() not in allowed:
         message = "The body must be JSON" if not kinds else "The body is none of what is read here"
         raise Refusal("unsupported_media_type", "content-type", message, allowed)
-    body = b""
+    chunks, length = [], 0
     async for chunk in request.stream():
-        body += chunk
-        if len(body) > limit:
+        chunks.append(chunk)
+        length += len(chunk)
+        if length > limit:
             raise Refusal("body_too_large", "body", "The body is too large", {"max_bytes": limit})
-    return body
+    return b"".join(chunks)
 
 
 def _json(document: dict[str, Any]) -> Response:

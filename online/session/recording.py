@@ -10,15 +10,17 @@ follow one another: each begins with a reply that says `Flag.FIRST`.
 
 import json
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.online.session.frames import REPLY, REPLY_FIELDS, Field, Request
+from palpate.online.session.frames import REPLY, REPLY_FIELDS, REQUEST, Field, Request
 from palpate.shared.arrays import Array
 from palpate.shared.errors import PalpateError
 
@@ -37,6 +39,8 @@ ASKED = (
     Field("received", "float64", "s", "when the reply came, on the client's clock"),
 )
 
+_ASKED = np.dtype([(f.name, f.type, f.shape) for f in ASKED])
+
 ORDERS = "snapshot", "restore", "young"
 """Commands of a session by their numbers in a recording."""
 
@@ -49,7 +53,7 @@ COMMANDS = Field("commands", "float64", "", _COMMAND, (3,))
 class Recorder:
     """Writes a session with this greeting to a file, which is overwritten, as it goes."""
 
-    def __init__(self, path: Path, greeting: dict[str, Any]) -> None:
+    def __init__(self, path: Path | BinaryIO, greeting: dict[str, Any]) -> None:
         self._requests: OrderedDict[int, Request] = OrderedDict()
         self._asked: list[tuple[Any, ...]] = []
         self._replies: list[bytes] = []
@@ -82,7 +86,18 @@ class Recorder:
     def obeyed(self, command: str, value: float) -> None:
         """Note that a command was obeyed after the replies received so far."""
         replies = len(self._file["seq"]) + len(self._replies)
-        _append(self._file[COMMANDS.name], [(replies, ORDERS.index(command), value)])
+        self.commands([(replies, ORDERS.index(command), value)])
+
+    def commands(self, rows: Sequence[Any] | NDArray[Any]) -> None:
+        """Write rows of ``COMMANDS``."""
+        _append(self._file[COMMANDS.name], rows)
+
+    def exchanged(self, asked: NDArray[Any], replies: NDArray[Any]) -> None:
+        """Write what was asked, with fields as in ``ASKED``, and the replies to it."""
+        for table in (asked, replies):
+            for name in table.dtype.names or ():
+                _append(self._file[name], table[name])
+        self._file.flush()
 
     def close(self) -> None:
         """Write what is left and close the file."""
@@ -92,16 +107,49 @@ class Recorder:
     def _write(self) -> None:
         if not self._replies:
             return
-        asked = np.array(self._asked, [(f.name, f.type, f.shape) for f in ASKED])
-        for table in (asked, np.frombuffer(b"".join(self._replies), REPLY)):
-            for name in table.dtype.names or ():
-                _append(self._file[name], table[name])
-        self._file.flush()
+        self.exchanged(np.array(self._asked, _ASKED), np.frombuffer(b"".join(self._replies), REPLY))
         self._asked.clear()
         self._replies.clear()
 
 
+def recorded(head: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    """File of a session of which a client kept all frames.
+
+    Parameters
+    ----------
+    head : dict
+        ``greeting``, as it came, and ``commands``, rows of `COMMANDS`.
+    arrays : mapping
+        ``requests`` and ``replies``, bytes of the frames (without what replies hold on request),
+        those that were answered and their answers, in order; ``received``, when they came, s.
+
+    Raises
+    ------
+    PalpateError
+        If they are none.
+    """
+    try:
+        requests = np.frombuffer(arrays["requests"].tobytes(), REQUEST)
+        replies = np.frombuffer(arrays["replies"].tobytes(), REPLY)
+        commands = np.array(head["commands"], float).reshape(-1, *COMMANDS.shape)
+        if not np.array_equal(requests["seq"], replies["seq"]):
+            raise ValueError("the replies are not those to the requests")
+        if not (np.isfinite(commands).all() and np.isin(commands[:, 1], range(len(ORDERS))).all()):
+            raise ValueError("a command is none")
+        asked = np.zeros(len(replies), _ASKED)
+        asked["asked_position"], asked["asked_outputs"] = requests["position"], requests["outputs"]
+        asked["received"] = arrays["received"]
+        with closing(Recorder(file := BytesIO(), dict(head["greeting"]))) as recorder:
+            recorder.exchanged(asked, replies)
+            recorder.commands(commands)
+    except (KeyError, TypeError, ValueError) as error:
+        raise PalpateError(f"not what was kept of a session: {error}") from None
+    return file.getvalue()
+
+
 def _append(dataset: h5py.Dataset, rows: Sequence[Any] | NDArray[Any]) -> None:
+    if len(rows) == 0:
+        return
     dataset.resize(len(dataset) + len(rows), axis=0)
     dataset[-len(rows) :] = rows
 

@@ -1,17 +1,22 @@
 """The page in a browser without a window, as its user meets it."""
 
+import base64
 import json
+import os
 import shutil
 import signal
 import socket
 import time
 from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from palpate.offline.identify import identify
 from palpate.online.client.session import Session
+from palpate.online.session.recording import read_recording
+from palpate.online.session.tracker import replay
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.progress import Progress, tell, training_folder
 
@@ -280,29 +285,45 @@ def test_a_scene_that_is_added_is_offered_and_one_that_goes_is_not(tab, serve, a
         release(tab, *MIDDLE)
 
 
+SAVED = """(async () => {
+    const bytes = new Uint8Array(await (await palpate.recorded.h5()).arrayBuffer());
+    return btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join(""));
+})()"""
+
 PLAY = """async (text) => {
     await palpate.play(new File([text], "played.csv"));
     return document.getElementById("message").textContent;
 }"""
 
 
-def test_what_is_recorded_is_played_again_and_tells_the_modulus(page, atlas, artifact, tmp_path):
+def test_what_is_recorded_is_replayed_played_again_and_tells_the_modulus(
+    page, atlas, artifact, tmp_path
+):
     x, y = MIDDLE
     page.run("palpate.record()")
+    page.wait("palpate.recording.greeting")
     press(page, x, y)
     page.wait("palpate.answer?.CONTACT && palpate.tool.now === palpate.tool.level")
+    page.run("palpate.session.command('snapshot', 1)")
     for step in range(1, 9):
         page.mouse("moved", x + 6 * step, y, button="left", buttons=1)
         time.sleep(0.05)
+    page.run("palpate.session.command('restore', 1)")
     release(page, x + 48, y)
     page.wait("palpate.tool.now < -0.9 && !palpate.answer.CONTACT")
-    text = page.run("palpate.recording.text()")
     page.run("palpate.record()")
     assert page.run("palpate.recording") is None
+    assert page.run("document.getElementById('save').hidden") is False
+    (tmp_path / "recorded.h5").write_bytes(base64.b64decode(page.run(SAVED)))
+    recording = read_recording(tmp_path / "recorded.h5")
+    assert [name for _, name, _ in recording.commands] == ["snapshot", "restore"]
+    assert replay(recording, atlas)["different"] == 0
+    text = page.run("palpate.recorded.csv().text()")
     (tmp_path / "recorded.csv").write_text(text)
+    rows = np.genfromtxt(text.splitlines(), delimiter=",", names=True)
+    assert len(rows) == len(recording.replies)
     found = identify(artifact, tmp_path / "recorded.csv")
     assert found["young"] == pytest.approx(atlas.scene.tissue.young, rel=1e-3)
-    rows = np.genfromtxt(text.splitlines(), delimiter=",", names=True)
     recorded = {(r["asked_x"], r["asked_y"], r["asked_z"]): r["force_z"] for r in rows}
     page.run("palpate.log.length = 0")
     assert page.run(f"({PLAY})({json.dumps(text)})") == ""
@@ -328,3 +349,106 @@ def test_a_recording_that_makes_no_sense_is_told(page, text, why):
     assert said.startswith("played.csv: ")
     assert why in said
     assert page.run("palpate.player") is None
+
+
+SET = PLAY.replace("play(", "set(").replace("played.csv", "task.json")
+
+
+def test_a_task_is_followed_and_scored(page):
+    x, y = MIDDLE
+    path = []
+    for along in (0, 60):
+        press(page, x + along, y)
+        page.wait("palpate.answer?.CONTACT && palpate.tool.now === palpate.tool.level")
+        path.append(page.run("palpate.answer.contact_point"))
+        release(page, x + along, y)
+        page.wait("palpate.tool.now < -0.9 && !palpate.answer.CONTACT")
+    task = {"name": "Across", "path": path, "force_limit": 0.001, "reach": 0.3}
+    assert page.run(f"({SET})({json.dumps(json.dumps(task))})") == ""
+    page.wait("document.getElementById('score').textContent.includes('touch its first point')")
+    page.run("palpate.log.length = 0")
+    press(page, x, y)
+    page.wait("palpate.task.passed === 1")
+    for step in range(1, 11):
+        page.mouse("moved", x + 6 * step, y, button="left", buttons=1)
+        time.sleep(0.05)
+    page.wait("palpate.task.done")
+    release(page, x + 60, y)
+    score = page.run("({ ...palpate.task })")
+    between = np.linalg.norm(np.subtract(*path))
+    assert between - 0.6 < score["length"] < 1.3 * between + 1.0
+    assert 0.4 < score["time"] < 60.0
+    assert score["over"] == pytest.approx(score["time"])  # all of it pressed harder than that
+    largest = max(np.linalg.norm(entry["force"]) for entry in page.run("palpate.log"))
+    assert 0.0 < score["peak"] <= largest + 1e-9
+    page.wait("document.getElementById('score').textContent.startsWith('Across: done')")
+    page.run("document.getElementById('again').click()")
+    assert page.run("palpate.task.passed") == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("{", "This is no JSON"),
+        ("null", '"path"'),
+        ('{"path": [[1, 2, 3]], "force_limit": 1}', '"path" must be 2 to'),
+        ('{"path": [[1, 2, 3], [1, 2, null]], "force_limit": 1}', "[x, y, z]"),
+        ('{"path": [[1, 2, 3], [1, 2, 4]]}', '"force_limit"'),
+        ('{"path": [[1, 2, 3], [1, 2, 4]], "force_limit": 1, "reach": 0}', '"reach"'),
+    ],
+)
+def test_a_task_that_makes_no_sense_is_told(page, text, why):
+    said = page.run(f"({SET})({json.dumps(text)})")
+    assert said.startswith("task.json: ")
+    assert why in said
+    assert page.run("palpate.task") is None
+
+
+def test_modes_that_make_no_sense_are_told_and_the_servers_field_is_shown(page):
+    page.run("""(() => {
+        const real = window.fetch;
+        window.fetch = (path, options) => (String(path).includes("/modes/")
+            ? Promise.resolve(new Response(new Uint8Array(40))) : real(path, options));
+    })()""")
+    press(page, *MIDDLE)
+    page.wait(
+        "document.getElementById('difference').textContent.startsWith('Modes cannot be used')"
+    )
+    page.wait("palpate.answer?.CONTACT && palpate.tool.now === palpate.tool.level")
+    page.wait("Math.max(...palpate.view.readBack()) > 0.01")
+    release(page, *MIDDLE)
+
+
+ENTER = """(() => {
+    document.querySelector("#ask input").value = "%s";
+    document.querySelector("#ask form").requestSubmit();
+})()"""
+
+
+def test_it_asks_for_the_token_until_it_is_right(new_tab, serve, artifact):
+    with serve(artifact.parent, PALPATE_TOKEN="secret") as server:
+        tab = new_tab()
+        tab.open(server.url)
+        tab.wait("document.getElementById('ask')?.open")
+        assert tab.run("document.getElementById('wrong').hidden")
+        tab.run(ENTER % "guess")
+        tab.wait("document.getElementById('ask').open && !document.getElementById('wrong').hidden")
+        tab.run(ENTER % "secret")
+        tab.wait(OPENED)
+        press(tab, *MIDDLE)
+        tab.wait("palpate.answer?.CONTACT")
+        release(tab, *MIDDLE)
+        tab.run("palpate.session.close()")
+
+
+def test_a_picture_of_it(page, tmp_path):
+    """The one in README, if its place is said."""
+    page.size(1280, 720, "light")
+    press(page, *MIDDLE)
+    page.wait("palpate.answer?.CONTACT && palpate.tool.now === palpate.tool.level")
+    time.sleep(1.0)
+    path = Path(os.environ.get("PALPATE_PICTURE", tmp_path / "page.png"))
+    path.write_bytes(page.picture())
+    release(page, *MIDDLE)
+    page.size(1280, 720)
+    assert path.stat().st_size > 20_000

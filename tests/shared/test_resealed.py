@@ -126,3 +126,14 @@ def test_a_dataset_that_claims_to_be_huge_takes_no_memory(whole, tmp_path, monke
     write_artifact(path, whole.scene, whole.documents, datasets)
     with pytest.raises(ArtifactError, match="body_modes"):
         ReducedModel.load(path)
+
+
+@pytest.mark.parametrize(("name", "value"), [("faces", 0), ("patch_centres", 1e3)])
+def test_what_does_not_fit_together_is_refused_when_it_is_loaded(whole, tmp_path, name, value):
+    """A face without an area, and a local model that is far from all faces."""
+    path, values = tmp_path / "apart.h5", whole.arrays[name].copy()
+    values[0] = value
+    datasets = {key: Dataset(a, "1", "") for key, a in (whole.arrays | {name: values}).items()}
+    write_artifact(path, whole.scene, whole.documents, datasets)
+    with pytest.raises(ArtifactError, match="incomplete or inconsistent"):
+        ReducedModel.load(path)

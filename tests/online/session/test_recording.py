@@ -1,5 +1,7 @@
 import json
 import threading
+import urllib.error
+import urllib.request
 
 import h5py
 import numpy as np
@@ -8,6 +10,7 @@ from click.testing import CliRunner
 
 from palpate.online import commands
 from palpate.online.client.session import ServiceError, Session
+from palpate.online.serve import layout
 from palpate.online.session.frames import (
     REPLY_FIELDS,
     Flag,
@@ -65,6 +68,46 @@ def test_a_recording_holds_what_was_asked_and_answered(recorded):
         for field in (*ASKED, *REPLY_FIELDS):
             assert file[field.name].attrs["units"] == field.unit
             assert file[field.name].attrs["description"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "why"),
+    [
+        ({}, "200"),
+        ({"commands": [[0, 1]]}, "reshape"),
+        ({"commands": [[0, 1, None]]}, "a command is none"),
+        ({"commands": [[0, 3, 1.0]]}, "a command is none"),
+        ({"greeting": {}}, "scene"),
+        ({"requests": np.zeros(7, np.uint8)}, "buffer size"),
+        ({"replies": np.zeros(0, np.uint8)}, "not those"),
+        ({"received": np.zeros(3)}, "shape"),
+    ],
+)
+def test_frames_that_were_kept_make_a_recording(recorded, url, tmp_path, wrong, why):
+    recording = read_recording(recorded[0])
+    requests = b"".join(map(encode_request, recording.requests))
+    head = {"greeting": {"scene": "toy"}, "commands": []}
+    arrays = {
+        "received": recording.received,
+        "requests": np.frombuffer(requests, np.uint8),
+        "replies": recording.replies.view(np.uint8),
+    }
+    head |= {name: value for name, value in wrong.items() if name in head}
+    arrays |= {name: value for name, value in wrong.items() if name in arrays}
+    request = urllib.request.Request(
+        f"{url}/recordings", layout.encode(head, arrays), {"Content-Type": layout.BINARY}
+    )
+    if wrong:
+        with pytest.raises(urllib.error.HTTPError, match="422") as refused:
+            urllib.request.urlopen(request)
+        assert why in json.load(refused.value)["error"]["message"]
+        return
+    with urllib.request.urlopen(request) as response:
+        (tmp_path / "again.h5").write_bytes(response.read())
+    again = read_recording(tmp_path / "again.h5")
+    assert again.requests == recording.requests
+    np.testing.assert_array_equal(again.replies, recording.replies)
+    np.testing.assert_array_equal(again.received, recording.received)
 
 
 def test_commands_are_recorded_and_replayed(opening, tmp_path, rng):
