@@ -195,9 +195,13 @@ def info(artifact: Path, errors: bool, as_json: bool) -> None:
     JSON holds the text of the scene as well.
     """
     from palpate.offline.info import budget, info, lines
+    from palpate.shared.artifact import ArtifactError
 
     report = info(artifact)
-    told = budget(report) if errors else lines(report)
+    try:
+        told = budget(report) if errors else lines(report)
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise ArtifactError(f"{artifact}: incomplete or inconsistent: {error!r}") from error
     click.echo(_json(report) if as_json else "\n".join(told))
 
 

@@ -152,7 +152,7 @@ def is_of(path: Path, key: str) -> bool:
     """Whether an artifact is of the scene and code that ``content_key`` stands for."""
     try:
         return bool(artifact.read_artifact(path).documents["provenance"]["content_key"] == key)
-    except artifact.ArtifactError:
+    except (artifact.ArtifactError, LookupError, TypeError):  # it is damaged, or no artifact
         return False
 
 

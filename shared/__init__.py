@@ -54,23 +54,33 @@ def _kernel_cache() -> None:
 def _writable(cache: Path, key: str) -> Path:
     """Folder of kernels in a cache, or where that cannot be written in the user's.
 
-    The latter begins with links to what the former has.  Without either kernels are for once.
+    The latter begins with links to what the former has, as does one for once where there is none.
     """
     own = cache / f"kernels-{key}"
     if os.access(cache if cache.exists() else cache.parent, os.W_OK):
         return own
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "palpate" / own.name
     try:
+        caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        folder = caches / "palpate" / own.name
         folder.parent.mkdir(parents=True, exist_ok=True)
-        if own.is_dir() and not folder.exists():
-            shutil.copytree(own, folder, copy_function=os.symlink, dirs_exist_ok=True)
-        folder.mkdir(exist_ok=True)
-    except OSError:
+        if not folder.exists():
+            _begin_cache(folder, own)
+    except (OSError, RuntimeError):  # the latter of users without a home
         folder = Path(tempfile.mkdtemp(prefix="palpate-"))
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
-        said = "no folder for compiled kernels can be written; set NUMBA_CACHE_DIR to one, or they"
+        _begin_cache(folder, own)
+        said = (
+            "no folder for compiled kernels can be written; set NUMBA_CACHE_DIR to one, or new ones"
+        )
         print(f"palpate: {said} are compiled each time", file=sys.stderr)
     return folder
+
+
+def _begin_cache(folder: Path, own: Path) -> None:
+    """Make a folder of kernels with links to those that the installation has."""
+    folder.mkdir(exist_ok=True)
+    if own.is_dir():
+        shutil.copytree(own, folder, copy_function=os.symlink, dirs_exist_ok=True)
 
 
 def _one_thread_of_blas() -> None:

@@ -5,6 +5,8 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
+from palpate.shared.files import open_regular
+
 FILE = "progress.json"
 
 SILENT = 900.0
@@ -40,7 +42,8 @@ def trainings(directory: Path) -> list[Progress]:
     for path in sorted(directory.glob(f".*.training/{FILE}")):
         try:
             if time.time() - path.stat().st_mtime < SILENT:
-                found.append(Progress(**json.loads(path.read_text())))
+                with open_regular(path) as file:
+                    found.append(Progress(**json.load(file)))
         except (OSError, ValueError, TypeError):  # it has just ended, or is something else
             continue
     return found

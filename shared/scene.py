@@ -30,6 +30,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
 from palpate.shared.errors import PalpateError
+from palpate.shared.files import open_regular
 from palpate.shared.mechanics.laws import AnyTissue
 from palpate.shared.part import Fraction, Length, Part, Positive
 
@@ -374,7 +375,8 @@ def load_scene(path: Path | str) -> Scene:
     """Read a scene file; raise `SceneError` if it is missing or wrong."""
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        with open_regular(path) as file:
+            text = file.read().decode().replace("\r\n", "\n")
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(f"{path}: cannot be read: {error}") from error
     return parse_scene(text, path.parent, source=str(path))

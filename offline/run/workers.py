@@ -80,15 +80,17 @@ def worker_pool(
     left to this process, which stops the workers when they have done their tasks.
     """
     os.environ.update(dict.fromkeys(THREADS, "1"))
+    count = count or os.cpu_count() or 1
     pool = ProcessPoolExecutor(
-        count or os.cpu_count(),
+        count,
         mp_context=multiprocessing.get_context("spawn"),
         initializer=initializer,
         initargs=args,
     )
     interrupt = signal.signal(signal.SIGINT, signal.SIG_IGN)  # which workers inherit
     try:
-        pool.submit(os.getpid)  # starts them
+        for _ in range(count):  # each starts one, since none has done anything yet
+            pool.submit(os.getpid)
     finally:
         signal.signal(signal.SIGINT, interrupt)
     return pool

@@ -101,7 +101,8 @@ class HttpProtocol(HttpToolsProtocol):
         """Take over a connection."""
         super().connection_made(transport)
         self.patience = self.reading = self.loop.call_later(PATIENCE, transport.abort)
-        self.head: int | None = 0  # bytes of it read; None where a body is read
+        self.head: int | None = 0  # bytes of it read, or of what follows a body; None within one
+        self.with_body = False
         self.url = b""
         self.refused = False
         self.asked: list[RequestResponseCycle] = []  # not answered yet
@@ -179,24 +180,33 @@ class HttpProtocol(HttpToolsProtocol):
         self.patience.cancel()
         self.patience = self.loop.call_later(PATIENCE, self.transport.abort)
         self.scope[RECEIVED] = perf_counter()  # type: ignore[literal-required]
-        self.head = 0
+        self.head, self.with_body = 0, False
 
     def on_header(self, name: bytes, value: bytes) -> None:
         """Take a header, but none that comes after a body."""
-        if self.head is not None:
+        if not self.with_body:
             super().on_header(name, value)
 
     def on_headers_complete(self) -> None:
         """Know what is asked."""
         last = self.cycle
         super().on_headers_complete()
-        self.head = None
+        self.head, self.with_body = None, True
         if self.cycle is not last:
             self.asked.append(self.cycle)
         elif any(name in _OF_BODIES for name, _ in self.headers):
             self.refuse(Refusal("invalid_value", "headers", "A handshake has no body"))
         if len(self.pipeline) > MOST_PIPELINED:
             self.transport.abort()
+
+    def on_chunk_header(self) -> None:
+        """Begin a piece of a body; the last is none, and headers may follow it."""
+        self.head = 0
+
+    def on_body(self, body: bytes) -> None:
+        """Take a part of a body."""
+        self.head = None
+        super().on_body(body)
 
     def on_response_complete(self) -> None:
         """Go on to the next request."""

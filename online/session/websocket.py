@@ -91,6 +91,7 @@ class SessionProtocol(WebSocketsSansIOProtocol):
             self.transport.close()
         else:
             super().handle_parser_exception()
+            self.disconnected = True  # what the application still sends goes nowhere
 
     def handle_ping(self) -> None:
         """Answer a ping, unless the answers to those before pile up here."""

@@ -10,7 +10,10 @@ import pytest
 
 from palpate.offline.info import LABELS, budget, closing, percent
 from palpate.offline.scenes import find_scene
+from palpate.offline.train import is_of
+from palpate.shared.artifact import Dataset, read_artifact, write_artifact
 from palpate.shared.cli import main
+from palpate.shared.model import STORED
 from palpate.shared.scene import Errors
 
 CONTACT = ["--at", "4", "5.5", "8", "--pressure", "1.5"]
@@ -156,6 +159,25 @@ def test_what_makes_no_sense_is_told(
     assert error
     assert reason in told
     assert all(line.startswith("  ") for line in told.splitlines()[1:])
+
+
+@pytest.mark.parametrize("missing", ["training", "provenance", "validation"])
+def test_info_refuses_what_lacks_a_document(run, artifact, tmp_path, missing):
+    whole = read_artifact(artifact, *STORED)
+    documents = {name: found for name, found in whole.documents.items() if name != missing}
+    datasets = {name: Dataset(values, "1", "") for name, values in whole.arrays.items()}
+    write_artifact(path := tmp_path / "less.h5", whole.scene, documents, datasets)
+    assert not is_of(path, "another")
+    result = run("info", path)
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"Error: {path}: incomplete or inconsistent: KeyError")
+
+
+def test_a_scene_that_is_a_pipe_is_told(run, tmp_path):
+    os.mkfifo(tmp_path / "pipe.toml")
+    result = run("train", tmp_path / "pipe.toml", "--check")
+    assert result.exit_code == 2
+    assert "is not a regular file" in result.stderr
 
 
 def test_all_that_is_wrong_with_a_scene_is_told_a_line_each(run, tmp_path):

@@ -14,6 +14,7 @@ import pytest
 from palpate.online.client.http import Client
 from palpate.online.client.session import Session
 from palpate.online.serve import process as server
+from palpate.online.session.frames import Request, encode_request
 from palpate.shared.errors import PalpateError
 
 from .conftest import error_of
@@ -69,6 +70,26 @@ def test_a_head_without_an_end_is_refused_at_once(url, status, begin, more):
     assert said.startswith(b"HTTP/1.1 %d " % status)
     error = json.loads(said.partition(b"\r\n\r\n")[2])["error"]
     assert error["allowed"] == {"max_bytes": server.MOST_HEAD}
+
+
+def test_headers_after_a_body_without_an_end_are_refused_at_once(url):
+    begin = HEAD + b"transfer-encoding: chunked\r\n\r\n1\r\n{\r\n0\r\nx: "
+    with witness(url):
+        start = time.perf_counter()
+        answer_to(url, itertools.chain([begin], itertools.repeat(65536 * b"a", 400)))
+        assert time.perf_counter() - start < 2.0
+    assert b"HTTP/1.1 431 " in answer_to(url, [begin + 20_000 * b"a"])
+
+
+def test_pieces_of_a_long_body_are_no_long_head(serving):
+    head = (
+        b"POST /scenes/toy/solve HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\n"
+    )
+    body = b'{"contacts": [{"position": [5, 5, 5], "pressure": 4}]}' + 50_000 * b" "
+    pieces = b"".join(b"%x\r\n%b\r\n" % (len(p), p) for p in (body[:30_000], body[30_000:], b""))
+    with serving() as url, connect(url) as connection:
+        connection.sendall(head + b"transfer-encoding: chunked\r\n\r\n" + pieces)
+        assert connection.recv(65536).startswith(b"HTTP/1.1 200 ")
 
 
 def test_who_sends_too_much_is_kept_from_sending_more(url):
@@ -183,6 +204,17 @@ def test_text_that_is_none_ends_its_session_only(url, parts):
         session._connection.flush()
         with pytest.raises(Exception, match="1007"):
             session.receive()
+
+
+def test_a_good_frame_before_text_that_is_none(url):
+    """Its answer is made when the session has ended."""
+    with witness(url), Session(url, "toy") as session:
+        protocol = session._connection.protocol
+        protocol.send_binary(encode_request(Request(1, 0.0, (5.0, 5.0, 6.5))))
+        protocol.send_text(b"\xff")
+        session._connection.flush()
+        with pytest.raises(Exception, match="1007"):
+            list(iter(session.receive, None))
 
 
 def test_hanging_up_with_answers_unread(url):

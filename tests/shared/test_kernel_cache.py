@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+from palpate import shared
 from palpate.shared import PACKAGES, kernel_sources
 
 
@@ -59,3 +60,17 @@ def test_an_installation_that_cannot_be_written_has_its_kernels_elsewhere(tmp_pa
     else:
         assert not os.path.exists(folder)
         assert "set NUMBA_CACHE_DIR" in run.stderr
+
+
+def test_who_has_no_home_has_the_kernels_of_the_installation_for_once(tmp_path, monkeypatch):
+    def home():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(shared.os, "access", lambda *_: False)
+    monkeypatch.setattr(shared.Path, "home", home)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    (tmp_path / "kernels-abc").mkdir()
+    (tmp_path / "kernels-abc" / "laws.nbi").touch()
+    folder = shared._writable(tmp_path, "abc")
+    assert folder.parent != tmp_path
+    assert [path.name for path in folder.iterdir()] == ["laws.nbi"]

@@ -1,8 +1,10 @@
+import os
+
 import pytest
 
 from palpate.offline.run import progress
 from palpate.offline.run.progress import STAGES, Teller
-from palpate.shared.progress import training_folder, trainings
+from palpate.shared.progress import FILE, training_folder, trainings
 
 
 @pytest.fixture
@@ -29,6 +31,14 @@ def test_the_time_left_follows_from_the_speed_so_far(tmp_path, clock):
     assert told.seconds_left == pytest.approx(0.0, abs=1e-9)
     assert told[:4] == ("toy", list(STAGES)[-1], 10, 10)
     teller.end()
+    assert trainings(tmp_path) == []
+
+
+def test_what_is_no_file_tells_nothing(tmp_path):
+    """A pipe would be waited for."""
+    folder = training_folder(tmp_path / "toy.h5")
+    folder.mkdir()
+    os.mkfifo(folder / FILE)
     assert trainings(tmp_path) == []
 
 

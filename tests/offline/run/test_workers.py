@@ -1,12 +1,15 @@
 """Results on disk: whole ones only, of one process at a time."""
 
+import os
+import signal
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from palpate.offline.run.workers import Checkpoint, content_key, read_result
+from palpate.offline.run.workers import Checkpoint, content_key, read_result, worker_pool
 from palpate.offline.scenes import find_scene
 from palpate.shared.errors import PalpateError
 from palpate.shared.scene import SceneError, load_scene
@@ -73,6 +76,18 @@ def test_a_folder_belongs_to_one_process_until_it_ends(tmp_path):
     assert sorted(path.name for path in folder.iterdir()) == ["key", "lock"]
     checkpoint.leave()
     assert not folder.exists()
+
+
+def handler(_):
+    time.sleep(0.2)  # so that the other worker gets a task, too
+    return os.getpid(), signal.getsignal(signal.SIGINT)
+
+
+def test_no_worker_hears_the_keyboard():
+    with worker_pool(os.getpid, count=3) as pool:
+        found = dict(pool.map(handler, range(9)))
+    assert len(found) == 3
+    assert set(found.values()) == {signal.SIG_IGN}
 
 
 def test_a_section_that_cannot_be_read_is_told(tmp_path):
