@@ -421,7 +421,7 @@ class ReducedModel:
             tip=True,
             position=at,
             contact=touched,
-            footprint=_footprint(found, radius, tip=True) if touched and found.area > 0.0 else None,
+            footprint=_footprint(found, radius, tip=True) if touched else None,
             tangent=found.tangent.copy(),
             depth=depth,
             penetration=found.penetration.item(),
@@ -540,8 +540,10 @@ def _total(
     return total.tolist(), mesh
 
 
-def _footprint(found: Outcome, radius: float, tip: bool) -> Contact:
-    """What presses in an outcome."""
+def _footprint(found: Outcome, radius: float, tip: bool) -> Contact | None:
+    """What presses in an outcome; nothing where it covers none of the surface."""
+    if found.area.item() <= 0.0:
+        return None
     return Contact(
         found.foot.copy(),
         found.upward.copy(),
