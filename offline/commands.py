@@ -19,6 +19,8 @@ class _Artifact(click.Path):
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         named = Path("artifacts", f"{value}.h5")
+        if Path(value).suffix == ".toml":
+            self.fail(f"{value!r} is a scene; palpate train {value} makes its artifact")
         if Path(value).exists() or Path(value).suffix:
             return super().convert(value, param, ctx)
         if not named.exists():

@@ -30,14 +30,14 @@ def info(artifact: Path) -> dict[str, Any]:
     ------
     ArtifactError
     """
-    names = "nodes", "elements", "load_range", "surface_vertices"
+    names = "nodes", "elements", "load_range", "surface_vertices", "surface_normals"
     found = read_artifact(artifact, Mesh, Surface, LoadRange)
     try:
         scene = parse_scene(found.scene)
     except SceneError as error:
         raise ArtifactError(f"{artifact}: incomplete or inconsistent: {error}") from error
-    nodes, elements, limits, vertices = (found.arrays[name] for name in names)
-    depths = limits[:, TIP_DEPTH]
+    nodes, elements, limits, vertices, normals = (found.arrays[name] for name in names)
+    depths, radius = limits[:, TIP_DEPTH], scene.endoscope.radius
     middle = int(np.argmin(np.linalg.norm(vertices - vertices.mean(axis=0), axis=1)))
     return {
         "scene": scene.name,
@@ -57,7 +57,13 @@ def info(artifact: Path) -> dict[str, Any]:
             "tip_depth_limits": [float(depths.min()), float(depths.max())]
             if scene.endoscope.tip
             else None,
-            "example": {"at": vertices[middle].tolist(), "pressure": float(limits[middle, 0]) / 2},
+            "example": {
+                "at": vertices[middle].tolist(),
+                "pressure": float(limits[middle, 0]) / 2,
+                "tip": (vertices[middle] + (radius - depths[middle] / 2) * normals[middle]).tolist()
+                if scene.endoscope.tip
+                else None,
+            },
         },
     } | found.documents
 
@@ -126,6 +132,7 @@ def budget(report: Mapping[str, Any]) -> list[str]:
     tip = report.get("validation_tip", {})
     sources = {
         "mesh": training["mesh_errors"],
+        **({"- of the tip": training["mesh_errors_tip"]} if "mesh_errors_tip" in training else {}),
         "reduction": report["validation"] | ({"force": tip["force"]} if tip else {}),
         "- cubature": training["cubature_errors"],
         "- solver": {"displacement": {"p95": TOLERANCE * math.sqrt(scene.tolerance.looseness)}},
@@ -160,7 +167,8 @@ def _validations(
 def closing(artifact: Path) -> list[str]:
     """What to know of an artifact just trained, and what to do next."""
     report = info(artifact)
-    example, most = report["loads"]["example"], parse_scene(report["text"]).tolerance.reduction
+    example, tolerance = report["loads"]["example"], parse_scene(report["text"]).tolerance
+    most = tolerance.reduction
     place = " ".join(f"{x:.4g}" for x in example["at"])
     errors = [f"{label}: {text}" for label, text in accuracy(report).items()]
     found = report["validation"]
@@ -170,11 +178,22 @@ def closing(artifact: Path) -> list[str]:
             f"this is more than the {asked} that the scene leaves the reduction; most errors are "
             "near the limits: a smaller load.max_indentation lowers them"
         )
-    return [
-        f"{artifact}: {report['bytes'] / 1e6:.1f} MB",
-        *errors,
-        f"next: palpate solve {artifact} --at {place} --pressure {example['pressure']:.2g}",
-    ]
+    for label, _, mesh in _validations(report):
+        over = [
+            f"{COLUMNS[name]} {percent(mesh[name]['p95'])} (tolerance {percent(allowed)})"
+            for name, allowed in tolerance.total._asdict().items()
+            if name in mesh and mesh[name]["p95"] > allowed
+        ]
+        if over:
+            errors.append(
+                f"{label}: the tolerance is missed by the mesh alone: {', '.join(over)}; answers "
+                "estimate it; finer geometry.divisions lower it, and training takes longer"
+            )
+    asked = f"next: palpate solve {artifact} --at"
+    following = [f"{asked} {place} --pressure {example['pressure']:.2g}"]
+    if example["tip"]:
+        following.append(f"{asked} {' '.join(f'{x:.4g}' for x in example['tip'])} --tip")
+    return [f"{artifact}: {report['bytes'] / 1e6:.1f} MB", *errors, *following]
 
 
 def percent(share: float) -> str:

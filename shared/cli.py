@@ -41,6 +41,10 @@ class Finite(click.FloatRange):
             self.fail(f"{value} is not a finite number.", param, ctx)
         return number
 
+    def _describe_range(self) -> str:
+        """Nothing where all finite numbers are allowed."""
+        return "" if self.min is None and self.max is None else super()._describe_range()
+
 
 class _UserError(click.ClickException):
     """Shown without a traceback; the exit code is that of a wrong command line."""

@@ -84,9 +84,13 @@ class Extrusion(Part):
     kind: Literal["extrusion"] = Field(
         description="section along y; sides: lip, outer, tip, inner, posterior, anterior"
     )
-    section: str = Field(min_length=1, description="CSV file of the outline, beside the scene file")
+    section: str = Field(
+        min_length=1,
+        description="CSV file beside the scene file: a line x,z, then 8 or more points around, mm",
+    )
     corners: tuple[Point2, Point2, Point2, Point2] = Field(
-        description="(x, z), mm: lip-outer, outer-tip, tip-inner, inner-lip corner"
+        description="points (x, z) of the outline, mm, clockwise (x right, z up); between them lie "
+        "outer, tip, inner and lip"
     )
     length: Length = Field(description="length along y, mm")
     element: Element = "hex20"

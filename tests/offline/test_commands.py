@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from palpate.offline.info import LABELS, budget, closing, percent
+from palpate.offline.info import LABELS, budget, closing, info, percent
 from palpate.offline.scenes import find_scene
 from palpate.offline.train import is_of
 from palpate.shared.artifact import Dataset, read_artifact, write_artifact
@@ -74,11 +74,23 @@ def test_info_builds_no_model(artifact):
 
 
 def test_what_is_next_after_training_is_a_command_that_works(answer, artifact):
-    *_, following = closing(artifact)
-    assert following.startswith("next: palpate solve ")
-    report = answer(*following.split()[2:])
+    *_, load, tip = closing(artifact)
+    assert load.startswith("next: palpate solve ")
+    report = answer(*load.split()[2:])
     assert report["trust"]["in_range"]
     assert report["contact"]["distance"] < 1e-6
+    assert tip.endswith(" --tip")
+    report = answer(*tip.split()[2:])
+    assert report["trust"]["in_range"]
+    assert report["depth"] > 0.0
+
+
+def test_training_ends_with_a_word_of_a_tolerance_that_the_mesh_misses(artifact, monkeypatch):
+    report = info(artifact)
+    report["training"]["mesh_errors"]["von_mises"]["p95"] = 0.5
+    monkeypatch.setattr("palpate.offline.info.info", lambda _: report)
+    said = [line for line in closing(artifact) if "missed by the mesh alone" in line]
+    assert any(line.startswith("errors: ") and "von Mises 50 % (tol" in line for line in said)
 
 
 def test_an_artifact_answers_to_the_name_of_its_scene(answer, artifact, tmp_path, monkeypatch):
@@ -119,6 +131,8 @@ REFUSED = {
     "train pipe.toml": "geometry.section: pipe.csv cannot be read: pipe.csv is not a regular file",
     "train folder.toml": "geometry.section: . cannot be read: Is a directory",
     "train same.toml": "surface: the support holds all of it",
+    "train headless.toml": "cannot be read: its first line must name the columns, x,z",
+    "info nested.toml": "'nested.toml' is a scene; palpate train nested.toml makes its artifact",
     "train nested.toml": "nested.toml: not TOML: maximum recursion depth",
     "train many.toml": "more than 200000 elements in all",
     "train tiny.toml": "endoscope.radius = 1e-09: Input should be greater than or equal to 0.01",
@@ -143,6 +157,7 @@ def test_what_makes_no_sense_is_told(
         "lost": turbinate.replace("inferior_turbinate_section.csv", "lost.csv"),
         "pipe": turbinate.replace("inferior_turbinate_section.csv", "pipe.csv"),
         "folder": turbinate.replace("inferior_turbinate_section.csv", "."),
+        "headless": turbinate.replace("inferior_turbinate_section.csv", "headless.csv"),
         "same": quick.replace('side = "top"', 'side = "bottom"'),
         "nested": "a = " + 5000 * "[" + 5000 * "]",
         "many": quick.replace("[4, 4, 3]", "[500, 500, 500]"),
@@ -150,6 +165,7 @@ def test_what_makes_no_sense_is_told(
     }
     (tmp_path / "full.vtu").symlink_to("/dev/full")
     os.mkfifo(tmp_path / "pipe.csv")
+    (tmp_path / "headless.csv").write_text("0,0\n0,1\n")
     for name, text in scenes.items():
         (tmp_path / f"{name}.toml").write_text(text)
     named = {"A": artifact, "V": visco_artifact}
@@ -213,4 +229,6 @@ def test_a_new_scene_can_be_trained_and_is_not_overwritten(run, tmp_path, monkey
 
 def test_help_is_plain_text(run):
     for command in main.list_commands(None):
-        assert "\\b" not in run(command, "--help").output
+        told = run(command, "--help").output
+        assert "\\b" not in told
+        assert "None" not in told
