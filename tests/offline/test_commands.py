@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from palpate.offline.info import LABELS, budget, closing, info, percent
@@ -42,7 +43,7 @@ def test_info_for_people_is_ten_lines_in_units_and_for_who_asks_a_table_of_error
     own += f", tip's force {share}"
     assert re.fullmatch(f"tip's errors +95 of 100 within: {own}; {mesh}, {share}", lines[8])
     table = run("info", artifact, "--errors").stdout.splitlines()
-    assert re.match(r"trust +covers 95 % of errors, confidence \d\d %; doubts", table[6])
+    assert re.match(r"trust +covers 95 % of errors, confidence \d\d %; doubts", table[7])
     for line in lines + table:
         assert len(line) <= 120
         assert not re.search(r"[{}\[\]]|  %|None", line), line
@@ -50,7 +51,7 @@ def test_info_for_people_is_ten_lines_in_units_and_for_who_asks_a_table_of_error
 
 def test_info_tells_the_sources_of_errors_side_by_side(answer, artifact):
     report = answer("info", artifact)
-    table = {line[:LABELS].strip(): line[LABELS:].split("  ") for line in budget(report)[:6]}
+    table = {line[:LABELS].strip(): line[LABELS:].split("  ") for line in budget(report)[:7]}
     table = {key: [value.strip() for value in row if value.strip()] for key, row in table.items()}
     assert table["95 of 100"] == ["displacement", "von Mises", "tip's force"]
     assert table["tolerance"] == ["3 %", "12 %", "5 %"]
@@ -59,6 +60,8 @@ def test_info_tells_the_sources_of_errors_side_by_side(answer, artifact):
     assert table["reduction"] == [percent(error) for error in reduction]
     mesh = report["training"]["mesh_errors"]
     assert table["mesh"] == [percent(mesh[key]["p95"]) for key in Errors._fields]
+    mesh = report["training"]["mesh_errors_tip"]
+    assert table["- of the tip"] == [percent(mesh[key]["p95"]) for key in Errors._fields]
     # the points are chosen so that they err by less than the modes
     assert 0 < report["training"]["cubature_errors"]["displacement"]["p95"] < reduction[0]
     assert table["- cubature"][1:] == table["- solver"][1:] == ["–", "–"]
@@ -82,7 +85,7 @@ def test_what_is_next_after_training_is_a_command_that_works(answer, artifact):
     assert tip.endswith(" --tip")
     report = answer(*tip.split()[2:])
     assert report["trust"]["in_range"]
-    assert report["depth"] > 0.0
+    assert np.linalg.norm(report["force"]) > 0.0
 
 
 def test_training_ends_with_a_word_of_a_tolerance_that_the_mesh_misses(artifact, monkeypatch):
@@ -177,7 +180,7 @@ def test_what_makes_no_sense_is_told(
     assert all(line.startswith("  ") for line in told.splitlines()[1:])
 
 
-@pytest.mark.parametrize("missing", ["training", "provenance", "validation"])
+@pytest.mark.parametrize("missing", ["training", "provenance"])
 def test_info_refuses_what_lacks_a_document(run, artifact, tmp_path, missing):
     whole = read_artifact(artifact, *STORED)
     documents = {name: found for name, found in whole.documents.items() if name != missing}
