@@ -169,7 +169,6 @@ def closing(artifact: Path) -> list[str]:
     report = info(artifact)
     example, tolerance = report["loads"]["example"], parse_scene(report["text"]).tolerance
     most = tolerance.reduction
-    place = " ".join(f"{x:.4g}" for x in example["at"])
     errors = [f"{label}: {text}" for label, text in accuracy(report).items()]
     found = report["validation"]
     if any(found[key]["p95"] > getattr(most, key) for key in ("displacement", "von_mises")):
@@ -189,10 +188,12 @@ def closing(artifact: Path) -> list[str]:
                 f"{label}: the tolerance is missed by the mesh alone: {', '.join(over)}; answers "
                 "estimate it; finer geometry.divisions lower it, and training takes longer"
             )
-    asked = f"next: palpate solve {artifact} --at"
-    following = [f"{asked} {place} --pressure {example['pressure']:.2g}"]
-    if example["tip"]:
-        following.append(f"{asked} {' '.join(f'{x:.4g}' for x in example['tip'])} --tip")
+    ways = {"at": f"--pressure {example['pressure']:.2g}", "tip": "--tip"}
+    following = [
+        f"next: palpate solve {artifact} --at {' '.join(f'{x:.4g}' for x in example[place])} {how}"
+        for place, how in ways.items()
+        if example[place]
+    ]
     return [f"{artifact}: {report['bytes'] / 1e6:.1f} MB", *errors, *following]
 
 

@@ -2,6 +2,7 @@ import fcntl
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 # as in a server, whose answers must be the same to the last bit; before NumPy comes in
 for library in ("OPENBLAS", "MKL", "OMP"):
@@ -10,6 +11,7 @@ for library in ("OPENBLAS", "MKL", "OMP"):
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
+from palpate.shared.artifact import Dataset, write_artifact  # noqa: E402
 from palpate.shared.model import ReducedModel  # noqa: E402
 
 from . import browser  # noqa: E402
@@ -22,6 +24,14 @@ def rng():
 
 
 PALPATE = [sys.executable, "-c", "from palpate.shared.cli import main; main()"]
+
+
+def sealed(path, whole, **changed):
+    """Write an artifact with other contents, fields of `Artifact`, and seal it; return where."""
+    whole = replace(whole, **changed)
+    datasets = {name: Dataset(values, "1", "") for name, values in whole.arrays.items()}
+    write_artifact(path, whole.scene, whole.documents, datasets)
+    return path
 
 
 def trained(scene, tmp_path_factory):

@@ -7,6 +7,7 @@ leave the boundary as squarely as the shape allows. Every mesh of a section, coa
 sampling of the same map.
 """
 
+import io
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -56,11 +57,11 @@ def read_outline(path: Path) -> Array:
     SceneError
         If the file cannot be read, has fewer than 8 points, repeats one or crosses itself.
     """
+    content = read_section(path)
     try:
-        names, *rows = read_section(path).decode().splitlines() or [""]
-        if not re.search("[A-Za-z]", names):
+        if not re.match(rb".*[A-Za-z]", content):
             raise ValueError("its first line must name the columns, x,z")
-        points = np.array([[float(x) for x in row.split(",")] for row in rows if row.strip()])
+        points = np.loadtxt(io.BytesIO(content), delimiter=",", skiprows=1, ndmin=2)
     except ValueError as error:
         raise SceneError(f"geometry.section: {path} cannot be read: {error}") from error
     if points.ndim != 2 or points.shape[1] != 2 or len(points) < 8 or not np.isfinite(points).all():

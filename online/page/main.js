@@ -64,7 +64,7 @@ class Page {
     for (const kind of ["csv", "h5"]) element(`save-${kind}`).onclick = () => this.save(kind);
     element("play").onchange = ({ target }) => this.play(target.files[0]);
     element("task").onchange = ({ target }) => this.set(target.files[0]);
-    element("again").onclick = () => { this.task.again(); this.changed = true; };
+    element("again").onclick = () => { this.task.again(); this.showTask(); };
     document.addEventListener("dragover", (event) => event.preventDefault());
     document.addEventListener("drop", (event) => {
       event.preventDefault();
@@ -304,8 +304,6 @@ class Page {
     }
     if (!this.session || this.session.reader) this.opened ??= now; // s since the address was given
     this.readings.show(now, this.scene.tolerance, this.level());
-    element("again").hidden = !this.task;
-    element("score").textContent = this.task?.words() ?? "";
   }
 
   fit() {
@@ -392,32 +390,48 @@ class Page {
     }
   }
 
-  /** Set a task, which is a JSON file. */
-  async set(file) {
+  /** Use the text of a file that was chosen with an element, or say what is wrong with it. */
+  async take(file, id, use) {
     if (!file) return;
     try {
-      this.task = new Task(await file.text());
-      this.changed = true;
+      use(await file.text());
       this.say("");
     } catch (error) {
       this.say(`${file.name}: ${error.message}`);
     }
-    element("task").value = "";
+    element(id).value = "";
+  }
+
+  /** Set a task, which is a JSON file. */
+  set(file) {
+    return this.take(file, "task", (text) => {
+      this.task = new Task(text);
+      this.showTask();
+    });
   }
 
   /** Play a recording: the tip goes where it was, and the tissue answers anew. */
-  async play(file) {
-    if (!file) return;
-    try {
+  play(file) {
+    return this.take(file, "play", (text) => {
       if (!this.scene?.serves.sessions) throw new Error("Only scenes with a tip play recordings.");
-      this.player = new Player(await file.text());
+      this.player = new Player(text);
       this.playedSince = seconds();
       this.tool.held = false;
-      this.say("");
-    } catch (error) {
-      this.say(`${file.name}: ${error.message}`);
-    }
-    element("play").value = "";
+    });
+  }
+
+  /** Let the task know where the tool touches (null if it does not) and its force. */
+  score(now, point, force) {
+    if (!this.task) return;
+    this.task.take(now, point, force);
+    this.showTask();
+  }
+
+  /** Show how a task stands. */
+  showTask() {
+    element("again").hidden = !this.task;
+    element("score").textContent = this.task?.words() ?? "";
+    this.changed = true;
   }
 
   /** Put the tool where the recording that is played has it now. */
@@ -546,7 +560,7 @@ class Page {
   }
 
   release() {
-    this.task?.take(seconds(), null, 0);
+    this.score(seconds(), null, 0);
     this.answer = this.readings.answer = this.pressed = this.stress = null;
     this.view.showField(null);
     this.view.showStress(null);
@@ -560,7 +574,7 @@ class Page {
     this.stress = answer.stress;
     this.readings.take(answer, now);
     this.view.showStress(answer.stress);
-    this.task?.take(now, answer.CONTACT ? answer.contact_point : null, norm(answer.force));
+    this.score(now, answer.CONTACT ? answer.contact_point : null, norm(answer.force));
     this.log.push({ asked, force: answer.force, position: answer.position, flags: answer.flags });
     if (this.log.length > LOGGED) this.log.shift();
     this.changed = true;

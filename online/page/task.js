@@ -1,5 +1,7 @@
 // A task: a path over the surface to be followed within a limit of force, and how well it went.
 
+import { add, norm } from "./vectors.js";
+
 const REACH = 1; // mm from a point of the path within which it is passed, unless the task says
 const MOST = 500; // points of a path
 
@@ -61,4 +63,4 @@ export class Task {
   }
 }
 
-const apart = (a, b) => Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]);
+const apart = (a, b) => norm(add(a, b, -1));

@@ -110,7 +110,6 @@ class HttpProtocol(HttpToolsProtocol):
             allowed = {"max_connections": MOST_CONNECTIONS}
             message = "The service has no place for another connection"
             self.refuse(Refusal("overloaded", "", message, allowed, {"Retry-After": "1"}))
-            transport.close()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Forget a connection."""
@@ -140,25 +139,30 @@ class HttpProtocol(HttpToolsProtocol):
                     self.refuse_head()
 
     def refuse_head(self) -> None:
-        """Refuse a request whose head is too long."""
+        """Refuse a request whose head is too long, and read no more of it until it is cut off."""
         allowed = {"max_bytes": MOST_HEAD}
         if len(self.url) > MOST_HEAD // 2:
-            self.refuse(Refusal("url_too_long", "url", "The address is too long", allowed))
+            self.tell(Refusal("url_too_long", "url", "The address is too long", allowed))
         else:
             message = "The headers are too long"
-            self.refuse(Refusal("headers_too_large", "headers", message, allowed))
+            self.tell(Refusal("headers_too_large", "headers", message, allowed))
+        self.transport.pause_reading()
+        self.give_up()
+        self.refused = True
+        self.loop.call_later(LINGER, self.transport.abort)
 
     def refuse(self, refusal: Refusal) -> None:
-        """Answer to what is not read on, and close soon."""
+        """Answer to nothing that could be read, and close."""
+        self.tell(refusal)
+        self.transport.close()
+
+    def tell(self, refusal: Refusal) -> None:
+        """Write a refusal of what is not read on."""
         response = refusal.response()
         head = b"".join(name + b": " + value + b"\r\n" for name, value in response.raw_headers)
         line = STATUS_LINE[response.status_code]
         close = b"connection: close\r\n\r\n"
         self.transport.write(line + head + close + bytes(response.body))
-        self.transport.pause_reading()
-        self.give_up()
-        self.refused = True
-        self.loop.call_later(LINGER, self.transport.abort)
 
     def pause_writing(self) -> None:
         """Wait for a client that does not read, but not for ever, and not for too many."""

@@ -12,10 +12,12 @@ import pytest
 from palpate.offline.info import LABELS, budget, closing, info, percent
 from palpate.offline.scenes import find_scene
 from palpate.offline.train import is_of
-from palpate.shared.artifact import Dataset, read_artifact, write_artifact
+from palpate.shared.artifact import read_artifact
 from palpate.shared.cli import main
 from palpate.shared.model import STORED
 from palpate.shared.scene import Errors
+
+from ..conftest import sealed
 
 CONTACT = ["--at", "4", "5.5", "8", "--pressure", "1.5"]
 
@@ -174,8 +176,9 @@ def test_what_makes_no_sense_is_told(
     named = {"A": artifact, "V": visco_artifact}
     result = run(*(named.get(word, word) for word in command.split()))
     assert result.exit_code == 2
-    _, error, told = result.stderr.rpartition("Error: ")
+    before, error, told = result.stderr.rpartition("Error: ")
     assert error
+    assert not before or before[-1] in "\r\n"
     assert reason in told
     assert all(line.startswith("  ") for line in told.splitlines()[1:])
 
@@ -184,8 +187,7 @@ def test_what_makes_no_sense_is_told(
 def test_info_refuses_what_lacks_a_document(run, artifact, tmp_path, missing):
     whole = read_artifact(artifact, *STORED)
     documents = {name: found for name, found in whole.documents.items() if name != missing}
-    datasets = {name: Dataset(values, "1", "") for name, values in whole.arrays.items()}
-    write_artifact(path := tmp_path / "less.h5", whole.scene, documents, datasets)
+    path = sealed(tmp_path / "less.h5", whole, documents=documents)
     assert not is_of(path, "another")
     result = run("info", path)
     assert result.exit_code == 2

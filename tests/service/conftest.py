@@ -7,19 +7,17 @@ from contextlib import contextmanager
 
 import pytest
 
-from palpate.shared.artifact import Dataset, read_artifact, write_artifact
+from palpate.shared.artifact import read_artifact
 from palpate.shared.model import STORED
 
-from ..conftest import PALPATE
+from ..conftest import PALPATE, sealed
 
 
 def rewritten(artifact, path, old, new):
     """Write an artifact anew, with other words in its scene; return where."""
     whole = read_artifact(artifact, *STORED)
     assert old in whole.scene
-    datasets = {name: Dataset(values, "1", "") for name, values in whole.arrays.items()}
-    write_artifact(path, whole.scene.replace(old, new), whole.documents, datasets)
-    return path
+    return sealed(path, whole, scene=whole.scene.replace(old, new))
 
 
 class Server:

@@ -27,12 +27,13 @@ from palpate.online.client.session import Session, SessionClosed
 from palpate.online.serve import layout
 from palpate.online.session import frames
 from palpate.online.session.frames import Request
-from palpate.shared.artifact import ArtifactError, Dataset, read_artifact, write_artifact
+from palpate.shared.artifact import ArtifactError, read_artifact
 from palpate.shared.cli import main
 from palpate.shared.errors import PalpateError, QueryError
 from palpate.shared.model import STORED, ReducedModel
 from palpate.shared.scene import SceneError, load_scene, parse_scene
 
+from ..conftest import sealed
 from . import mutations
 from .mutations import changed_bytes, changed_document, changed_lines, changed_words, pick
 
@@ -121,8 +122,8 @@ def test_artifacts_that_are_sealed_anew(whole, atlas, tmp_path, rng):
                 arrays[name] = mutations.changed_array(rng, arrays[name])
                 if arrays[name] is None:
                     del arrays[name]
-        datasets = {name: Dataset(values, "1", "") for name, values in arrays.items()}
-        write_artifact(path, scene.replace("\x00", ""), documents, datasets)
+        scene = scene.replace("\x00", "")
+        sealed(path, whole, scene=scene, documents=documents, arrays=arrays)
         try:
             model = ReducedModel.load(path)
         except ArtifactError as error:

@@ -338,23 +338,14 @@ def test_what_is_recorded_is_replayed_played_again_and_tells_the_modulus(
         assert abs(entry["force"][2] - recorded[tuple(entry["asked"])]) < 1e-3 * most
 
 
-@pytest.mark.parametrize(
-    ("text", "why"),
-    [
-        ("time,x,y\n0,1,2\n", "lacks z"),
-        ("time,x,y,z\n", "no positions"),
-        ("time,x,y,z\n0,1,2,3\n1,1,,3\n", "Line 3"),
-        ("time,x,y,z\n1,1,2,3\n0,1,2,3\n", "Line 3"),
-    ],
-)
-def test_a_recording_that_makes_no_sense_is_told(page, text, why):
-    said = page.run(f"({PLAY})({json.dumps(text)})")
-    assert said.startswith("played.csv: ")
-    assert why in said
-    assert page.run("palpate.player") is None
-
-
 SET = PLAY.replace("play(", "set(").replace("played.csv", "task.json")
+
+
+THERE = """(() => {
+    const { answer, log, scene, tool } = palpate, asked = log.at(-1)?.asked;
+    return answer?.CONTACT && !answer.CLAMPED && tool.now === tool.level
+        && String(asked) === String(tool.centre(scene.ranges.radius));
+})()"""
 
 
 def test_a_task_is_followed_and_scored(page):
@@ -362,7 +353,7 @@ def test_a_task_is_followed_and_scored(page):
     path = []
     for along in (0, 60):
         press(page, x + along, y)
-        page.wait("palpate.answer?.CONTACT && palpate.tool.now === palpate.tool.level")
+        page.wait(THERE)  # and not on its way
         path.append(page.run("palpate.answer.contact_point"))
         release(page, x + along, y)
         page.wait("palpate.tool.now < -0.9 && !palpate.answer.CONTACT")
@@ -389,22 +380,34 @@ def test_a_task_is_followed_and_scored(page):
     assert page.run("palpate.task.passed") == 0
 
 
+RECORDINGS = [
+    ("time,x,y\n0,1,2\n", "lacks z"),
+    ("time,x,y,z\n", "no positions"),
+    ("time,x,y,z\n0,1,2,3\n1,1,,3\n", "Line 3"),
+    ("time,x,y,z\n1,1,2,3\n0,1,2,3\n", "Line 3"),
+]
+TASKS = [
+    ("{", "This is no JSON"),
+    ("null", '"path"'),
+    ('{"path": [[1, 2, 3]], "force_limit": 1}', '"path" must be 2 to'),
+    ('{"path": [[1, 2, 3], [1, 2, null]], "force_limit": 1}', "[x, y, z]"),
+    ('{"path": [[1, 2, 3], [1, 2, 4]]}', '"force_limit"'),
+    ('{"path": [[1, 2, 3], [1, 2, 4]], "force_limit": 1, "reach": 0}', '"reach"'),
+]
+
+
 @pytest.mark.parametrize(
-    ("text", "why"),
+    ("give", "name", "kept", "text", "why"),
     [
-        ("{", "This is no JSON"),
-        ("null", '"path"'),
-        ('{"path": [[1, 2, 3]], "force_limit": 1}', '"path" must be 2 to'),
-        ('{"path": [[1, 2, 3], [1, 2, null]], "force_limit": 1}', "[x, y, z]"),
-        ('{"path": [[1, 2, 3], [1, 2, 4]]}', '"force_limit"'),
-        ('{"path": [[1, 2, 3], [1, 2, 4]], "force_limit": 1, "reach": 0}', '"reach"'),
+        *((PLAY, "played.csv", "player", *wrong) for wrong in RECORDINGS),
+        *((SET, "task.json", "task", *wrong) for wrong in TASKS),
     ],
 )
-def test_a_task_that_makes_no_sense_is_told(page, text, why):
-    said = page.run(f"({SET})({json.dumps(text)})")
-    assert said.startswith("task.json: ")
+def test_a_file_that_makes_no_sense_is_told(page, give, name, kept, text, why):
+    said = page.run(f"({give})({json.dumps(text)})")
+    assert said.startswith(f"{name}: ")
     assert why in said
-    assert page.run("palpate.task") is None
+    assert page.run(f"palpate.{kept}") is None
 
 
 def test_modes_that_make_no_sense_are_told_and_the_servers_field_is_shown(page):

@@ -6,9 +6,11 @@ import h5py
 import numpy as np
 import pytest
 
-from palpate.shared.artifact import ArtifactError, Dataset, read_artifact, write_artifact
+from palpate.shared.artifact import ArtifactError, read_artifact
 from palpate.shared.errors import QueryError
 from palpate.shared.model import STORED, ReducedModel
+
+from ..conftest import sealed
 
 CHANGES = {
     "nan": lambda a, _: np.full_like(a, np.nan),
@@ -71,10 +73,10 @@ def test_every_dataset_that_is_changed_is_refused_by_name_or_answered_soundly(
         values = CHANGES[change](whole.arrays[name], rng)
         if values is not None and same(values, whole.arrays[name]):
             continue
-        changed = {key: Dataset(a, "1", "") for key, a in whole.arrays.items() if key != name}
-        if values is not None:
-            changed[name] = Dataset(values, "1", "")
-        write_artifact(path, whole.scene, whole.documents, changed)
+        arrays = whole.arrays | {name: values}
+        if values is None:
+            del arrays[name]
+        sealed(path, whole, arrays=arrays)
         started = time.perf_counter()
         model, reason = loaded(path)
         assert reason.startswith(f"{path}: ") if model is None else sound(model), name
@@ -114,7 +116,6 @@ def sound(model):
 
 def test_a_dataset_that_claims_to_be_huge_takes_no_memory(whole, tmp_path, monkeypatch):
     path = tmp_path / "huge.h5"
-    datasets = {name: Dataset(values, "1", "") for name, values in whole.arrays.items()}
     create = h5py.Group.create_dataset
 
     def claim(group, name, *more, data=None, **options):
@@ -123,7 +124,7 @@ def test_a_dataset_that_claims_to_be_huge_takes_no_memory(whole, tmp_path, monke
         return create(group, name, *more, data=data, **options)
 
     monkeypatch.setattr(h5py.Group, "create_dataset", claim)
-    write_artifact(path, whole.scene, whole.documents, datasets)
+    sealed(path, whole)
     with pytest.raises(ArtifactError, match="body_modes"):
         ReducedModel.load(path)
 
@@ -131,9 +132,8 @@ def test_a_dataset_that_claims_to_be_huge_takes_no_memory(whole, tmp_path, monke
 @pytest.mark.parametrize(("name", "value"), [("faces", 0), ("patch_centres", 1e3)])
 def test_what_does_not_fit_together_is_refused_when_it_is_loaded(whole, tmp_path, name, value):
     """A face without an area, and a local model that is far from all faces."""
-    path, values = tmp_path / "apart.h5", whole.arrays[name].copy()
+    values = whole.arrays[name].copy()
     values[0] = value
-    datasets = {key: Dataset(a, "1", "") for key, a in (whole.arrays | {name: values}).items()}
-    write_artifact(path, whole.scene, whole.documents, datasets)
+    path = sealed(tmp_path / "apart.h5", whole, arrays=whole.arrays | {name: values})
     with pytest.raises(ArtifactError, match="incomplete or inconsistent"):
         ReducedModel.load(path)
