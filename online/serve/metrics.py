@@ -101,9 +101,9 @@ class Metrics:
         self._rows = [cells[first : first + WIDTH] for first in range(0, len(cells), WIDTH)]
         self._row = self._rows[self.worker]
         self._row[_SESSIONS] = 0.0  # those of a killed worker are gone
-        self._row[_STARTS] += 1.0
-        self._row[_PID] = os.getpid()
         self._row[_RESIDENT] = self._row[_OWN] = math.nan
+        self._row[_PID] = os.getpid()
+        self._row[_STARTS] += 1.0  # last: who reads the start reads the rest as it is now
 
     @property
     def restarted(self) -> bool:
@@ -147,7 +147,7 @@ class Metrics:
 
     def text(self) -> str:
         """Write the numbers of all workers, labelled with theirs, as Prometheus reads them."""
-        rows = {worker: row for worker, row in enumerate(self._rows) if row[_PID]}
+        rows = {worker: row.tolist() for worker, row in enumerate(self._rows) if row[_PID]}
         for row in rows.values():
             with suppress(OSError):  # not every system says it
                 pages = Path(f"/proc/{int(row[_PID])}/statm").read_text().split()[1]
