@@ -18,7 +18,7 @@ from palpate.offline.fem.norms import statistics
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.reduce.footprint_models import RandomLoads, trained_patch
 from palpate.offline.reduce.layout import Patch
-from palpate.offline.reduce.load_range import untested
+from palpate.offline.reduce.load_range import bears, untested
 from palpate.offline.reduce.ritz import region
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.validate.compare import (
@@ -66,19 +66,24 @@ class TrialResult(NamedTuple):
 
     known: list[KnownAnswer]
     seconds: float  # median time of an answer
+    given_way: int = 0  # loads left out, under which the tissue gives way
 
 
 def try_patch(problem: FullProblem, patch: Patch, limits: Array) -> TrialResult:
     """Train a local model by itself and judge it on loads it has not seen.
 
-    ``limits`` is the load range at the surface's vertices.
+    ``limits`` is the load range at the surface's vertices, which is lowered only after training:
+    loads under which the tissue gives way say nothing about a size.
     """
     basis = region(problem, patch.footprints, patch.size.region_modes)
     model = untested(problem, trained_patch(problem, basis, patch), limits)
     loads = RandomLoads(problem.scene, patch, stream(patch.seed, Stage.TRIAL_LOADS))
-    known, seconds = list[KnownAnswer](), list[float]()
+    known, seconds, given_way = list[KnownAnswer](), list[float](), 0
     while len(known) < TRIAL_LOADS:
         query = [loads.any()]
+        if not bears(model, query[0]):
+            given_way += 1
+            continue
         started = time.perf_counter()
         play(model, query)
         spent = time.perf_counter() - started
@@ -87,7 +92,7 @@ def try_patch(problem: FullProblem, patch: Patch, limits: Array) -> TrialResult:
         if full is not None:
             seconds.append(spent)
             known += compare(LOADS, problem, model, query, full).known
-    return TrialResult(known, float(np.median(seconds)))
+    return TrialResult(known, float(np.median(seconds)), given_way)
 
 
 @dataclass(frozen=True)
@@ -99,21 +104,17 @@ class Trial:
     von_mises: dict[str, float]
     estimates: tuple[float, float]  # 95th percentiles of what would be estimated of these
     loads: int
+    given_way: int  # loads beside these under which the tissue gives way
     solve_us: float
 
     @classmethod
     def of(cls, size: Size, results: Sequence[TrialResult]) -> Self:
-        """Gather the results of the patches, without the one of the largest error.
-
-        Where the tissue gives way the load range is lowered only after training: loads beyond that
-        say nothing about a size.
-        """
-        worst = np.argmax([_errors(result.known)[:, 0].max() for result in results])
-        kept = [result for i, result in enumerate(results) if i != worst] or results
-        known = [answer for result in kept for answer in result.known]
+        """Gather the results of the patches."""
+        known = [answer for result in results for answer in result.known]
+        given_way = sum(result.given_way for result in results)
         displacement, von_mises = map(statistics, _errors(known).T)
         seconds = round(1e6 * float(np.median([result.seconds for result in results])), 1)
-        return cls(size, displacement, von_mises, _estimates(known), len(known), seconds)
+        return cls(size, displacement, von_mises, _estimates(known), len(known), given_way, seconds)
 
     def over(self, tolerance: Tolerance) -> float:
         """Largest ratio of an estimate to what the reduction may err by.

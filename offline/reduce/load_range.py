@@ -36,7 +36,7 @@ from scipy.spatial import cKDTree
 from palpate.offline.fem.mesh import local_thickness
 from palpate.offline.fem.model import FullModel, NoEquilibrium
 from palpate.offline.fem.potential import Potential, Projected
-from palpate.offline.fem.problem import FullProblem
+from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.fem.terms import DeadLoad
 from palpate.offline.reduce.ritz import energy_pod, ritz_vectors
 from palpate.offline.reduce.sampling import (
@@ -326,6 +326,12 @@ def limit_load_share(model: ReducedModel, x: Array, direction: Array, limit: flo
     exponents = np.diff(np.log(moved)) / np.diff(np.log(SHARES))
     sudden = np.flatnonzero(~(np.diff(exponents) <= SUDDEN))  # or without an answer
     return float(SHARES[sudden[0] + 1]) / MARGIN if len(sudden) else 1.0
+
+
+def bears(model: ReducedModel, load: Load) -> bool:
+    """Whether the tissue yields gradually up to a load, so that the range does not end before."""
+    limit = Place.at(model, load.position).limit(load.direction)
+    return load.pressure <= limit * limit_load_share(model, load.position, load.direction, limit)
 
 
 def firm_share(model: ReducedModel, x: Array, direction: Array, limit: float) -> float:

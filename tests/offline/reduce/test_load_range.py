@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from palpate.offline.fem.model import NoEquilibrium
-from palpate.offline.fem.problem import FullProblem
+from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.reduce.load_range import (
     FAR,
     FIRM,
@@ -20,6 +20,7 @@ from palpate.offline.reduce.load_range import (
     UNANSWERED,
     LoadPath,
     bearable_shares,
+    bears,
     firm_share,
     limit_load_share,
     load_range,
@@ -303,6 +304,12 @@ def test_the_range_ends_before_loads_without_an_answer():
     plate, down = Plate(np.inf), np.array([0.0, 0.0, -1.0])
     plate.lost = 0.9 * LIMIT, 0.97 * LIMIT
     assert 0.8 / MARGIN <= limit_load_share(plate, np.zeros(3), down, LIMIT) <= 0.9 / MARGIN
+
+
+@pytest.mark.parametrize(("place", "share", "borne"), [(0, 0.6, 1), (0, 0.9, 0), (9, 0.9, 1)])
+def test_a_load_is_borne_up_to_where_the_tissue_gives_way(place, share, borne):
+    plate, down = Plate(0.78 * LIMIT), np.array([0.0, 0.0, -1.0])
+    assert bears(plate, Load(np.array([place, 0.0, 0.0]), down, share * LIMIT)) == borne
 
 
 @pytest.mark.parametrize("loose", [0.35, 0.75, 0.9])
