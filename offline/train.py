@@ -161,7 +161,7 @@ def forecast(problem: FullProblem, workers: int) -> str:
     scene = problem.scene
     dofs, size, more = problem.mesh.nodes.size, scene.training.size, ""
     if size is None:  # the size that training tries first
-        size, more = ladder(scene.tissue)[max(first_place(scene.tolerance), 0)], " or more"
+        size, more = ladder(scene)[max(first_place(scene.tolerance), 0)], " or more"
     models = spacing_count(problem.surface, size.patch_spacing)
     seconds = models * (MODEL + MODEL_AND_DOF * dofs) / workers
     seconds *= (TIP if scene.endoscope.tip else 1.0) * (TIME if scene.tissue.prony else 1.0)
@@ -199,7 +199,7 @@ class Pipeline:
         training: dict[str, Any] = {"mesh": mesh_quality(self.problem.mesh)}
         if size is None:
             scene, attempt = self.scene, partial(self._trial, limits)
-            sizes = ladder(scene.tissue)
+            sizes = ladder(scene)
             size, training["choice"] = choose(sizes, scene.tolerance, scene.budget, attempt)
             tqdm.write(f"size: {size}\n{training['choice']['why']}", file=sys.stderr)
         if mesh_choice is not None:

@@ -30,21 +30,21 @@ from palpate.offline.validate.compare import (
 )
 from palpate.offline.validate.queries import LOADS
 from palpate.shared.arrays import Array
-from palpate.shared.mechanics.laws import AnyTissue
 from palpate.shared.mechanics.tissue import lame
-from palpate.shared.scene import Budget, Size, Tolerance
+from palpate.shared.scene import Budget, Scene, Size, Tolerance
 
 LADDER = (
-    Size(patch_spacing=2.6, modes=28, cubature_points=64, region_modes=120),
-    Size(patch_spacing=2.0, modes=32, cubature_points=80, region_modes=150),
-    Size(patch_spacing=2.2, modes=44, cubature_points=96, region_modes=190),
-    Size(patch_spacing=2.0, modes=56, cubature_points=112, region_modes=246),
-    Size(patch_spacing=1.5, modes=80, cubature_points=176, region_modes=300),
+    Size(patch_spacing=1.3, modes=28, cubature_points=64, region_modes=120),
+    Size(patch_spacing=1.0, modes=32, cubature_points=80, region_modes=150),
+    Size(patch_spacing=1.1, modes=44, cubature_points=96, region_modes=190),
+    Size(patch_spacing=1.0, modes=56, cubature_points=112, region_modes=246),
+    Size(patch_spacing=0.75, modes=80, cubature_points=176, region_modes=300),
 )
-"""Sizes from the smallest to the largest: the error falls by about ``RUNG`` from each to the next.
+"""Sizes from the smallest to the largest for an endoscope of radius one: the error falls by about
+``RUNG`` from each to the next.
 
 What limits the smallest is how far apart its patches, and the footprints that they learn from, lie.
-At 3.2 mm stress errs by half as much again, with 96 points, too.
+At 1.6 radii stress errs by half as much again, with 96 points, too.
 """
 
 RUNG = 2 / 3
@@ -146,17 +146,23 @@ def _estimates(known: Sequence[KnownAnswer]) -> tuple[float, float]:
     return displacement, von_mises
 
 
-def ladder(tissue: AnyTissue) -> tuple[Size, ...]:
-    """Sizes for a tissue: the less compressible, the more points take its volume's energy.
+def ladder(scene: Scene) -> tuple[Size, ...]:
+    """Sizes for a scene.
 
-    They go with the cube root of the ratio of Lame's constants: at a Poisson's ratio of 0.49 56
-    modes err by 2.1 % on 112 points and by 0.6 % on 192, and 80 modes by 1.5 % on 176.
+    Patches are as far apart as the endoscope is large, whose footprints they answer.  The less
+    compressible the tissue, the more points take its volume's energy.  They go with the cube root
+    of the ratio of Lame's constants: at a Poisson's ratio of 0.49 56 modes err by 2.1 % on 112
+    points and by 0.6 % on 192, and 80 modes by 1.5 % on 176.
     """
-    (mu, lam), (usual_mu, usual_lam) = (lame(1.0, p) for p in (tissue.poisson, COMPRESSIBLE))
+    (mu, lam), (usual_mu, usual_lam) = (lame(1.0, p) for p in (scene.tissue.poisson, COMPRESSIBLE))
     more = max(1.0, (lam / mu) / (usual_lam / usual_mu)) ** (1 / 3)
-    points = [16 * math.ceil(more * size.cubature_points / 16) for size in LADDER]
-    pairs = zip(LADDER, points, strict=True)
-    return tuple(size.model_copy(update={"cubature_points": most}) for size, most in pairs)
+    own = []
+    for size in LADDER:
+        points = 16 * math.ceil(more * size.cubature_points / 16)
+        spacing = round(scene.endoscope.radius * size.patch_spacing, 3)
+        new = {"patch_spacing": spacing, "cubature_points": points}
+        own.append(size.model_copy(update=new))
+    return tuple(own)
 
 
 def first_place(tolerance: Tolerance) -> int:

@@ -1,5 +1,7 @@
 """The smallest size that meets a tolerance, and what is said when none does."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -103,11 +105,20 @@ def test_a_looser_tolerance_is_served_by_fewer_samples():
     assert fewer(1, loose) == 1
 
 
+def scene(poisson, radius=1.0):
+    tissue = NeoHookeanTissue(law="neo-hookean", young=15.0, poisson=poisson)
+    return SimpleNamespace(tissue=tissue, endoscope=SimpleNamespace(radius=radius))
+
+
+def test_patches_are_as_far_apart_as_the_endoscope_is_large():
+    one, three = ladder(scene(0.45)), ladder(scene(0.45, radius=3.0))
+    for small, large in zip(one, three, strict=True):
+        assert large.patch_spacing == pytest.approx(3.0 * small.patch_spacing)
+        assert large.modes == small.modes
+
+
 def test_the_less_compressible_the_more_points():
-    sizes = [
-        ladder(NeoHookeanTissue(law="neo-hookean", young=15.0, poisson=p))
-        for p in (0.3, 0.45, 0.49, 0.499)
-    ]
+    sizes = [ladder(scene(p)) for p in (0.3, 0.45, 0.49, 0.499)]
     assert sizes[0] == sizes[1] == LADDER
     for own in zip(*sizes[1:], strict=True):
         assert len({size.modes for size in own}) == 1
