@@ -56,6 +56,32 @@ artifact_option = click.option(
 )
 
 
+UNITS = {
+    "position": "mm",
+    "distance": "mm",
+    "centre": "mm",
+    "radius": "mm",
+    "depth": "mm",
+    "depth_limit": "mm",
+    "contact_displacement": "mm",
+    "peak.displacement": "mm",
+    "peak.von_mises": "kPa",
+    "peak.von_mises_p99": "kPa",
+    "pressure": "kPa",
+    "pressure_limit": "kPa",
+    "force": "mN",
+    "tangent": "mN/mm",
+    "solve_us": "µs",
+    "recover_us": "µs",
+    "error.displacement": "relative",
+    "error.von_mises": "relative",
+    "error_estimate.displacement": "relative",
+    "error_estimate.von_mises": "relative",
+    "error_estimate.force": "relative",
+}
+"""Of what is reported, by its name, or that of its table as well."""
+
+
 def reporting(command: Callable[..., Report]) -> Callable[..., None]:
     """Command that prints what it returns: a ``name value`` line for each number, or JSON."""
 
@@ -69,10 +95,18 @@ def reporting(command: Callable[..., Report]) -> Callable[..., None]:
         leaves = list(_leaves(report, ""))
         width = max(len(name) for name, _ in leaves)
         for name, value in leaves:
-            text = f"{value:.4g}" if isinstance(value, float) else str(value)
-            click.echo(f"{name:<{width}}  {text}")
+            *_, table, key = ["", *name.split(".")]
+            unit = UNITS.get(f"{table}.{key}", UNITS.get(key, ""))
+            click.echo(f"{name:<{width}}  {_text(value)} {unit}".rstrip())
 
     return show
+
+
+def _text(value: object) -> str:
+    """A value in four digits, those of a list one after the other."""
+    if isinstance(value, list | tuple):
+        return ", ".join(f"({_text(v)})" if isinstance(v, list) else _text(v) for v in value) or "-"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _json(report: Report) -> str:
@@ -212,7 +246,11 @@ def info(artifact: Path, errors: bool, as_json: bool) -> None:
 @load_options
 @click.option("--radius", type=NUMBER, help="Of the footprint, mm.  [default: the scene's]")
 @young_option
-@click.option("--tip", is_flag=True, help="Press with the rigid tip, its centre --at a place.")
+@click.option(
+    "--tip",
+    is_flag=True,
+    help="Press with the rigid tip instead, its centre --at a place: how deep, tells the force.",
+)
 @click.option("--full-model", is_flag=True, help="Solve the full model as well and compare.")
 @click.option("--vtu", type=_Output(".vtu"), metavar="OUT.vtu", help="Write mesh and fields.")
 @click.option("--csv", "table", type=TABLE, metavar="IN.csv", help="Answer every row instead.")

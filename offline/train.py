@@ -53,6 +53,7 @@ from palpate.offline.run.progress import Teller
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.workers import Checkpoint, Tasks, content_key, open_scene, run, worker_pool
 from palpate.offline.scenes import default_artifact, find_scene
+from palpate.offline.scenes.doubts import doubts
 from palpate.offline.validate import mesh_part
 from palpate.offline.validate.compare import (
     Row,
@@ -71,12 +72,16 @@ from palpate.shared.model import ReducedModel
 from palpate.shared.progress import training_folder
 from palpate.shared.scene import Scene, Size, divisions_of
 
-MODEL, MODEL_AND_DOF = 0.35, 1.75e-4
-"""Core seconds that training takes for a local model, and more for each degree of freedom; all
-stages shared out.  Measured on elastic scenes of 1900 to 7800 degrees of freedom, warm cache."""
+MODEL, MODEL_AND_DOF, PLACE = 0.35, 1.75e-4, 4.0
+"""Core seconds that training takes for a local model, and more for each degree of freedom; for a
+place where errors of the mesh are looked at.  All other stages are shared out.  Measured on elastic
+scenes of 1000 to 22 000 degrees of freedom, warm cache."""
 
 TIP, TIME = 1.2, 2.0
 """How many times as long it takes for the rigid tip as well, and for visco-elastic tissue."""
+
+TRIALS = 2
+"""Sizes that are tried where a scene has none; a patch's trial takes as long as five models."""
 
 TRIAL_PATCHES = 8
 
@@ -122,7 +127,8 @@ def train(
         with pool:
             pipeline = Pipeline(trained, pool, checkpoint, started)
             count = workers or os.cpu_count() or 1
-            tqdm.write(forecast(pipeline.problem, count), file=sys.stderr)
+            said = forecast(pipeline.problem, count), *_doubts(pipeline.problem)
+            tqdm.write("\n".join(said), file=sys.stderr)
             pipeline.run(path, mesh_choice)
         checkpoint.remove()
     finally:
@@ -141,11 +147,17 @@ def check(scene: str | Path, workers: int | None = None) -> str:
     """
     found = find_scene(scene)
     content_key(found)
-    if found.geometry.divisions is None:
+    coarsest = found.geometry.divisions is None
+    if coarsest:
         found = divided(found, candidates(found)[0])
     problem = FullProblem(found)
     spacing_count(problem.surface, found.training.limit_spacing)
-    return forecast(problem, workers or os.cpu_count() or 1)
+    expected = forecast(problem, workers or os.cpu_count() or 1, coarsest)
+    return "\n".join([expected, *_doubts(problem)])
+
+
+def _doubts(problem: FullProblem) -> list[str]:
+    return [f"is this meant? {doubt}" for doubt in doubts(problem)]
 
 
 def is_of(path: Path, key: str) -> bool:
@@ -156,20 +168,27 @@ def is_of(path: Path, key: str) -> bool:
         return False
 
 
-def forecast(problem: FullProblem, workers: int) -> str:
-    """Mesh, number of local models and time of a training, in one line for people."""
-    scene = problem.scene
-    dofs, size, more = problem.mesh.nodes.size, scene.training.size, ""
+def forecast(problem: FullProblem, workers: int, coarsest: bool = False) -> str:
+    """Mesh, number of local models and time of a training, in one line for people.
+
+    ``coarsest`` says that the mesh is the coarsest of those that training chooses from.
+    """
+    scene, tip = problem.scene, problem.scene.endoscope.tip
+    dofs, size, more, tried = problem.mesh.nodes.size, scene.training.size, "", 0
     if size is None:  # the size that training tries first
         size, more = ladder(scene)[max(first_place(scene.tolerance), 0)], " or more"
+        tried = 5 * TRIALS * TRIAL_PATCHES
     models = spacing_count(problem.surface, size.patch_spacing)
-    seconds = models * (MODEL + MODEL_AND_DOF * dofs) / workers
-    seconds *= (TIP if scene.endoscope.tip else 1.0) * (TIME if scene.tissue.prony else 1.0)
+    seconds = (models + tried) * (MODEL + MODEL_AND_DOF * dofs)
+    seconds += PLACE * (mesh_part.places_of(scene, problem.surface) + tip * mesh_part.LEAST)
+    seconds *= (TIP if tip else 1.0) * (TIME if scene.tissue.prony else 1.0) / workers
     cores = "1 free core" if workers == 1 else f"{workers} free cores"
+    about = "at least" if coarsest or more else "about"
     return (
         f"{scene.name}: {' x '.join(map(str, divisions_of(scene.geometry)))} elements "
-        f"{scene.geometry.element}, {dofs} DOFs; about {models}{more} local models; about "
-        f"{duration(seconds)} on {cores}, and longer the first time, while code is compiled"
+        f"{scene.geometry.element}{' or more' if coarsest else ''}, {dofs} DOFs; about "
+        f"{models}{more} local models; {about} {duration(seconds)} on {cores}, and some 3 min more "
+        "the first time, while code is compiled"
     )
 
 
@@ -300,11 +319,12 @@ class Pipeline:
                 search, model, asking, stream(self.scene.seed, search.stage, i)
             )
             lowered[:, search.field] *= shares
-            tqdm.write(
-                f"{search.title}: load range lowered on {np.mean(shares < 1):.1%} of the surface, "
-                f"to {shares.min():.0%} of what it was",
-                file=sys.stderr,
-            )
+            if np.any(shares < 1):
+                tqdm.write(
+                    f"{search.title}: load range lowered on {np.mean(shares < 1):.1%} of the "
+                    f"surface, to {shares.min():.0%} of what it was",
+                    file=sys.stderr,
+                )
         return lowered
 
     def _ask(self, path: Path, title: str, function: Callable[..., float], at: list[Any]) -> Array:

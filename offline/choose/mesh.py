@@ -70,11 +70,11 @@ def with_mesh(scene: Scene) -> tuple[Scene, dict[str, Any] | None]:
     if scene.geometry.divisions is not None:
         return scene, None
     allowed, tried = scene.tolerance.mesh, list[dict[str, Any]]()
-    references: list[Reference] = []
-    for divisions in tqdm(candidates(scene), "choosing the mesh"):
+    coarsest, *_ = meshes = candidates(scene)
+    references = _references(scene, FullProblem(divided(scene, coarsest)))
+    for divisions in tqdm(meshes, "choosing the mesh"):
         chosen = divided(scene, divisions)
         problem = FullProblem(chosen)
-        references = references or _references(scene, problem)
         errors = _errors(problem, references)
         dofs = problem.mesh.nodes.size
         tried.append({"divisions": divisions, "dofs": dofs, "errors": errors._asdict()})
@@ -125,8 +125,9 @@ def candidates(scene: Scene) -> list[Divisions]:
 def _references(scene: Scene, problem: FullProblem) -> list[Reference]:
     """What graded meshes say at places all over the surface."""
     count = min(mesh_part.places_of(scene, problem.surface), MOST_PLACES)
+    places = spread_points(problem.surface, count, stream(scene.seed, Stage.MESH_CHOICE))
     found = []
-    for x in spread_points(problem.surface, count, stream(scene.seed, Stage.MESH_CHOICE)):
+    for x in tqdm(places, "fine meshes to choose by"):
         fine = Graded(scene, x, REFERENCE)
         mesh = fine.problem.mesh
         found.append(Reference(x, fine.ticks, mesh.elements, _pressed(fine.problem, x)))

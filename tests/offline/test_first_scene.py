@@ -65,3 +65,20 @@ def test_the_readme_lists_all_keys_as_the_command_does(run):
     for name, field in Scene.model_fields.items():
         assert field.description, name
     assert "None" not in reference()
+
+
+@pytest.mark.parametrize(
+    ("said", "slip", "asked"),
+    [
+        ("[20.0, 20.0, 8.0]", "[0.2, 0.2, 0.08]", "lengths are in mm"),
+        ("young = 5.0", "young = 5000.0", "soft tissue has 0.1 to 1000 kPa"),
+        ("radius = 3.0", "radius = 30.0", "wider than the body of 20 x 20 x 8 mm"),
+        ("max_tilt = 20.0", "max_tilt = 0.35", "angles are in degrees"),
+    ],
+)
+def test_what_is_likely_a_slip_is_asked_about(run, slab, said, slip, asked):
+    assert "is this meant?" not in run("train", slab, "--check").stdout
+    slab.write_text(SLAB.replace(said, slip))
+    checked = run("train", slab, "--check")
+    assert checked.exit_code == 0, checked.output
+    assert asked in checked.stdout

@@ -1,0 +1,31 @@
+"""What a scene may say and most likely does not mean: other units, sizes that do not fit."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from palpate.offline.fem.problem import FullProblem
+
+SMALLEST, LARGEST = 2.0, 1000.0
+"""Sizes of a body, mm."""
+
+SOFTEST, STIFFEST = 0.1, 1000.0
+"""Young's moduli of soft tissue, kPa: brain has one, cartilage some hundreds."""
+
+SLIGHT = 2.0
+"""Largest tilt, degrees, that may be one in radians."""
+
+
+def doubts(problem: FullProblem) -> Iterator[str]:
+    """Say what to look at once more, key by key."""
+    scene, sizes = problem.scene, np.ptp(problem.mesh.nodes, axis=0)
+    body = " x ".join(f"{size:.3g}" for size in sizes) + " mm"
+    if not SMALLEST <= sizes.max() <= LARGEST:
+        yield f"geometry: a body of {body}; lengths are in mm"
+    young, radius, tilt = scene.tissue.young, scene.endoscope.radius, scene.endoscope.max_tilt
+    if not SOFTEST <= young <= STIFFEST:
+        yield f"tissue.young = {young:g}: soft tissue has {SOFTEST:g} to {STIFFEST:g} kPa"
+    if 2.0 * radius > np.median(sizes):
+        yield f"endoscope.radius = {radius:g}: its tip is wider than the body of {body}"
+    if 0.0 < tilt < SLIGHT:
+        yield f"endoscope.max_tilt = {tilt:g}: angles are in degrees"
