@@ -2,6 +2,7 @@ import fcntl
 import os
 import subprocess
 import sys
+import threading
 from dataclasses import replace
 
 # as in a server, whose answers must be the same to the last bit; before NumPy comes in
@@ -32,6 +33,15 @@ def sealed(path, whole, **changed):
     datasets = {name: Dataset(values, "1", "") for name, values in whole.arrays.items()}
     write_artifact(path, whole.scene, whole.documents, datasets)
     return path
+
+
+def pytest_sessionstart(session):
+    """Train what most tests need while other tests run, where many processes run them all."""
+    if session.config.getoption("dist", "no") == "no" or session.config.args != ["tests"]:
+        return
+    for scene in ("quick", "quick-visco"):
+        folder = session.config._tmp_path_factory
+        threading.Thread(target=trained, args=(scene, folder), daemon=True).start()
 
 
 def trained(scene, tmp_path_factory):

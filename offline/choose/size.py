@@ -212,8 +212,9 @@ def _reason(
         why = f"the smallest of {sizes} sizes that meets the tolerance: {chosen}"
     else:
         why = (
-            f"no size meets the reduction's share of {tolerance.reduction.displacement:.2%} and "
-            f"{tolerance.reduction.von_mises:.2%}; this is the most accurate: {chosen}"
+            "no size's estimates are within the reduction's share of "
+            f"{tolerance.reduction.displacement:.2%} and {tolerance.reduction.von_mises:.2%}; "
+            f"this is the most accurate: {chosen}"
         )
     allowed = 1e6 * budget.query
     if chosen.solve_us > allowed:
