@@ -282,10 +282,14 @@ def bearable_shares(search: Search, model: ReducedModel, ask: Ask, rng: Rng) -> 
         shares = zip(places, ask(search.title, search.share, places), strict=True)
         return [(x, share) for (x, *_), share in shares if share < 1.0]
 
-    found = lacking(search.points(surface, search.first * len(model.models.centres), rng))
+    most = search.first * len(model.models.centres)
+    found = lacking(search.points(surface, most, rng))
     near = [rng.choice(vertices.query_ball_point(x, search.reach), search.closer) for x, _ in found]
     if near:
-        found += lacking(surface.vertices[np.concatenate(near)])
+        closer = np.concatenate(near)
+        if len(closer) > most:  # it lacks nearly everywhere
+            closer = rng.choice(closer, most, replace=False)
+        found += lacking(surface.vertices[closer])
     shares = np.ones(len(surface.vertices))
     for x, share in found:
         lowered = vertices.query_ball_point(x, search.reach)

@@ -13,6 +13,9 @@ import { add, across, cross, dot, norm, scale, unit } from "./vectors.js";
 import { MOST_PARTS, View } from "./view.js";
 
 const COLOURINGS = ["stress", "displacement", "plain"];
+const SLOW = 0.045; // s a frame, from which on fewer pixels are drawn
+const BLURRED = 0.6; // pixels for each of the screen, from which on they are not fewer
+const COLOURED = 0.04; // s between fields of stress, which cost the service most of an answer
 const STILL = 15; // s after which a position is sent again, so that the session does not end
 const CHECKED = 0.25; // s between comparisons of the two fields
 const NEAR = 3; // local models whose modes are fetched as the tip comes near
@@ -40,6 +43,8 @@ class Page {
     this.dark.onchange = () => { this.changed = true; };
     this.listen();
     this.last = seconds();
+    this.sharpness = 1; // pixels drawn for each of the screen
+    this.pace = 0; // s a frame, of late
     requestAnimationFrame(() => this.frame());
   }
 
@@ -169,7 +174,7 @@ class Page {
     this.log.length = 0;
     this.player = null;
     if (this.recording) this.record(); // of another scene
-    Object.assign(this, { answer: null, sentAt: null, placed: null, checkedAt: 0, stress: null });
+    Object.assign(this, { answer: null, sentAt: null, placed: null, checkedAt: 0, stress: null, colouredAt: 0 });
     this.readings.answer = null;
     const most = sessions
       ? Math.min(1.25 * scene.ranges.depth[1], 0.95 * scene.ranges.radius) : 1.25 * scene.ranges.pressure[1];
@@ -301,13 +306,23 @@ class Page {
       this.changed = false;
       this.draw();
       this.readings.countFrame(now);
-    }
+      if (this.drew) this.keepUp(passed);
+      this.drew = true;
+    } else this.drew = false;
     if (!this.session || this.session.reader) this.opened ??= now; // s since the address was given
     this.readings.show(now, this.scene.tolerance, this.level());
   }
 
+  /** Draw fewer pixels where it takes too long to follow the hand. */
+  keepUp(passed) {
+    this.pace += 0.1 * (passed - this.pace);
+    if (this.pace < SLOW || this.sharpness <= BLURRED) return;
+    this.sharpness *= 0.8;
+    this.pace = 0;
+  }
+
   fit() {
-    if (this.view.fit()) this.changed = true;
+    if (this.view.fit(this.sharpness)) this.changed = true;
     this.camera.aspect = this.view.canvas.width / this.view.canvas.height;
   }
 
@@ -338,28 +353,34 @@ class Page {
     if (!position) return;
     const same = this.sentAt && norm(add(position, this.sentAt, -1)) === 0;
     const still = same && !this.answer?.CLAMPED && now - this.sentTime < STILL;
-    if (still && !scene.serves.histories && !this.wanted) return;
+    const faded = now - this.colouredAt >= COLOURED;
+    if (still && !scene.serves.histories && !this.wanted && !(this.pale && faded)) return;
     const server = element("server-field").checked;
-    const outputs = ["VON_MISES", "STRESS", "PARTS"];
+    const outputs = ["PARTS"];
+    if (faded) outputs.push("VON_MISES", "STRESS");
     if (server || !this.shaped) outputs.push("DISPLACEMENT");
     else outputs.push("HALF");
     this.wanted = false;
-    Object.assign(this, { sentAt: position, sentTime: now });
+    Object.assign(this, { asked: position, sentAt: position, sentTime: now });
     session.send(position, outputs);
   }
 
   replied(reply, trip, frames) {
     const now = seconds();
+    this.pale = !reply.stress;
+    if (reply.stress) this.colouredAt = now;
+    const stress = reply.stress ?? this.stress;
+    const largest = reply.stress ? reply.max_von_mises : this.answer?.largest_stress;
     const answer = {
-      ...reply, trip_ms: trip, solve_ms: 1e3 * reply.solve_time, largest_stress: reply.max_von_mises,
+      ...reply, stress, trip_ms: trip, solve_ms: 1e3 * reply.solve_time, largest_stress: largest,
       errors: {
         force: reply.CONTACT ? reply.error_force : null,
         displacement: reply.error_displacement, von_mises: reply.error_von_mises,
       },
     };
-    this.answered(answer, now, this.sentAt);
+    this.answered(answer, now, this.asked);
     if (this.recording) {
-      this.recording.take(now, this.sentAt, reply, frames);
+      this.recording.take(now, this.asked, reply, frames);
       element("record").textContent = `End after ${this.recording.rows.length} answers`;
     }
     this.shape(reply, now);
@@ -571,9 +592,9 @@ class Page {
 
   answered(answer, now, asked) {
     this.answer = answer;
+    if (answer.stress !== this.stress) this.view.showStress(answer.stress);
     this.stress = answer.stress;
     this.readings.take(answer, now);
-    this.view.showStress(answer.stress);
     this.score(now, answer.CONTACT ? answer.contact_point : null, norm(answer.force));
     this.log.push({ asked, force: answer.force, position: answer.position, flags: answer.flags });
     if (this.log.length > LOGGED) this.log.shift();

@@ -375,9 +375,9 @@ export class View {
     return moved;
   }
 
-  /** Make the canvas as fine as the screen; return whether it has changed. */
-  fit() {
-    const finer = Math.min(window.devicePixelRatio || 1, 2), { canvas } = this;
+  /** Have as many pixels as are shown, times `sharpness`; return whether that is new. */
+  fit(sharpness) {
+    const finer = sharpness * Math.min(window.devicePixelRatio || 1, 2), { canvas } = this;
     const wanted = [canvas.clientWidth, canvas.clientHeight].map((x) => Math.max(1, Math.round(x * finer)));
     if (canvas.width === wanted[0] && canvas.height === wanted[1]) return false;
     [canvas.width, canvas.height] = wanted;

@@ -157,7 +157,7 @@ def test_the_slider_makes_the_tissue_as_stiff(page, server, atlas):
     x, y = MIDDLE
     press(page, x, y)
     page.wait("palpate.answer?.CONTACT && palpate.tool.now === palpate.tool.level")
-    page.wait("palpate.session.ready")  # nothing is under way
+    page.wait("palpate.session.ready && !palpate.pale")  # nothing is under way
     before = page.run("""(() => {
         const slider = document.getElementById("young"), before = palpate.log.length;
         slider.value = "0.3";
