@@ -53,7 +53,7 @@ from palpate.offline.run.progress import Teller
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.workers import Checkpoint, Tasks, content_key, open_scene, run, worker_pool
 from palpate.offline.scenes import default_artifact, find_scene
-from palpate.offline.scenes.doubts import doubts
+from palpate.offline.doubts import doubts
 from palpate.offline.validate import mesh_part
 from palpate.offline.validate.compare import (
     Row,

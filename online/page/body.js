@@ -94,32 +94,36 @@ export class Body {
     return Array.from({ length: this.count }, (_, i) => cells.get(key(row(this.nodes, i))));
   }
 
-  /** Vertices for drawing: a node on a sharp edge is as many as there are sides that meet. */
+  /**
+   * Vertices for drawing: a node on a sharp edge is as many as there are sides that meet, and one on
+   * the rim of what may be touched is two.
+   */
   split(clamped, touchable) {
     const { triangles, normals, count } = this.surface;
     const sides = Array.from({ length: this.count }, () => []);
     const index = new Uint32Array(triangles.length), vertices = [];
     for (let t = 0; t < count; t++) {
-      const normal = row(normals, t);
-      for (let i = 3 * t; i < 3 * t + 3; i++) {
-        const own = sides[triangles[i]];
-        let side = own.find((other) => dot(unit(vertices[other].normal), normal) > CREASE);
-        if (side === undefined) {
-          side = vertices.length;
-          own.push(side);
-          vertices.push({ node: triangles[i], normal: [0, 0, 0] });
+      const normal = row(normals, t), corners = row(triangles, t);
+      const touched = corners.every((node) => touchable[node] && dot(normal, touchable[node]) > 0.5);
+      corners.forEach((node, i) => {
+        const smooth = sides[node].find(({ side }) => dot(unit(side.normal), normal) > CREASE);
+        const side = smooth?.side ?? { normal: [0, 0, 0] };
+        side.normal = add(side.normal, normal);
+        let own = sides[node].find((other) => other.side === side && other.touched === touched);
+        if (!own) {
+          own = { node, side, touched, number: vertices.length };
+          sides[node].push(own);
+          vertices.push(own);
         }
-        vertices[side].normal = add(vertices[side].normal, normal);
-        index[i] = side;
-      }
+        index[3 * t + i] = own.number;
+      });
     }
     this.index = index;
-    this.vertexNodes = Uint32Array.from(vertices, (v) => v.node);
-    this.vertexNormals = Float32Array.from(vertices.flatMap((v) => unit(v.normal)));
-    this.vertexPlaces = Float32Array.from(vertices.flatMap((v) => row(this.nodes, v.node)));
-    const touched = (v) => touchable[v.node] && dot(unit(v.normal), touchable[v.node]) > 0.5;
+    this.vertexNodes = Uint32Array.from(vertices, ({ node }) => node);
+    this.vertexNormals = Float32Array.from(vertices.flatMap(({ side }) => unit(side.normal)));
+    this.vertexPlaces = Float32Array.from(vertices.flatMap(({ node }) => row(this.nodes, node)));
     this.vertexKinds = Uint8Array.from(
-      vertices.flatMap((v) => [clamped[v.node] ? 255 : 0, touched(v) ? 255 : 0]),
+      vertices.flatMap(({ node, touched }) => [clamped[node] ? 255 : 0, touched ? 255 : 0]),
     );
   }
 

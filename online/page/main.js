@@ -13,6 +13,7 @@ import { add, across, cross, dot, norm, scale, unit } from "./vectors.js";
 import { MOST_PARTS, View } from "./view.js";
 
 const COLOURINGS = ["stress", "displacement", "plain"];
+const MOVING = 0.3; // s after which a picture that has not changed stands still
 const SLOW = 0.045; // s a frame, from which on fewer pixels are drawn
 const BLURRED = 0.6; // pixels for each of the screen, from which on they are not fewer
 const COLOURED = 0.04; // s between fields of stress, which cost the service most of an answer
@@ -45,6 +46,7 @@ class Page {
     this.last = seconds();
     this.sharpness = 1; // pixels drawn for each of the screen
     this.pace = 0; // s a frame, of late
+    this.movedAt = 0;
     requestAnimationFrame(() => this.frame());
   }
 
@@ -184,7 +186,7 @@ class Page {
     this.ratio = 1;
     element("young").value = said.get("young") ?? 0;
     this.stiffen();
-    this.fit();
+    this.fit(1);
     if (!this.camera.fromText(said.get("view") ?? "")) this.lookAtAll();
     const tool = (said.get("tool") ?? "").split(",").map(Number);
     if (tool.length === 4 && tool.every(Number.isFinite)) {
@@ -293,7 +295,6 @@ class Page {
     const now = seconds(), passed = Math.min(now - this.last, 0.1);
     this.last = now;
     if (document.hidden || !this.scene) return;
-    this.fit();
     const before = this.tool.now;
     if (this.player) this.playOn(now);
     else this.tool.step(passed, !this.scene.serves.sessions);
@@ -303,12 +304,15 @@ class Page {
     if (this.scene.serves.sessions) this.ask(now);
     else this.press(now);
     if (this.changed) {
+      if (now - this.movedAt < MOVING) this.keepUp(passed);
+      this.movedAt = now;
+    }
+    const resized = this.fit(now - this.movedAt < MOVING ? this.sharpness : 1);
+    if (this.changed || resized) {
       this.changed = false;
       this.draw();
       this.readings.countFrame(now);
-      if (this.drew) this.keepUp(passed);
-      this.drew = true;
-    } else this.drew = false;
+    }
     if (!this.session || this.session.reader) this.opened ??= now; // s since the address was given
     this.readings.show(now, this.scene.tolerance, this.level());
   }
@@ -321,9 +325,11 @@ class Page {
     this.pace = 0;
   }
 
-  fit() {
-    if (this.view.fit(this.sharpness)) this.changed = true;
-    this.camera.aspect = this.view.canvas.width / this.view.canvas.height;
+  /** Make the canvas so much finer than the screen; return whether it has changed. */
+  fit(sharpness) {
+    const resized = this.view.fit(sharpness), { width, height } = this.view.canvas;
+    this.camera.aspect = width / height;
+    return resized;
   }
 
   /** What the tool is set to and has reached, for the readings. */

@@ -33,7 +33,7 @@ export function trust(answer, tolerance) {
   const doubted = Object.entries(answer.errors)
     .filter(([name, error]) => Number.isFinite(error) && error > tolerance[name])
     .map(([name]) => `${NAMES[name]} (${Number((100 * tolerance[name]).toFixed(1))} %)`);
-  if (doubted.length) words.push(`Errors may be above what is wanted: ${doubted.join(", ")}.`);
+  if (doubted.length) words.push(`Errors may exceed what is wanted: ${doubted.join(", ")}.`);
   if (words.length) return { state: "doubt", words: words.join(" ") };
   if (!answer.CONTACT) return { state: "none", words: "The tool does not touch the tissue." };
   return { state: "good", words: "In range, converged, errors within what is wanted." };
