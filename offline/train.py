@@ -37,7 +37,7 @@ from palpate.offline.fem.problem import FullProblem
 from palpate.offline.info import duration
 from palpate.offline.reduce.footprint_models import compile_query, train_patch
 from palpate.offline.reduce.join import bases_of, join
-from palpate.offline.reduce.layout import Layout
+from palpate.offline.reduce.layout import PATCHES, RITZ_SPACING, Layout
 from palpate.offline.reduce.load_range import SEARCHES, ask, bearable_shares, load_range, untested
 from palpate.offline.reduce.ritz import region
 from palpate.offline.reduce.sampling import fewer, spacing_count, spread_points, triangle_areas
@@ -151,7 +151,6 @@ def check(scene: str | Path, workers: int | None = None) -> str:
     if coarsest:
         found = divided(found, candidates(found)[0])
     problem = FullProblem(found)
-    spacing_count(problem.surface, found.training.limit_spacing)
     expected = forecast(problem, workers or os.cpu_count() or 1, coarsest)
     return "\n".join([expected, *_doubts(problem)])
 
@@ -171,14 +170,21 @@ def is_of(path: Path, key: str) -> bool:
 def forecast(problem: FullProblem, workers: int, coarsest: bool = False) -> str:
     """Mesh, number of local models and time of a training, in one line for people.
 
-    ``coarsest`` says that the mesh is the coarsest of those that training chooses from.
+    ``coarsest`` says that the mesh is the coarsest of those that training chooses from.  Raises
+    ``PalpateError`` with the key of a spacing that would make too many points.
     """
     scene, tip = problem.scene, problem.scene.endoscope.tip
     dofs, size, more, tried = problem.mesh.nodes.size, scene.training.size, "", 0
     if size is None:  # the size that training tries first
         size, more = ladder(scene)[max(first_place(scene.tolerance), 0)], " or more"
         tried = 5 * TRIALS * TRIAL_PATCHES
-    models = spacing_count(problem.surface, size.patch_spacing)
+    for key, spacing in {
+        "training.limit_spacing": scene.training.limit_spacing,
+        "training.region_spacing": scene.training.region_spacing,
+        PATCHES: RITZ_SPACING * size.patch_spacing,
+    }.items():
+        spacing_count(problem.surface, spacing, key)
+    models = spacing_count(problem.surface, size.patch_spacing, PATCHES)
     seconds = (models + tried) * (MODEL + MODEL_AND_DOF * dofs)
     seconds += PLACE * (mesh_part.places_of(scene, problem.surface) + tip * mesh_part.LEAST)
     seconds *= (TIP if tip else 1.0) * (TIME if scene.tissue.prony else 1.0) / workers
@@ -254,7 +260,8 @@ class Pipeline:
     def _load_range(self) -> Array:
         """Load range (v, LIMIT_FIELDS) at the vertices of the surface."""
         rng = stream(self.scene.seed, Stage.LOAD_RANGE)
-        count = spacing_count(self.surface, self.scene.training.limit_spacing)
+        spacing = self.scene.training.limit_spacing
+        count = spacing_count(self.surface, spacing, "training.limit_spacing")
         points = spread_points(self.surface, max(count, 16), rng)
         tasks = {f"range-{i}": (load_range, x) for i, x in enumerate(points)}
         fields = np.array(self._stage("load range", tasks))

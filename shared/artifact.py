@@ -12,11 +12,10 @@ bit in HDF5's own structures can keep its library busy for ever.
 import hashlib
 import json
 import math
-import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from io import BufferedRandom, BufferedReader
+from io import BufferedReader, BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple, get_args, get_type_hints
 
@@ -26,7 +25,7 @@ from numpy.typing import NDArray
 
 from palpate.shared.arrays import number_type
 from palpate.shared.errors import PalpateError
-from palpate.shared.files import open_regular
+from palpate.shared.files import open_regular, write_whole
 
 FORMAT = "palpate-artifact"
 FORMAT_VERSION = 10
@@ -187,31 +186,27 @@ def digest(values: NDArray[Any]) -> str:
 def write_artifact(
     path: Path, scene: str, documents: Mapping[str, Any], datasets: Mapping[str, Dataset]
 ) -> None:
-    """Write an artifact beside ``path``, flush it to disk, then move it into place."""
+    """Write an artifact, whole or not at all.
+
+    HDF5 has it in memory: where the disk is full, HDF5 itself would crash.
+    """
+    image = BytesIO()
+    with h5py.File(image, "w", userblock_size=SEAL_BYTES) as file:
+        file.attrs["format"] = FORMAT
+        file.attrs["format_version"] = FORMAT_VERSION
+        file.attrs["scene"] = scene
+        file.attrs["documents"] = json.dumps(documents, sort_keys=True)
+        for key, dataset in datasets.items():
+            worthwhile = dataset.compress and dataset.values.size > 0
+            filters = {"compression": 4, "shuffle": True} if worthwhile else {}
+            stored = file.create_dataset(key, data=dataset.values, **filters)
+            stored.attrs["units"] = dataset.units
+            stored.attrs["description"] = dataset.description
+            stored.attrs["sha256"] = digest(dataset.values)
+    rest = image.getbuffer()[SEAL_BYTES:]
+    seal = f"{FORMAT} {FORMAT_VERSION} {hashlib.sha256(rest).hexdigest()}\n".encode()
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.part")
-    try:
-        with h5py.File(temporary, "w", userblock_size=SEAL_BYTES) as file:
-            file.attrs["format"] = FORMAT
-            file.attrs["format_version"] = FORMAT_VERSION
-            file.attrs["scene"] = scene
-            file.attrs["documents"] = json.dumps(documents, sort_keys=True)
-            for key, dataset in datasets.items():
-                worthwhile = dataset.compress and dataset.values.size > 0
-                filters = {"compression": 4, "shuffle": True} if worthwhile else {}
-                stored = file.create_dataset(key, data=dataset.values, **filters)
-                stored.attrs["units"] = dataset.units
-                stored.attrs["description"] = dataset.description
-                stored.attrs["sha256"] = digest(dataset.values)
-        with temporary.open("r+b") as written:
-            seal = f"{FORMAT} {FORMAT_VERSION} {_digest_of_rest(written)}\n"
-            written.seek(0)
-            written.write(seal.encode())
-            written.flush()
-            os.fsync(written.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_whole(path, seal.ljust(SEAL_BYTES, b"\0"), rest)
 
 
 def read_artifact(path: Path, *kinds: type) -> Artifact:
@@ -251,7 +246,7 @@ def _check_seal(file: BufferedReader, path: Path) -> str:
     return seal[2].decode()
 
 
-def _digest_of_rest(file: BufferedReader | BufferedRandom) -> str:
+def _digest_of_rest(file: BufferedReader) -> str:
     """SHA-256 of all that follows the seal."""
     file.seek(SEAL_BYTES)
     return hashlib.file_digest(file, "sha256").hexdigest()

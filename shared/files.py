@@ -1,4 +1,4 @@
-"""Files that people name: only regular ones are read, and their names can be shown."""
+"""Files that people name: regular ones are read, whole ones written, and names can be shown."""
 
 import os
 import stat
@@ -14,6 +14,25 @@ def open_regular(path: Path) -> BufferedReader:
         file.close()
         raise OSError(f"{path} is not a regular file")
     return file
+
+
+def write_whole(path: Path, *parts: bytes | memoryview) -> None:
+    """Write a file beside its place, flush it to disk, then move it there.
+
+    Where that fails nothing of it stays, and the ``OSError`` has its name.
+    """
+    part = path.with_name(f".{path.name}.part")
+    try:
+        with part.open("wb") as file:
+            file.writelines(parts)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError as error:  # of a full disk it does not
+        error.filename = error.filename or str(path)
+        raise
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def printable(text: str) -> str:

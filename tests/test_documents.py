@@ -21,9 +21,11 @@ from palpate.offline.studies.figures import (
     table,
 )
 from palpate.online.serve.answer import answer
+from palpate.online.serve.errors import STATUS
 from palpate.online.serve.metrics import Metrics
 from palpate.online.serve.schemas import SolveRequest, parse
 from palpate.online.serve.wire import JSON
+from palpate.online.session.session import ENDING, GOING_AWAY, IDLE
 from palpate.shared.cli import main
 from palpate.shared.model import ReducedModel
 
@@ -91,6 +93,20 @@ def test_the_theory_names_code_that_is_there():
         owner, _, last = name.rpartition(".")
         own = [text for path, text in code.items() if path.stem == owner] or code.values()
         assert any(re.search(rf"\b{last}\b", text) for text in own), name
+
+
+def test_codes_that_documents_name_are_those_of_the_service():
+    text = TEXTS[ROOT / "online" / "README.md"]
+    named = re.findall(r"\b(4\d\d|5\d\d) `(\w+)`", text)
+    assert named
+    for status, code in named:
+        assert STATUS[code] == int(status)
+    for code in re.findall(r'"code": "(\w+)"', text):
+        assert code in STATUS
+    (ends,) = re.findall(r"(?s)\*\*It ends\*\*.*?Beyond", text)
+    too_long = 1009  # of the WebSocket protocol itself
+    codes = {GOING_AWAY, IDLE, *ENDING.values(), too_long}
+    assert set(map(int, re.findall(r"\b[14]\d{3}\b", ends))) == codes
 
 
 def test_the_readme_is_read_in_five_minutes():

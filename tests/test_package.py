@@ -1,9 +1,16 @@
 """The package has a name of its own: folders of other projects cannot hide its parts."""
 
+import ast
+import re
 import subprocess
 import sys
+import tomllib
+from importlib.metadata import packages_distributions, requires
+from pathlib import Path
 
 import pytest
+
+import palpate
 
 SCRIPT = """
 from palpate import REST, Client, ReducedModel, Session
@@ -40,8 +47,48 @@ def test_the_parts_are_not_importable_without_the_name_of_the_package(part, tmp_
     assert f"No module named '{part}'" in run(tmp_path, "-c", f"import {part}").stderr
 
 
-def test_an_unknown_name_is_an_attribute_error():
-    import palpate
+def test_every_name_that_the_package_has_is_there():
+    assert set(palpate.__all__) == palpate._WHERE.keys()
+    for name in palpate.__all__:
+        assert getattr(palpate, name) is not None
 
+
+def test_an_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="no attribute 'Atlas'"):
         _ = palpate.Atlas
+
+
+def distribution(requirement):
+    """Name of what a requirement asks for."""
+    return re.match(r"[\w.-]+", requirement)[0].lower().replace("_", "-")
+
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+CORE = set(map(distribution, PROJECT["dependencies"]))
+
+
+def test_the_core_has_no_library_for_training_pictures_or_tests():
+    extras = PROJECT["optional-dependencies"]
+    for needed in map(distribution, (name for extra in extras.values() for name in extra)):
+        assert needed not in CORE
+    assert not CORE & {"mkl", "matplotlib", "pyvista", "tqdm", "torch", "scikit-learn", "felupe"}
+
+
+@pytest.mark.parametrize("part", ["shared", "online"])
+def test_what_serves_imports_nothing_but_the_core(part):
+    """Or what that brings along; where a function imports more, it is for another extra."""
+    brought = {
+        distribution(line) for name in CORE for line in requires(name) or () if ";" not in line
+    }
+    owners = packages_distributions()
+    for source in (ROOT / part).rglob("*.py"):
+        for node in ast.parse(source.read_text("utf-8")).body:
+            names = [alias.name for alias in getattr(node, "names", ())]
+            if isinstance(node, ast.ImportFrom):
+                names = [node.module]
+            for name in names if isinstance(node, ast.Import | ast.ImportFrom) else ():
+                top = name.partition(".")[0]
+                if top != "palpate" and top not in sys.stdlib_module_names:
+                    owner = {distribution(found) for found in owners[top]}
+                    assert owner & (CORE | brought), (source, name)

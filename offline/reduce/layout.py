@@ -12,6 +12,9 @@ from palpate.shared.arrays import Array, Ints
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.scene import Scene, Size
 
+PATCHES = "training.size.patch_spacing"
+"""Key of the spacing of local models."""
+
 RITZ_SPACING = 0.455
 """Of the footprints whose Ritz vectors are taken, in units of the patch spacing."""
 
@@ -43,14 +46,14 @@ class Layout:
     def __init__(self, scene: Scene, surface: Surface, limits: Array, size: Size) -> None:
         rng, blend = stream(scene.seed, Stage.LAYOUT), scene.training.blend
         self._scene, self._surface, self._limits, self.size = scene, surface, limits, size
-        count = spacing_count(surface, size.patch_spacing)
+        count = spacing_count(surface, size.patch_spacing, PATCHES)
         self.centres = centred_points(surface, count, rng)  # (p, 3) mm
-        count = spacing_count(surface, scene.training.region_spacing)
+        count = spacing_count(surface, scene.training.region_spacing, "training.region_spacing")
         region = cKDTree(centred_points(surface, count, rng)).query(self.centres)[1]
         region = np.unique(region, return_inverse=True)[1].astype(np.int32)
         order = np.argsort(region, kind="stable")
         self.centres, self.region = self.centres[order], region[order]  # (p,), ascending
-        count = spacing_count(surface, RITZ_SPACING * size.patch_spacing)
+        count = spacing_count(surface, RITZ_SPACING * size.patch_spacing, PATCHES)
         ritz = spread_points(surface, count, rng)
         self.footprints = [Footprint.of(surface, x, limits) for x in ritz]
         # footprints of each local model, ascending

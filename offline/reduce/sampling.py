@@ -69,18 +69,19 @@ def fewer(count: int, tolerance: Tolerance) -> int:
     return math.ceil(count / math.sqrt(tolerance.looseness))
 
 
-def spacing_count(surface: Surface, spacing: float) -> int:
+def spacing_count(surface: Surface, spacing: float, key: str = "endoscope.radius") -> int:
     """How many points have the given mean spacing (mm) on the surface (hexagonal packing).
 
-    Raises ``PalpateError`` if they are more than anybody waits for.
+    Raises ``PalpateError`` with the key of a scene that sets it if they are more than anybody waits
+    for.
     """
     area = float(triangle_areas(surface).sum())
     count = max(1, round(area * 2 / (math.sqrt(3) * spacing**2)))
     if count > MOST_POINTS:
         raise PalpateError(
-            f"the accessible surface, {area:.3g} mm^2, would take {count} points {spacing:.3g} mm "
-            f"apart, and at most {MOST_POINTS} are worked with: a larger endoscope.radius, a "
-            "training.size.patch_spacing in proportion to it or a smaller surface lowers that"
+            f"{key}: the accessible surface, {area:.3g} mm^2, would take {count} points "
+            f"{spacing:.3g} mm apart, and at most {MOST_POINTS} are worked with; what a scene does "
+            "not say of its training is in proportion to endoscope.radius"
         )
     return count
 

@@ -21,6 +21,7 @@ import threading
 import weakref
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from tqdm import tqdm
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.section import read_section
 from palpate.shared.errors import PalpateError
+from palpate.shared.files import write_whole
 from palpate.shared.scene import Extrusion, Scene, parse_scene
 
 Tasks = Mapping[str, tuple[Any, ...]]
@@ -151,14 +153,9 @@ class Checkpoint:
 
     def store(self, name: str, result: object) -> Path:
         """Keep a result; return where, for workers to read it with ``read_result``."""
-        path = self._path(name)
-        temporary, pickled = path.with_suffix(".part"), pickle.dumps(result)
-        with temporary.open("wb") as file:
-            file.write(hashlib.sha256(pickled).digest())
-            file.write(pickled)
-            file.flush()
-            os.fsync(file.fileno())
-        return temporary.replace(path)
+        path, pickled = self._path(name), pickle.dumps(result)
+        write_whole(path, hashlib.sha256(pickled).digest(), pickled)
+        return path
 
     def resume(self, title: str, executor: Executor, tasks: Tasks) -> dict[str, Any]:
         """Results of tasks by name; those that are not there yet are run, with a bar."""
@@ -217,5 +214,6 @@ def _locked(path: Path) -> int:
             f"{path.parent} is in use by {other}; wait for it to end, or choose another --out"
         ) from None
     os.truncate(descriptor, 0)
-    os.write(descriptor, f"process {os.getpid()}: {' '.join(sys.argv)}\n".encode())
+    with suppress(OSError):  # where the disk is full it is locked all the same
+        os.write(descriptor, f"process {os.getpid()}: {' '.join(sys.argv)}\n".encode())
     return descriptor

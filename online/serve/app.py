@@ -91,7 +91,7 @@ def create_app(here: Service, on_ready: Callable[[], None] = lambda: None) -> Fa
         # Even unused it looks for a tracer in every request; the service times itself.
         telemetry={"tracing": False, "metrics": False, "logs": False},
     )
-    app.state.service = here
+    app.state.service, app.state.sessions = here, sessions
     app.add_middleware(guard.Guard, settings=settings, metrics=here.metrics)
     if settings.origins:
         # outermost: preflights carry no token, and refusals must be readable by the page too
@@ -358,9 +358,10 @@ async def session(name: SceneName, request: Request) -> Response:
     """Open a session (WebSocket): send positions of the tip, get forces.
 
     The first message of the service is a greeting in JSON that states the layout of the frames.
-    A text message is answered in JSON, a binary one in binary.
+    A text message is answered in JSON, a binary one in binary. A request without a handshake is
+    told why one would be refused.
     """
-    request.app.state.service.model(name)
+    request.app.state.sessions.check(name)
     raise Refusal("upgrade_required", "upgrade", "A session is opened by a WebSocket handshake")
 
 

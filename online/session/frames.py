@@ -178,6 +178,22 @@ class Reply(NamedTuple):
     dent: Array | None
 
     @property
+    def converged(self) -> bool:
+        """Whether an equilibrium was found at `position`."""
+        return bool(self.flags & Flag.CONVERGED)
+
+    @property
+    def in_range(self) -> bool:
+        """Whether the model was trained for such a state."""
+        return bool(self.flags & Flag.IN_RANGE)
+
+    @property
+    def out_of_range(self) -> tuple[str, ...]:
+        """What of the state the model was not trained for, as an `Answer` names it."""
+        beyond = {"position": Flag.BESIDE, "depth": Flag.TOO_DEEP}
+        return tuple(name for name, flag in beyond.items() if self.flags & flag)
+
+    @property
     def contact(self) -> bool:
         """Whether the tip touches."""
         return bool(self.flags & Flag.CONTACT)

@@ -62,16 +62,7 @@ class Sessions:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Refuse a session or run it until it ends."""
-        served = self._service.model(scope["path_params"]["name"])
-        if not served.model.has_tip:
-            raise Refusal(
-                "no_tip", "name", "This scene was trained without a tip; it only answers loads"
-            )
-        most = self._service.settings.max_sessions
-        if self._open >= most:
-            raise Refusal(
-                "too_many_sessions", "", f"{self._open} sessions are open", {"max_sessions": most}
-            )
+        served = self.check(scope["path_params"]["name"])
         self._open += 1
         count = self._service.metrics.count
         count("sessions")
@@ -85,6 +76,20 @@ class Sessions:
             count("sessions", by=-1.0)
             tracker.restart()
             served.spare.append(tracker)
+
+    def check(self, name: str) -> ServedModel:
+        """Return the model of a scene, or refuse a session of it."""
+        served = self._service.model(name)
+        if not served.model.has_tip:
+            raise Refusal(
+                "no_tip", "name", "This scene was trained without a tip; it only answers loads"
+            )
+        most = self._service.settings.max_sessions
+        if self._open >= most:
+            raise Refusal(
+                "too_many_sessions", "", f"{self._open} sessions are open", {"max_sessions": most}
+            )
+        return served
 
     def prepare(self, served: ServedModel, path: Sequence[Sequence[float]]) -> None:
         """Call everything once and make spare trackers; the tip follows `path` (mm)."""

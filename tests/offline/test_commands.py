@@ -1,5 +1,6 @@
 """The offline commands as their user meets them, on an artifact of the quick scene."""
 
+import errno
 import json
 import os
 import re
@@ -88,6 +89,16 @@ def test_what_is_next_after_training_is_a_command_that_works(answer, artifact):
     report = answer(*tip.split()[2:])
     assert report["trust"]["in_range"]
     assert np.linalg.norm(report["force"]) > 0.0
+
+
+def test_training_ends_with_where_how_large_how_accurate_and_what_is_next(
+    run, artifact, monkeypatch
+):
+    monkeypatch.setattr("palpate.offline.train.is_of", lambda *_: True)
+    first, *said = run("train", "quick", "--out", artifact).stdout.splitlines()
+    assert first == f"{artifact}: {artifact.stat().st_size / 1e6:.1f} MB"
+    assert re.match(r"errors: 95 of 100 within: displacement [\d.]+ %, von Mises ", said[0])
+    assert said[-2].startswith(f"next: palpate solve {artifact} --at ")
 
 
 def test_training_ends_with_a_word_of_a_tolerance_that_the_mesh_misses(artifact, monkeypatch):
@@ -238,3 +249,51 @@ def test_help_is_plain_text(run):
         told = run(command, "--help").output
         assert "\\b" not in told
         assert "None" not in told
+
+
+FULL = """
+import resource, sys
+import numpy as np
+from palpate.offline import train
+from palpate.shared.artifact import Dataset, write_artifact
+from palpate.shared.cli import main
+
+def run(self, path, _):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, -1))  # as on a disk with so much room
+    much = np.random.default_rng(0).random(100_000)
+    if sys.argv[2] == "result":
+        self.checkpoint.store("result", much)
+    write_artifact(path, "", {}, {"much": Dataset(much, "1", "more than there is room for")})
+
+if __name__ == "__main__":  # workers import this file
+    train.Pipeline.run = run
+    main(["train", "quick", "--out", sys.argv[1], "--workers", "1"])
+"""
+
+
+@pytest.mark.parametrize(("write", "named"), [("result", "result.pickle"), ("all", "quick.h5")])
+def test_training_without_room_ends_in_a_sentence_and_leaves_nothing(tmp_path, write, named):
+    (tmp_path / "full.py").write_text(FULL)
+    out = tmp_path / "artifacts" / "quick.h5"
+    ended = subprocess.run(
+        [sys.executable, tmp_path / "full.py", out, write], capture_output=True, text=True
+    )
+    *_, said = ended.stderr.splitlines()
+    assert re.fullmatch(f"Error: {out.parent}/.*{named}: File too large", said), ended.stderr
+    assert ended.returncode == 2
+    assert "Traceback" not in ended.stderr
+    assert list(out.parent.iterdir()) == []
+
+
+def test_training_into_a_folder_that_can_only_be_read_ends_in_a_sentence(
+    run, tmp_path, monkeypatch
+):
+    def refuse(path, *_):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+
+    monkeypatch.setattr(os, "mkdir", refuse)
+    ended = run("train", "quick", "--out", tmp_path / "quick.h5")
+    assert ended.exit_code == 2
+    said = f"Error: {tmp_path}/.quick.training.*: {os.strerror(errno.EROFS)}\n"
+    assert re.fullmatch(said, ended.stderr)
+    assert list(tmp_path.iterdir()) == []

@@ -82,3 +82,20 @@ def test_what_is_likely_a_slip_is_asked_about(run, slab, said, slip, asked):
     checked = run("train", slab, "--check")
     assert checked.exit_code == 0, checked.output
     assert asked in checked.stdout
+
+
+@pytest.mark.parametrize(
+    ("line", "key"),
+    [
+        ("training.limit_spacing = 0.05", "training.limit_spacing"),
+        ("training.region_spacing = 0.05", "training.region_spacing"),
+        ("training.size = {patch_spacing = 0.1, modes = 40, cubature_points = 64, "
+         "region_modes = 60}", "training.size.patch_spacing"),
+        ("endoscope.reach = 4.5", ""),
+    ],
+)  # fmt: skip
+def test_a_spacing_that_makes_too_many_points_is_refused_by_its_key(run, slab, line, key):
+    slab.write_text(f"{SLAB}{line}\n")
+    checked = run("train", slab, "--check")
+    assert checked.exit_code == (2 if key else 0), checked.output
+    assert checked.stderr.startswith(f"Error: {key}: the accessible surface" if key else "")

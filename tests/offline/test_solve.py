@@ -104,6 +104,18 @@ def test_no_load_has_no_error_and_a_load_without_equilibrium_is_told(artifact, m
         solve(artifact, POSITION, 1e4)
 
 
+def test_a_smaller_radius_is_answered_and_said_to_be_out_of_range(
+    answer, artifact, atlas, pressure
+):
+    at = "--at", *POSITION, "--pressure", pressure, "--radius", 1.5
+    report, expected = answer("solve", artifact, *at), atlas.press(POSITION, pressure, radius=1.5)
+    assert report["contact"]["radius"] == 1.5
+    np.testing.assert_allclose(report["force"], expected.force)
+    assert 0 < report["force"][2] < atlas.press(POSITION, pressure).force[2]
+    assert report["trust"]["converged"]
+    assert report["trust"]["out_of_range"] == ["radius"]
+
+
 def test_the_tip_is_answered_as_by_the_atlas(answer, artifact, atlas):
     at = 4.0, 5.5, 9.7
     report, expected = answer("solve", artifact, "--tip", "--at", *at), atlas.touch(at)

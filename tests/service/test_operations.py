@@ -7,7 +7,7 @@ import shutil
 import signal
 import time
 import urllib.request
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 
 import numpy as np
 import pytest
@@ -15,13 +15,14 @@ from click.testing import CliRunner
 from prometheus_client.parser import text_string_to_metric_families
 
 from palpate.online.client.http import Client
-from palpate.online.client.session import ServiceError, SessionClosed
+from palpate.online.client.session import ServiceError, Session, SessionClosed
 from palpate.online.loadtest.run import run
 from palpate.online.settings import Plan
 from palpate.shared.cli import main
 from palpate.shared.model import ReducedModel
 
 from .conftest import rewritten
+from .test_mutations import process_memory
 
 pytestmark = pytest.mark.service
 
@@ -73,6 +74,59 @@ def test_settings_come_from_the_environment_and_a_token_lets_other_machines_in(s
     assert any(message.startswith("real-time scheduling: ") for message in messages)
     assert any("POST /scenes/quick/solve" in message and "200" in message for message in messages)
     assert "secret" not in server.log
+
+
+@pytest.mark.parametrize(
+    ("proxy", "statuses"),
+    [
+        ([], [200, 429]),
+        (["--proxy", "10.0.0.9"], [200, 429]),
+        (["--proxy", "127.0.0.1"], [200, 200]),
+    ],
+)
+def test_only_a_proxy_that_is_named_is_believed_who_its_clients_are(
+    serve, artifact, proxy, statuses
+):
+    found = []
+    with serve(artifact.parent, "--rate-limit", "0.01", *proxy) as server:
+        for client in ("10.0.0.1", "10.0.0.2"):
+            request = urllib.request.Request(
+                f"{server.url}/scenes", headers={"X-Forwarded-For": client}
+            )
+            try:
+                with urllib.request.urlopen(request) as response:
+                    found.append(response.status)
+            except urllib.error.HTTPError as refused:
+                with refused:
+                    found.append(refused.code)
+    assert found == statuses
+
+
+def misbehave(url, times):
+    """Ask for what is refused, and leave sessions in the middle of nonsense."""
+    for i in range(times):
+        for path, body in (
+            ("/scenes/quick/solve", 20_000 * b"[0,"),  # no JSON
+            ("/scenes/quick/solve", 70_000 * b"["),  # too long
+            (f"/scenes/{i}{5_000 * 'a'}/solve", b"{}"),
+            (f"/{i}{20_000 * 'a'}", b""),  # its head is too long
+        ):
+            with pytest.raises((urllib.error.URLError, ConnectionError)):
+                urllib.request.urlopen(f"{url}{path}", body)
+        with suppress(ServiceError), Session(url, "quick") as session:  # there may be too many
+            for nonsense in (1_000 * b"x", '{"position": [1e9', '{"snapshot": 99}'):
+                session._connection.send(nonsense)
+            session._connection.socket.close()
+
+
+def test_refused_requests_and_abandoned_sessions_take_no_memory_for_good(serve, artifact):
+    with serve(artifact.parent) as server:
+        misbehave(server.url, 50)
+        before = process_memory(server.process.pid)
+        misbehave(server.url, 300)
+        assert process_memory(server.process.pid) - before < 20e6  # of 45 MB that were sent
+        with Client(server.url) as client:
+            assert client.scenes()["scenes"]
 
 
 def session_on(worker, url, client, **options):

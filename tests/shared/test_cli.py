@@ -131,7 +131,8 @@ def test_whatever_imports_the_software_runs_on_one_blas_thread():
             ["felupe", "matplotlib", "palpate.offline", "pyvista", "scipy.sparse.linalg", "tqdm"],
         ),
         (
-            "from palpate import Client, Session",
+            "from palpate import Client, Flag, Output, PalpateError, ServiceError, Session\n"
+            "from palpate import SessionClosed",
             ["fastapi", "pydantic", "h5py", "numba", "starlette", "orjson", "msgpack"],
         ),
     ],

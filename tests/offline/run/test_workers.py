@@ -69,7 +69,7 @@ def test_a_folder_belongs_to_one_process_until_it_ends(tmp_path):
         assert (folder / "other" / "a.pickle").exists()
         other.kill()
     (folder / "key").mkdir(exist_ok=True)
-    (folder / "key" / "left.part").touch()
+    (folder / "key" / ".left.pickle.part").touch()
     checkpoint = Checkpoint(folder, "key")
     assert sorted(path.name for path in folder.iterdir()) == ["key", "lock"]
     checkpoint.leave()

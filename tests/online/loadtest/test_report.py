@@ -1,3 +1,4 @@
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +11,7 @@ from palpate.online.loadtest.run import (
     summarize,
     summarize_added,
     summarize_overload,
+    table,
     verdict,
 )
 from palpate.online.loadtest.streams import (
@@ -78,8 +80,13 @@ def test_what_became_of_messages_is_told_apart():
     assert found["complaints"] == ["stop"]
 
 
-def judged(messages, late_ms=0.0, steal=(), **plan):
+def judged(messages, **changes):
     """The verdict on frames at 1 kHz of a session."""
+    return reported(messages, **changes)["verdict"]
+
+
+def reported(messages, late_ms=0.0, steal=(), **plan):
+    """The summary of a load test of frames at 1 kHz of a session."""
     messages.lateness[:] = 1e3 * late_ms
     box = machine(10, steal)
     clean = clean_windows(box, messages)
@@ -88,12 +95,13 @@ def judged(messages, late_ms=0.0, steal=(), **plan):
         "windows": 10,
         "clean_windows": int(clean.sum()),
         "steal_s": float(box.steal.sum()),
+        "load_average": 0.0,
         "lateness_us": quantiles(messages.lateness),
     }
     asked = Plan("http://127.0.0.1:1", "toy", **plan)
     if asked.overload > 1:
         summary["overload"] = {"recovered_s": 0.5 if asked.overload < 5 else None}
-    return verdict(asked, summary)
+    return summary | {"plan": asdict(asked), "verdict": verdict(asked, summary)}
 
 
 def test_the_verdict_says_whether_why_and_what_to_do():
@@ -125,6 +133,20 @@ def test_a_load_test_that_was_late_itself_says_nothing_of_the_service():
     found = judged(log(due), steal=range(6))
     assert found["verdict"] == "void"
     assert "4 of 10 windows are clean" in found["why"]
+
+
+def test_the_verdict_is_the_first_that_is_printed_and_then_what_to_do():
+    due, asked = np.arange(0.0, 10.0, 0.01), "toy: 1 sessions at 1000 frames/s for 10 s"
+    lost = np.where(due < 1.0, LOST, ANSWERED)
+    kept, missed, void = (
+        table(reported(*found)).splitlines()
+        for found in ((log(due),), (log(due, outcome=lost),), (log(due), 1.6))
+    )
+    assert kept[:2] == [f"kept: {asked}: 99 of 100 within 200 µs (frames)", ""]
+    assert missed[0] == f"not kept: {asked}: 100 of 1000 frames were lost"
+    assert missed[1].startswith("what to do: look at the service's log")
+    assert void[0].startswith(f"void: {asked}: the load test was late itself, by 1600 µs (p99)")
+    assert void[1].startswith("what to do: run it where it has a core of its own")
 
 
 def test_what_the_service_adds_is_the_round_trip_less_its_work():

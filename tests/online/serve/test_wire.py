@@ -1,4 +1,5 @@
 import struct
+import sys
 from contextlib import suppress
 
 import numpy as np
@@ -94,3 +95,28 @@ def test_formats_not_on_offer_are_refused(accept):
 def test_no_header_breaks_it(accept):
     with suppress(Refusal):
         assert negotiate(accept) in OFFERED
+
+
+def steps(accept):
+    """Steps of the interpreter that choosing a format takes."""
+    count, before = 0, sys.gettrace()
+
+    def trace(frame, event, _):
+        nonlocal count
+        frame.f_trace_opcodes = True
+        count += event == "opcode"
+        return trace
+
+    sys.settrace(trace)
+    try:
+        with suppress(Refusal):
+            negotiate.__wrapped__(accept)
+    finally:
+        sys.settrace(before)
+    return count
+
+
+@pytest.mark.parametrize("piece", ["a/{}, ", "a/{};q=0.1,", ",", ";", "a/{};", "q={}", "*/*,", " "])
+def test_a_header_ten_times_as_long_takes_at_most_ten_times_the_work(piece):
+    short, long = (steps("".join(map(piece.format, range(n)))) for n in (300, 3000))
+    assert 0 < long < 11 * short

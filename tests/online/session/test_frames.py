@@ -71,6 +71,7 @@ def test_a_request_and_a_reply_come_back():
     assert (reply.error_displacement, reply.error_force) == pytest.approx((0.001, 0.003))
     assert reply.contact
     assert reply.good
+    assert reply.converged
     for flag in (Flag.CLAMPED, Flag.FALLBACK):  # a reply for another position
         assert not frames.decode_reply(frames.encode_reply(REQUEST, step(7 | flag))).good
     assert reply.coordinates is reply.displacement is reply.von_mises is None
@@ -154,3 +155,20 @@ def test_the_protocol_has_the_layout():
         for name, (kind, offset) in frames.REPLY.fields.items()
     ]
     assert frames.PATH.read_text() == frames.document()
+
+
+@pytest.mark.parametrize(
+    ("flags", "beyond"),
+    [
+        (Flag.CONVERGED | Flag.IN_RANGE, ()),
+        (Flag.CONVERGED | Flag.TOO_DEEP, ("depth",)),
+        (Flag.CONVERGED | Flag.BESIDE | Flag.TOO_DEEP, ("position", "depth")),
+        (Flag.FALLBACK, ()),
+    ],
+)
+def test_a_reply_has_the_names_of_an_answer_for_how_far_to_trust_it(flags, beyond):
+    reply = frames.decode_reply(frames.encode_reply(REQUEST, step(flags)))
+    assert reply.converged == (flags != Flag.FALLBACK)
+    assert reply.in_range == (flags == Flag.CONVERGED | Flag.IN_RANGE)
+    assert reply.out_of_range == beyond
+    assert {"converged", "in_range", "out_of_range"} <= set(Answer._fields)

@@ -1,6 +1,8 @@
 """Sessions on a real socket: what is answered, what is refused, and how they end."""
 
 import json
+import urllib.error
+import urllib.request
 
 import numpy as np
 import pytest
@@ -209,6 +211,20 @@ def test_without_a_handshake_there_is_no_session_but_its_description(client):
     document = client.get("/openapi.json").json()
     responses = document["paths"]["/scenes/{name}/session"]["get"]["responses"]
     assert responses["101"]["description"] == frames.document()
+
+
+def test_who_cannot_read_a_refused_handshake_is_told_the_same_without_one(serving):
+    """As the client in C# does."""
+    models = FakeModel(), FakeModel("flat", has_tip=False)
+    with serving(*models, max_sessions=1) as url, Session(url, "toy"):
+        for scene in ("toy", "flat", "other"):
+            with pytest.raises(ServiceError) as refused:
+                Session(url, scene)
+            with pytest.raises(urllib.error.HTTPError) as told:
+                urllib.request.urlopen(f"{url}/scenes/{scene}/session")
+            with told.value as response:
+                error = json.load(response)["error"]
+            assert (told.value.code, error["code"]) == (refused.value.status, refused.value.code)
 
 
 def test_a_session_closed_by_its_client_says_so(session):
