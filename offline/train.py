@@ -31,6 +31,7 @@ from tqdm import tqdm
 
 from palpate.offline.choose.mesh import candidates, divided, with_mesh
 from palpate.offline.choose.size import Trial, choose, first_place, ladder, try_patch
+from palpate.offline.doubts import doubts
 from palpate.offline.fem.mesh import mesh_quality
 from palpate.offline.fem.norms import statistics
 from palpate.offline.fem.problem import FullProblem
@@ -53,7 +54,6 @@ from palpate.offline.run.progress import Teller
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.workers import Checkpoint, Tasks, content_key, open_scene, run, worker_pool
 from palpate.offline.scenes import default_artifact, find_scene
-from palpate.offline.doubts import doubts
 from palpate.offline.validate import mesh_part
 from palpate.offline.validate.compare import (
     Row,
