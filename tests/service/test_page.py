@@ -177,6 +177,16 @@ def test_the_slider_makes_the_tissue_as_stiff(page, server, atlas):
     release(page, x, y)
 
 
+def test_where_drawing_is_slow_a_picture_that_moves_has_fewer_pixels(page):
+    width, whole = "palpate.view.canvas.width", "palpate.view.canvas.clientWidth"
+    page.wait(f"{width} === {whole}")
+    page.run("for (let i = 0; i < 100; i++) palpate.keepUp(0.1)")
+    page.run("window.moving = setInterval(() => { palpate.changed = true; }, 20)")
+    page.wait(f"{width} < 0.6 * {whole}")
+    page.run("clearInterval(window.moving)")
+    page.wait(f"{width} === {whole}")  # it stands still
+
+
 def test_a_drag_beside_the_tissue_turns_it_and_the_address_says_how(page):
     before = page.run("palpate.camera.yaw")
     page.mouse("pressed", 60, 600, button="left", buttons=1, clickCount=1)
