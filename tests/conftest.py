@@ -39,9 +39,10 @@ def pytest_sessionstart(session):
     """Train what most tests need while other tests run, where many processes run them all."""
     if session.config.getoption("dist", "no") == "no" or session.config.args != ["tests"]:
         return
+    folders = session.config._tmp_path_factory
+    folders.getbasetemp()  # now: threads would make two
     for scene in ("quick", "quick-visco"):
-        folder = session.config._tmp_path_factory
-        threading.Thread(target=trained, args=(scene, folder), daemon=True).start()
+        threading.Thread(target=trained, args=(scene, folders), daemon=True).start()
 
 
 def trained(scene, tmp_path_factory):
