@@ -57,29 +57,29 @@ artifact_option = click.option(
 
 
 UNITS = {
-    "position": "mm",
-    "distance": "mm",
-    "centre": "mm",
-    "radius": "mm",
-    "depth": "mm",
-    "depth_limit": "mm",
+    "force": "mN",
+    "tangent": "mN/mm",
     "contact_displacement": "mm",
+    "contact.position": "mm",
+    "contact.distance": "mm",
+    "contact.centre": "mm",
+    "contact.radius": "mm",
+    "contact.depth": "mm",
+    "contact.depth_limit": "mm",
+    "contact.pressure": "kPa",
+    "contact.pressure_limit": "kPa",
     "peak.displacement": "mm",
     "peak.von_mises": "kPa",
     "peak.von_mises_p99": "kPa",
-    "pressure": "kPa",
-    "pressure_limit": "kPa",
-    "force": "mN",
-    "tangent": "mN/mm",
-    "solve_us": "µs",
-    "recover_us": "µs",
+    "timing.solve_us": "µs",
+    "timing.recover_us": "µs",
     "error.displacement": "relative",
     "error.von_mises": "relative",
     "error_estimate.displacement": "relative",
     "error_estimate.von_mises": "relative",
     "error_estimate.force": "relative",
 }
-"""Of what is reported, by its name, or that of its table as well."""
+"""Of what `palpate solve` reports, by its name and that of its table."""
 
 
 def reporting(command: Callable[..., Report]) -> Callable[..., None]:
@@ -95,8 +95,7 @@ def reporting(command: Callable[..., Report]) -> Callable[..., None]:
         leaves = list(_leaves(report, ""))
         width = max(len(name) for name, _ in leaves)
         for name, value in leaves:
-            *_, table, key = ["", *name.split(".")]
-            unit = UNITS.get(f"{table}.{key}", UNITS.get(key, ""))
+            unit = UNITS.get(".".join(name.split(".")[-2:]), "")
             click.echo(f"{name:<{width}}  {_text(value)} {unit}".rstrip())
 
     return show

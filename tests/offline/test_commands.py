@@ -116,6 +116,13 @@ def test_an_artifact_answers_to_the_name_of_its_scene(answer, artifact, tmp_path
     assert answer("solve", "quick", *CONTACT)["scene"] == "quick"
 
 
+def test_answers_for_people_have_units(run, artifact):
+    said = run("solve", artifact, "--at", "5", "5", "8", "--pressure", "1").stdout
+    for name, unit in {"contact.pressure": "kPa", "force": "mN", "peak.displacement": "mm"}.items():
+        assert re.search(rf"^{name} +[-\d., e]+ {unit}$", said, re.M), name
+    assert re.search(r"^contact.position +5, 5, 8 mm$", said, re.M)
+
+
 def test_outside_the_range_it_warns_and_knows_no_error(run, artifact, atlas):
     pressure = 2 * atlas.pressure_max
     result = run("solve", artifact, *CONTACT[:-1], pressure, "--json")
