@@ -16,7 +16,8 @@ const COLOURINGS = ["stress", "displacement", "plain"];
 const MOVING = 0.3; // s after which a picture that has not changed stands still
 const SLOW = 0.045; // s a frame, from which on fewer pixels are drawn
 const BLURRED = 0.6; // pixels for each of the screen, from which on they are not fewer
-const COLOURED = 0.04; // s between fields of stress, which cost the service most of an answer
+const COLOURED = 0.05; // s between fields of stress, which cost the service most of an answer
+const MEASURED = 0.1; // s between largest stresses, which cost as much
 const STILL = 15; // s after which a position is sent again, so that the session does not end
 const CHECKED = 0.25; // s between comparisons of the two fields
 const NEAR = 3; // local models whose modes are fetched as the tip comes near
@@ -176,7 +177,7 @@ class Page {
     this.log.length = 0;
     this.player = null;
     if (this.recording) this.record(); // of another scene
-    Object.assign(this, { answer: null, sentAt: null, placed: null, checkedAt: 0, stress: null, colouredAt: 0 });
+    Object.assign(this, { answer: null, sentAt: null, placed: null, checkedAt: 0, stress: null, colouredAt: 0, measuredAt: 0 });
     this.readings.answer = null;
     const most = sessions
       ? Math.min(1.25 * scene.ranges.depth[1], 0.95 * scene.ranges.radius) : 1.25 * scene.ranges.pressure[1];
@@ -363,7 +364,8 @@ class Page {
     if (still && !scene.serves.histories && !this.wanted && !(this.pale && faded)) return;
     const server = element("server-field").checked;
     const outputs = ["PARTS"];
-    if (faded) outputs.push("VON_MISES", "STRESS");
+    if (faded) outputs.push("VON_MISES");
+    if (now - this.measuredAt >= MEASURED) outputs.push("STRESS");
     if (server || !this.shaped) outputs.push("DISPLACEMENT");
     else outputs.push("HALF");
     this.wanted = false;
@@ -373,10 +375,11 @@ class Page {
 
   replied(reply, trip, frames) {
     const now = seconds();
-    this.pale = !reply.stress;
+    this.pale = !(reply.stress && reply.measured);
     if (reply.stress) this.colouredAt = now;
+    if (reply.measured) this.measuredAt = now;
     const stress = reply.stress ?? this.stress;
-    const largest = reply.stress ? reply.max_von_mises : this.answer?.largest_stress;
+    const largest = reply.measured ? reply.max_von_mises : this.answer?.largest_stress;
     const answer = {
       ...reply, stress, trip_ms: trip, solve_ms: 1e3 * reply.solve_time, largest_stress: largest,
       errors: {

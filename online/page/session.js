@@ -52,6 +52,7 @@ class Reader {
     }
     if (has("DISPLACEMENT")) reply.displacement = numbers(3 * reply.nodes);
     if (has("VON_MISES")) reply.stress = numbers(reply.nodes);
+    reply.measured = has("STRESS") !== 0;
     if (at !== buffer.byteLength) throw new Refused(0, "garbage", "A reply makes no sense.");
     for (const [name, bit] of Object.entries(this.layout.flags)) {
       reply[name] = (reply.flags & bit) !== 0;
