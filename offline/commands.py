@@ -248,7 +248,7 @@ def info(artifact: Path, errors: bool, as_json: bool) -> None:
 @click.option(
     "--tip",
     is_flag=True,
-    help="Press with the rigid tip instead, its centre --at a place: how deep, tells the force.",
+    help="Press with the rigid tip instead, its centre --at a place; its depth sets the force.",
 )
 @click.option("--full-model", is_flag=True, help="Solve the full model as well and compare.")
 @click.option("--vtu", type=_Output(".vtu"), metavar="OUT.vtu", help="Write mesh and fields.")

@@ -126,9 +126,7 @@ def train(
         pool = worker_pool(open_scene, trained.text, str(trained.folder), count=workers)
         with pool:
             pipeline = Pipeline(trained, pool, checkpoint, started)
-            count = workers or os.cpu_count() or 1
-            said = forecast(pipeline.problem, count), *_doubts(pipeline.problem)
-            tqdm.write("\n".join(said), file=sys.stderr)
+            tqdm.write(outlook(pipeline.problem, workers), file=sys.stderr)
             pipeline.run(path, mesh_choice)
         checkpoint.remove()
     finally:
@@ -150,13 +148,13 @@ def check(scene: str | Path, workers: int | None = None) -> str:
     coarsest = found.geometry.divisions is None
     if coarsest:
         found = divided(found, candidates(found)[0])
-    problem = FullProblem(found)
-    expected = forecast(problem, workers or os.cpu_count() or 1, coarsest)
-    return "\n".join([expected, *_doubts(problem)])
+    return outlook(FullProblem(found), workers, coarsest)
 
 
-def _doubts(problem: FullProblem) -> list[str]:
-    return [f"is this meant? {doubt}" for doubt in doubts(problem)]
+def outlook(problem: FullProblem, workers: int | None, coarsest: bool = False) -> str:
+    """What people look at before a training: its ``forecast``, and what is likely a slip."""
+    slips = (f"is this meant? {doubt}" for doubt in doubts(problem))
+    return "\n".join([forecast(problem, workers or os.cpu_count() or 1, coarsest), *slips])
 
 
 def is_of(path: Path, key: str) -> bool:

@@ -25,7 +25,7 @@ import numpy as np
 from palpate.online.client.http import Client
 from palpate.online.client.session import Session
 
-from .conftest import Server
+from .conftest import Server, process_memory
 
 RATE = 1000.0  # frames per second
 MANY = 900  # connections at once
@@ -129,8 +129,7 @@ def observed(session, server, seconds):
 
     def watch():
         while not over.wait(0.1):
-            pages = int(Path(f"/proc/{server.process.pid}/statm").read_text().split()[1])
-            memory.append(1e-6 * pages * os.sysconf("SC_PAGE_SIZE"))
+            memory.append(1e-6 * process_memory(server.process.pid))
             start = time.perf_counter()
             try:
                 with connected(server.url) as connection:

@@ -6,7 +6,6 @@ By default a fiftieth of those are tried that ``PALPATE_MUTATIONS=1`` tries, 200
 requests, 2000 frames, 1000 scenes and 1000 command lines; with ``-s`` their outcomes are counted.
 """
 
-import ctypes
 import json
 import os
 import re
@@ -36,6 +35,7 @@ from palpate.shared.scene import SceneError, load_scene, parse_scene
 
 from ..conftest import sealed
 from . import mutations
+from .conftest import process_memory
 from .mutations import changed_bytes, changed_document, changed_lines, changed_words, pick
 
 pytestmark = pytest.mark.service
@@ -43,14 +43,6 @@ pytestmark = pytest.mark.service
 SHARE = float(os.environ.get("PALPATE_MUTATIONS", "0.02"))
 SLOWEST = 1.0  # s of a processor's time
 MEMORY = 200e6  # bytes that may be taken for good by all mutations of a kind
-
-
-def process_memory(pid):
-    """Bytes that a process holds; this one gives back first what its allocator keeps for later."""
-    if pid == os.getpid():
-        ctypes.CDLL(None).malloc_trim(0)
-    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def process_time(pid):

@@ -21,8 +21,7 @@ from palpate.online.settings import Plan
 from palpate.shared.cli import main
 from palpate.shared.model import ReducedModel
 
-from .conftest import rewritten
-from .test_mutations import process_memory
+from .conftest import process_memory, rewritten
 
 pytestmark = pytest.mark.service
 
