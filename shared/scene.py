@@ -314,12 +314,12 @@ class Scene(Part):
     @field_validator("support", "surface")
     @classmethod
     def _side_exists(cls, patch: Patch, info: ValidationInfo) -> Patch:
-        geometry = info.data.get("geometry")
-        if geometry is not None and patch.side not in geometry.sides:
+        sides = info.context  # of the kind of body, whatever else is wrong with that
+        if sides is not None and patch.side not in sides:
             raise PydanticCustomError(
                 "side",
                 "side is '{side}', but the sides of this body are {sides}",
-                {"side": patch.side, "sides": ", ".join(geometry.sides)},
+                {"side": patch.side, "sides": ", ".join(sides)},
             )
         return patch
 
@@ -342,6 +342,15 @@ def _derived(data: dict[str, Any]) -> dict[str, Any]:
             }
             data[name] = lengths | data[name]
     return data
+
+
+def _sides(geometry: object) -> tuple[str, ...] | None:
+    """Sides of the kind of body that is given; None if it is none."""
+    kind = geometry.get("kind") if isinstance(geometry, dict) else None
+    for body in (Extrusion, Block):
+        if kind in get_args(body.model_fields["kind"].annotation):
+            return body.sides
+    return None
 
 
 def _said(field: FieldInfo) -> dict[str, Any]:
@@ -404,7 +413,10 @@ def parse_scene(text: str, folder: Path | None = None, source: str = "scene") ->
         With every field that is wrong, its value and what is allowed.
     """
     try:
-        scene = Scene.model_validate_json(json.dumps(_derived(tomllib.loads(text)), default=str))
+        data = _derived(tomllib.loads(text))
+        scene = Scene.model_validate_json(
+            json.dumps(data, default=str), context=_sides(data["geometry"])
+        )
     except ValidationError as error:
         faults = [_explain(dict(detail)) for detail in error.errors(include_url=False)]
         between = "\n  " if len(faults) > 1 else " "
@@ -429,9 +441,19 @@ def _explain(detail: dict[str, Any]) -> str:
     if table and kind == "missing":
         return f"{path}: missing ({table.model_fields[loc[-1]].description})"
     if kind in ("union_tag_not_found", "union_tag_invalid"):
-        kinds = ", ".join(own[-1] for own in tables if own and own[:-1] == loc)
         key, given = detail["ctx"]["discriminator"].strip("'"), detail["ctx"].get("tag")
+        kinds = (
+            f"{own[-1]}, which needs {', '.join(_needed(part, key))}"
+            for own, part in tables.items()
+            if own and own[:-1] == loc
+        )
         wrong = ": missing" if given is None else f" = {given!r}: not known"
-        return f"{path}.{key}{wrong} (one of {kinds})"
+        return f"{path}.{key}{wrong} (one of {'; '.join(kinds)})"
     shown = "" if isinstance(detail["input"], dict) else f" = {detail['input']!r}"
     return f"{path}{shown}: {detail['msg']}"
+
+
+def _needed(part: type[Part], tag: str) -> list[str]:
+    """Keys that a kind of table must have beside the ``tag`` that names it."""
+    fields = part.model_fields.items()
+    return [name for name, field in fields if field.is_required() and name != tag]

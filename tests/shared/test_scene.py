@@ -103,7 +103,12 @@ def test_mesh_and_reduction_together_have_the_tolerance() -> None:
         ("radius", "xyzzy", r"endoscope.xyzzy: unknown key$"),
         ("size", "sise", r"geometry.sise: unknown key; did you mean 'size'\?"),
         ("young = 15.0\n", "", r"tissue.young: missing \(Young's modulus at rest, kPa\)"),
-        ('kind = "block"\n', "", r"geometry.kind: missing \(one of extrusion, block\)"),
+        (
+            'kind = "block"\n',
+            "",
+            r"geometry.kind: missing \(one of extrusion, which needs section, corners, length; "
+            r"block, which needs size\)",
+        ),
         ("0.45", "0.5", r"tissue.poisson = 0.5: .*less than 0.5"),
         ("0.45", "-0.1", r"tissue.poisson = -0.1: .*greater than or equal to 0"),
         ("young = 15.0", "young = nan", r"tissue.young = nan: .*finite"),
@@ -118,7 +123,7 @@ def test_mesh_and_reduction_together_have_the_tolerance() -> None:
             r"tissue.prony.0.1 = 0.0: .*greater than or equal to",
         ),
         ("young = 15.0", "young = true", r"tissue.young = True: .*valid number"),
-        ("neo-hookean", "hooke", r"tissue.law = 'hooke': .*neo-hookean, mooney-rivlin"),
+        ("neo-hookean", "hooke", r"tissue.law = 'hooke': .*neo-hookean, .*mooney-rivlin"),
         ("neo-hookean", "mooney-rivlin", r"tissue.c10: missing \(factor of the first inv.*, kPa\)"),
         (
             "[10.0, 8, 5.0]",
@@ -127,7 +132,7 @@ def test_mesh_and_reduction_together_have_the_tolerance() -> None:
         ),
         ("[4, 4, 2]", "[4, 0, 2]", r"geometry.divisions.1 = 0: .*greater than or equal to 1"),
         ("hex8", "tet4", r"geometry.element = 'tet4': .*'hex20'"),
-        ("block", "sphere", r"geometry.kind = 'sphere': .*extrusion, block"),
+        ("block", "sphere", r"geometry.kind = 'sphere': .*extrusion, .*block"),
         ('"top"', '"lip"', r"surface: side is 'lip', but the sides .* are left, right"),
         ("[1.0, 9.0]", "[9.0, 1.0]", r"surface: x must be \[from, to\]"),
         ('"slab"', '"../slab"', r"name = '../slab'"),
@@ -171,6 +176,28 @@ def test_an_empty_scene_is_told_all_that_it_lacks() -> None:
         "name", "geometry.kind", "tissue.law", "support.side", "surface.side", "endoscope.radius",
         "endoscope.max_tilt", "load.max_indentation",
     ]  # fmt: skip
+
+
+def test_what_kinds_need_is_told_at_once_with_a_side_that_they_do_not_have() -> None:
+    kinds = 'geometry.kind = "block"\ntissue.law = "demiray"\nsupport.side = "lip"\n'
+    with pytest.raises(SceneError) as error:
+        parse_scene(kinds)
+    told = [line.split(":")[0].strip() for line in str(error.value).splitlines()[1:]]
+    assert told == [
+        "name", "geometry.size", "tissue.poisson", "tissue.young", "tissue.b", "support",
+        "surface.side", "endoscope.radius", "endoscope.max_tilt", "load.max_indentation",
+    ]  # fmt: skip
+
+
+def test_what_each_kind_needs_is_told_where_there_is_none() -> None:
+    with pytest.raises(SceneError) as error:
+        parse_scene("")
+    told = dict(line.strip().split(": ", 1) for line in str(error.value).splitlines()[1:])
+    assert told["tissue.law"] == (
+        "missing (one of neo-hookean, which needs poisson, young; mooney-rivlin, which needs "
+        "poisson, c10, c01; demiray, which needs poisson, young, b)"
+    )
+    assert told["geometry.kind"].endswith("block, which needs size)")
 
 
 def test_lengths_that_are_absent_are_multiples_of_the_radius() -> None:
