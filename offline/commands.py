@@ -415,11 +415,11 @@ def convergence(scene: str, places: int, report: Path | None) -> Report:
     At PLACES places, with 2 x 2 x 2 and with 3 x 3 x 3 points per element. The finest meshes of the
     turbinate take some minutes and 4 GB of memory.
     """
-    from palpate.offline.scenes import find_scene
+    from palpate.offline.scenes import opened_scene
     from palpate.offline.studies.convergence import convergence
 
-    found = find_scene(scene)
-    return convergence(found, places, report or Path("artifacts") / found.name / "report")
+    with opened_scene(scene) as found:
+        return convergence(found, places, report or Path("artifacts") / found.name / "report")
 
 
 @study.command()
@@ -436,11 +436,11 @@ def chart(scene: str, artifact: Path | None, **settings: Any) -> Report:
     validate asks with this seed, on one core. Table and picture go to NAME/report/chart.csv and
     .png beside the artifact. Takes half an hour; a stopped run continues where it was.
     """
-    from palpate.offline.scenes import default_artifact, find_scene
+    from palpate.offline.scenes import default_artifact, opened_scene
     from palpate.offline.studies.chart import chart
 
-    found = find_scene(scene)
-    return chart(artifact or default_artifact(found), found, **settings)
+    with opened_scene(scene) as found:
+        return chart(artifact or default_artifact(found), found, **settings)
 
 
 @study.command()
@@ -457,11 +457,11 @@ def truth(scene: str, artifact: Path | None, places: int, seed: int) -> Report:
     to NAME/report/truth.csv beside the artifact. Takes 20 minutes; a stopped run continues where it
     was.
     """
-    from palpate.offline.scenes import default_artifact, find_scene
+    from palpate.offline.scenes import default_artifact, opened_scene
     from palpate.offline.studies.truth import truth
 
-    found = find_scene(scene)
-    return truth(artifact or default_artifact(found), found, places, seed)
+    with opened_scene(scene) as found:
+        return truth(artifact or default_artifact(found), found, places, seed)
 
 
 @study.command()
@@ -509,11 +509,11 @@ def stability(scene: str, artifact: Path | None, **settings: Any) -> Report:
     beyond it, for which the full model's answer is known. The map goes to NAME/report/stability.csv
     and .png beside the artifact. A killed run goes on where it stopped.
     """
-    from palpate.offline.scenes import default_artifact, find_scene
+    from palpate.offline.scenes import default_artifact, opened_scene
     from palpate.offline.studies.stability import stability
 
-    found = find_scene(scene)
-    return stability(artifact or default_artifact(found), found, **settings)
+    with opened_scene(scene) as found:
+        return stability(artifact or default_artifact(found), found, **settings)
 
 
 @study.command("stability-in-time")

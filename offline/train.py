@@ -53,7 +53,7 @@ from palpate.offline.reduce.window import (
 from palpate.offline.run.progress import Teller
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.run.workers import Checkpoint, Tasks, content_key, open_scene, run, worker_pool
-from palpate.offline.scenes import default_artifact, find_scene
+from palpate.offline.scenes import default_artifact, opened_scene
 from palpate.offline.validate import mesh_part
 from palpate.offline.validate.compare import (
     Row,
@@ -112,7 +112,13 @@ def train(
     force : bool
         Train although the artifact is of this very scene and of this code.
     """
-    started, untrained = time.perf_counter(), find_scene(scene)
+    with opened_scene(scene) as untrained:
+        return _train(untrained, out, workers, force)
+
+
+def _train(untrained: Scene, out: Path | None, workers: int | None, force: bool) -> Path:
+    """Train a scene that is read; see ``train``."""
+    started = time.perf_counter()
     path, key = out or default_artifact(untrained), content_key(untrained)
     if not force and is_of(path, key):
         tqdm.write(f"{path}: up to date; --force trains it again", file=sys.stderr)
@@ -143,12 +149,11 @@ def check(scene: str | Path, workers: int | None = None) -> str:
     SceneError
         With every field that is wrong; or else what is wrong with its files, or its mesh.
     """
-    found = find_scene(scene)
-    content_key(found)
-    coarsest = found.geometry.divisions is None
-    if coarsest:
-        found = divided(found, candidates(found)[0])
-    return outlook(FullProblem(found), workers, coarsest)
+    with opened_scene(scene) as found:
+        content_key(found)
+        coarsest = found.geometry.divisions is None
+        meshed = divided(found, candidates(found)[0]) if coarsest else found
+        return outlook(FullProblem(meshed), workers, coarsest)
 
 
 def outlook(problem: FullProblem, workers: int | None, coarsest: bool = False) -> str:
@@ -169,7 +174,7 @@ def forecast(problem: FullProblem, workers: int, coarsest: bool = False) -> str:
     """Mesh, number of local models and time of a training, in one line for people.
 
     ``coarsest`` says that the mesh is the coarsest of those that training chooses from.  Raises
-    ``PalpateError`` with the key of a spacing that would make too many points.
+    ``SceneError`` with the key of a spacing that would make too many points.
     """
     scene, tip = problem.scene, problem.scene.endoscope.tip
     dofs, size, more, tried = problem.mesh.nodes.size, scene.training.size, "", 0

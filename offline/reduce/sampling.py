@@ -6,9 +6,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from palpate.shared.arrays import Array
-from palpate.shared.errors import PalpateError
 from palpate.shared.geometry.surface import Surface
-from palpate.shared.scene import Tolerance
+from palpate.shared.scene import SceneError, Tolerance
 
 MOST_POINTS = 20_000
 """Local models, or points of the load range, of one scene."""
@@ -72,13 +71,13 @@ def fewer(count: int, tolerance: Tolerance) -> int:
 def spacing_count(surface: Surface, spacing: float, key: str = "endoscope.radius") -> int:
     """How many points have the given mean spacing (mm) on the surface (hexagonal packing).
 
-    Raises ``PalpateError`` with the key of a scene that sets it if they are more than anybody waits
+    Raises ``SceneError`` with the key of a scene that sets it if they are more than anybody waits
     for.
     """
     area = float(triangle_areas(surface).sum())
     count = max(1, round(area * 2 / (math.sqrt(3) * spacing**2)))
     if count > MOST_POINTS:
-        raise PalpateError(
+        raise SceneError(
             f"{key}: the accessible surface, {area:.3g} mm^2, would take {count} points "
             f"{spacing:.3g} mm apart, and at most {MOST_POINTS} are worked with; what a scene does "
             "not say of its training is in proportion to endoscope.radius"

@@ -3,6 +3,7 @@
 import json
 import tomllib
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -30,13 +31,29 @@ def find_scene(name_or_path: str | Path) -> Scene:
     SceneError
         If there is no such scene, or it is wrong.
     """
+    return load_scene(_path_of(name_or_path))
+
+
+@contextmanager
+def opened_scene(name_or_path: str | Path) -> Iterator[Scene]:
+    """Load a scene as `find_scene` does; a `SceneError` of what is made of it names its file."""
+    path = _path_of(name_or_path)
+    scene = load_scene(path)
+    try:
+        yield scene
+    except SceneError as error:
+        raise SceneError(f"{path}: {error}") from error
+
+
+def _path_of(name_or_path: str | Path) -> Path:
+    """File of a scene that comes along or of any other."""
     path = Path(name_or_path)
-    if path.suffix != ".toml":
-        names = shipped_scenes()
-        if str(name_or_path) not in names:
-            raise SceneError(f"{name_or_path}: neither a .toml file nor one of {', '.join(names)}")
-        path = FOLDER / f"{name_or_path}.toml"
-    return load_scene(path)
+    if path.suffix == ".toml":
+        return path
+    names = shipped_scenes()
+    if str(name_or_path) not in names:
+        raise SceneError(f"{name_or_path}: neither a .toml file nor one of {', '.join(names)}")
+    return FOLDER / f"{name_or_path}.toml"
 
 
 def default_artifact(scene: Scene) -> Path:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from palpate.offline.info import LABELS, budget, closing, info, percent
-from palpate.offline.scenes import find_scene
+from palpate.offline.scenes import FOLDER, find_scene
 from palpate.offline.train import is_of
 from palpate.shared.artifact import read_artifact
 from palpate.shared.cli import main
@@ -150,11 +150,14 @@ REFUSED = {
     "study chart-in-time A": "is elastic",
     "study stability-in-time A": "is elastic",
     "validate A --histories 2": "is elastic",
-    "train lost.toml": "geometry.section: lost.csv cannot be read: No such file",
-    "train pipe.toml": "geometry.section: pipe.csv cannot be read: pipe.csv is not a regular file",
-    "train folder.toml": "geometry.section: . cannot be read: Is a directory",
-    "train same.toml": "surface: the support holds all of it",
-    "train headless.toml": "cannot be read: its first line must name the columns, x,z",
+    "train lost.toml": "lost.toml: geometry.section: lost.csv cannot be read: No such file",
+    "train pipe.toml": "pipe.toml: geometry.section: pipe.csv cannot be read: pipe.csv is not",
+    "train folder.toml": "folder.toml: geometry.section: . cannot be read: Is a directory",
+    "train same.toml": "same.toml: surface: the support holds all of it",
+    "train headless.toml": "headless.toml: geometry.section: headless.csv cannot be read: its",
+    "train --check same.toml": "same.toml: surface: the support holds all of it",
+    "train --check corners.toml": "corners.toml: geometry.corners: must lie on the outline",
+    "study convergence same.toml": "same.toml: surface: the support holds all of it",
     "info nested.toml": "'nested.toml' is a scene; palpate train nested.toml makes its artifact",
     "train nested.toml": "nested.toml: not TOML: maximum recursion depth",
     "train many.toml": "more than 200000 elements in all",
@@ -181,6 +184,7 @@ def test_what_makes_no_sense_is_told(
         "pipe": turbinate.replace("inferior_turbinate_section.csv", "pipe.csv"),
         "folder": turbinate.replace("inferior_turbinate_section.csv", "."),
         "headless": turbinate.replace("inferior_turbinate_section.csv", "headless.csv"),
+        "corners": turbinate.replace("[1.2, 2.9]", "[3.2, 7.0]"),
         "same": quick.replace('side = "top"', 'side = "bottom"'),
         "nested": "a = " + 5000 * "[" + 5000 * "]",
         "many": quick.replace("[4, 4, 3]", "[500, 500, 500]"),
@@ -188,6 +192,9 @@ def test_what_makes_no_sense_is_told(
     }
     (tmp_path / "full.vtu").symlink_to("/dev/full")
     os.mkfifo(tmp_path / "pipe.csv")
+    (tmp_path / "inferior_turbinate_section.csv").symlink_to(
+        FOLDER / "inferior_turbinate_section.csv"
+    )
     (tmp_path / "headless.csv").write_text("0,0\n0,1\n")
     for name, text in scenes.items():
         (tmp_path / f"{name}.toml").write_text(text)

@@ -98,4 +98,5 @@ def test_a_spacing_that_makes_too_many_points_is_refused_by_its_key(run, slab, l
     slab.write_text(f"{SLAB}{line}\n")
     checked = run("train", slab, "--check")
     assert checked.exit_code == (2 if key else 0), checked.output
-    assert checked.stderr.startswith(f"Error: {key}: the accessible surface" if key else "")
+    told = f"Error: {slab}: {key}: the accessible surface"
+    assert checked.stderr.startswith(told if key else "")
