@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from palpate.shared.files import open_regular
+from palpate.shared.files import open_regular, write_whole
 
 FILE = "progress.json"
 
@@ -31,9 +31,7 @@ def training_folder(artifact: Path) -> Path:
 
 def tell(folder: Path, progress: Progress) -> None:
     """Tell how far the training that works in a folder is."""
-    part = folder / f"{FILE}.part"
-    part.write_text(json.dumps(progress._asdict()))
-    part.replace(folder / FILE)
+    write_whole(folder / FILE, json.dumps(progress._asdict()).encode())
 
 
 def trainings(directory: Path) -> list[Progress]:

@@ -274,8 +274,11 @@ from palpate.shared.artifact import Dataset, write_artifact
 from palpate.shared.cli import main
 
 def run(self, path, _):
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, -1))  # as on a disk with so much room
+    room = 10 if sys.argv[2] == "progress" else 100_000
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, -1))  # as on a disk with so much room
     much = np.random.default_rng(0).random(100_000)
+    if sys.argv[2] == "progress":
+        self.checkpoint._told("load range", 1, 2)
     if sys.argv[2] == "result":
         self.checkpoint.store("result", much)
     write_artifact(path, "", {}, {"much": Dataset(much, "1", "more than there is room for")})
@@ -286,7 +289,10 @@ if __name__ == "__main__":  # workers import this file
 """
 
 
-@pytest.mark.parametrize(("write", "named"), [("result", "result.pickle"), ("all", "quick.h5")])
+@pytest.mark.parametrize(
+    ("write", "named"),
+    [("progress", "progress.json"), ("result", "result.pickle"), ("all", "quick.h5")],
+)
 def test_training_without_room_ends_in_a_sentence_and_leaves_nothing(tmp_path, write, named):
     (tmp_path / "full.py").write_text(FULL)
     out = tmp_path / "artifacts" / "quick.h5"
