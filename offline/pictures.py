@@ -6,6 +6,7 @@ deformed surface lets it: the model knows its pressure only.
 """
 
 import itertools
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.solve import CELL_TYPES
+from palpate.offline.solve import CELL_TYPES, cautions
 from palpate.shared.answer import Answer
 from palpate.shared.arrays import Array
 from palpate.shared.errors import PalpateError
@@ -92,6 +93,8 @@ def picture(
     require_pyvista()
     atlas = ReducedModel.load(artifact)
     solution = atlas.press(position, pressure, direction)
+    for said in cautions(atlas, solution):
+        print(f"Warning: {said}", file=sys.stderr)
     stress = atlas.von_mises(solution)
     fields = {"displacement": atlas.displacement(solution).astype(float), "von_mises": stress}
     grid, rest = body(atlas.nodes, atlas.body.elements, solution.contact_point, fields)

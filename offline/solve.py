@@ -7,7 +7,7 @@ https://docs.vtk.org/en/latest/design_documents/VTKFileFormats.html
 import sys
 import time
 from base64 import b64encode
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -19,7 +19,8 @@ from palpate.offline.fem.mesh import least_volume_ratio
 from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import FullProblem, Load, Step, TipPosition
-from palpate.shared.answer import describe, peak
+from palpate.offline.info import percent
+from palpate.shared.answer import Answer, describe, peak
 from palpate.shared.arrays import Array
 from palpate.shared.errors import QueryError
 from palpate.shared.model import ReducedModel
@@ -40,7 +41,8 @@ def solve(
 ) -> dict[str, Any]:
     """Answer one load as the service does, JSON-able, with ``peak`` values of the fields.
 
-    Or, without a pressure, a position of the rigid tip.
+    Or, without a pressure, a position of the rigid tip.  What is to be known before it is trusted
+    goes to stderr.
 
     Parameters
     ----------
@@ -83,6 +85,8 @@ def solve(
         step = Load(solution.contact_point, solution.direction, pressure)
     if not solution.converged:
         raise NoEquilibrium(f"{limit} there")
+    for said in cautions(atlas, solution):
+        print(f"Warning: {said}", file=sys.stderr)
     fields, recover_us = _timed(
         lambda: {
             name: getattr(atlas, name)(solution).astype(float)
@@ -127,6 +131,27 @@ def solve(
             named["load_mN"] = problem.load_vector(step)
         write_vtu(vtu, mesh.nodes, mesh.elements, named | {"clamped": mesh.clamped})
     return report
+
+
+def cautions(atlas: ReducedModel, answer: Answer) -> Iterator[str]:
+    """Say what to know of an answer with an equilibrium before it is trusted, a sentence each."""
+    if answer.tip and not answer.contact:
+        at = ", ".join(f"{x:.4g}" for x in answer.contact_point)
+        yield (
+            f"the tip touches nothing: it is {-answer.depth:.3g} mm away from the surface, "
+            f"which is nearest at ({at}) mm"
+        )
+    for name in answer.out_of_range:
+        limit = f" of {answer.pressure_limit:.3g} kPa" if name == "pressure" else ""
+        yield f"{name} is outside the trained range{limit}: the error is unknown"
+    beyond = [
+        f"{name} {percent(getattr(answer, f'error_{name}'))} "
+        f"(tolerance {percent(getattr(atlas.scene.tolerance, name))})"
+        for name in atlas.doubts(answer)
+        if name not in answer.out_of_range
+    ]
+    if beyond:
+        yield f"error_estimate is beyond the scene's tolerance: {', '.join(beyond)}"
 
 
 def _timed(call: Callable[[], Any]) -> tuple[Any, float]:

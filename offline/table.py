@@ -1,17 +1,22 @@
 """A table of loads, or of positions of the tip, answered on all cores: CSV in, CSV out."""
 
 import csv
+import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from palpate.offline.info import percent
 from palpate.offline.run.tables import write_csv
+from palpate.shared.answer import Answers
 from palpate.shared.arrays import Array
 from palpate.shared.errors import PalpateError, QueryError
 from palpate.shared.files import open_regular
 from palpate.shared.model import ReducedModel
+from palpate.shared.scene import Tolerance
 
 PLACE, PRESSURE, DIRECTION = ("x", "y", "z"), ("pressure",), ("dx", "dy", "dz")
 FOUND = (
@@ -28,7 +33,7 @@ def solve_table(
 
     The tissue has another Young's modulus (kPa) if one is given.
     Its first line names the columns: ``x,y,z`` (mm), and of loads ``pressure`` (kPa), and if wanted
-    ``dx,dy,dz``, the direction.
+    ``dx,dy,dz``, the direction.  How many answers are not to be trusted goes to stderr.
 
     Raises
     ------
@@ -56,6 +61,8 @@ def solve_table(
         where = f", line {int(row) + 2}" if row else ""
         raise PalpateError(f"{table}{where}: {field}: {error.message}") from error
     seconds = time.perf_counter() - started
+    for said in _cautions(answers, atlas.scene.tolerance, tip):
+        print(f"Warning: {said}", file=sys.stderr)
     for name in FOUND:
         values = getattr(answers, name)
         parts = values.T if values.ndim == 2 else [values]
@@ -74,6 +81,20 @@ def solve_table(
         "seconds": seconds,
         "out": str(out),
     }
+
+
+def _cautions(answers: Answers, tolerance: Tolerance, tip: bool) -> Iterator[str]:
+    """Say of how many answers what is to be known before they are trusted, a sentence each."""
+    rows, sound = len(answers.converged), answers.converged & answers.in_range
+    if tip and (off := answers.converged & ~answers.force.any(axis=1)).any():
+        yield f"the tip touches nothing in {off.sum()} of {rows} rows"
+    for name, most in tolerance.total._asdict().items():
+        errors = getattr(answers, f"error_{name}")
+        if (beyond := sound & (errors > most)).any():
+            yield (
+                f"error_{name} is more than the scene's tolerance of {percent(most)} in "
+                f"{beyond.sum()} of {rows} rows, up to {percent(errors[beyond].max())}"
+            )
 
 
 def read_table(table: Path) -> tuple[list[str], Array]:

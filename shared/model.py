@@ -339,6 +339,9 @@ class ReducedModel:
     ) -> Answer:
         """Answer a position of the rigid tip.
 
+        One that touches nothing is answered without ``contact``: the force is zero, the surface
+        nearest at ``contact_point``, at a depth of minus its distance from the tip.
+
         Parameters
         ----------
         position : array_like, shape (3,), mm

@@ -20,6 +20,7 @@ from palpate.shared.scene import Errors
 
 from ..conftest import sealed
 
+TIP_AT_THE_RIM = "--tip", "--at", 0.2, 0.2, 9.5
 CONTACT = ["--at", "4", "5.5", "8", "--pressure", "1.5"]
 
 
@@ -130,6 +131,43 @@ def test_outside_the_range_it_warns_and_knows_no_error(run, artifact, atlas):
     assert result.stderr.startswith("Warning: pressure is outside the trained range of ")
     trust = json.loads(result.stdout)["trust"]
     assert trust["error_estimate"] == {"displacement": None, "von_mises": None}
+
+
+def test_a_tip_in_the_air_is_told_with_its_way_to_the_tissue(run, artifact):
+    told = run("solve", artifact, "--tip", "--at", 5, 5, 30, "--json")
+    report = json.loads(told.stdout)
+    assert report["force"] == [0.0, 0.0, 0.0]
+    assert not report["contact"]["touches"]
+    assert told.stderr == (
+        "Warning: the tip touches nothing: it is 20 mm away from the surface, which is nearest at "
+        "(5, 5, 8) mm\n"
+    )
+    assert "touches nothing" not in run("solve", artifact, "--tip", "--at", 5, 5, 9.7).stderr
+
+
+@pytest.mark.parametrize("press", [("--at", 0.2, 0.2, 8, "--pressure", 1), TIP_AT_THE_RIM])
+def test_estimates_beyond_the_tolerance_are_told(run, artifact, atlas, press):
+    told = run("solve", artifact, *press, "--json")
+    found = json.loads(told.stdout)["trust"]["error_estimate"]
+    most = atlas.scene.tolerance.total._asdict()
+    beyond = [
+        f"{name} {percent(error)} (tolerance {percent(most[name])})"
+        for name, error in found.items()
+        if error > most[name]
+    ]
+    assert beyond
+    said = f"Warning: error_estimate is beyond the scene's tolerance: {', '.join(beyond)}\n"
+    assert told.stderr == said
+
+
+def test_of_a_table_it_is_told_how_many_rows_to_look_at(run, artifact, atlas, tmp_path):
+    table, out = tmp_path / "in.csv", tmp_path / "out.csv"
+    table.write_text("x,y,z\n5,5,30\n0.2,0.2,9.5\n")
+    told = run("solve", artifact, "--tip", "--csv", table, "--out", out)
+    error = percent(atlas.touch((0.2, 0.2, 9.5)).error_force)
+    beyond = "Warning: error_force is more than the scene's tolerance of 5 %"
+    assert told.stderr.splitlines()[0] == "Warning: the tip touches nothing in 1 of 2 rows"
+    assert told.stderr.splitlines()[-1] == f"{beyond} in 1 of 2 rows, up to {error}"
 
 
 AT = "--at 4 5.5 8 --pressure"
