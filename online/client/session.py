@@ -216,8 +216,10 @@ class Session:
 
     The `timeout` (s) is the longest wait for a reply; a session that could not send in this time
     is of no more use. What is sent and answered is recorded to the file `record`, for
-    ``palpate replay``. The `greeting` is what the service said of the scene and of its frames.
-    Raises `ServiceError` if the service refuses the session.
+    ``palpate replay``; once the disk is full the session goes on unrecorded: a warning is logged,
+    what was written can be replayed, and `close` raises `PalpateError`. The `greeting` is what the
+    service said of the scene and of its frames. Raises `ServiceError` if the service refuses the
+    session.
 
     With `reconnect` (s) a `step` that finds its session lost begins another one and goes on; no
     attempt is made later than that. The tissue is at rest then and snapshots are gone: the answer
@@ -268,11 +270,11 @@ class Session:
         return self._connection.socket.fileno()
 
     def close(self) -> None:
-        """End the session."""
+        """End the session; raise `PalpateError` if it could not be recorded to its end."""
         self._connection.close()
-        if self._recorder is not None:
-            self._recorder.close()
-            self._recorder = None
+        recorder, self._recorder = self._recorder, None
+        if recorder is not None:
+            recorder.close()
 
     def send(
         self,

@@ -9,12 +9,13 @@ follow one another: each begins with a reply that says `Flag.FIRST`.
 """
 
 import json
+import logging
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from io import BytesIO
+from io import BytesIO, FileIO
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -23,6 +24,8 @@ from numpy.typing import NDArray
 from palpate.online.session.frames import REPLY, REPLY_FIELDS, REQUEST, Field, Request
 from palpate.shared.arrays import Array
 from palpate.shared.errors import PalpateError
+
+logger = logging.getLogger(__name__)
 
 FORMAT = "palpate-session"
 FORMAT_VERSION = 4
@@ -50,20 +53,62 @@ _COMMAND = (
 COMMANDS = Field("commands", "float64", "", _COMMAND, (3,))
 
 
-class Recorder:
-    """Writes a session with this greeting to a file, which is overwritten, as it goes."""
+class _Disk(FileIO):
+    """A file whose writes all succeed for HDF5, which otherwise would crash the process.
 
-    def __init__(self, path: Path | BinaryIO, greeting: dict[str, Any]) -> None:
+    From the first ``failure`` on nothing is written, so that what was there before can be read.
+    """
+
+    failure: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        """Write the data, unless that fails or has failed before."""
+        left = memoryview(data).cast("B")
+        try:
+            while self.failure is None and len(left):
+                left = left[super().write(left) :]
+        except OSError as error:
+            self.failure = error
+        return len(data)
+
+    def truncate(self, size: int | None = None) -> int:
+        """Change the size, unless that fails or has failed before."""
+        try:
+            if self.failure is None:
+                super().truncate(size)
+        except OSError as error:
+            self.failure = error
+        return size or 0
+
+
+class Recorder:
+    """Writes a session with this greeting to a file, which is overwritten, as it goes.
+
+    Where that fails, as on a full disk, a warning is logged and the recording ends; what was
+    written until then can be read. Only ``close`` raises `PalpateError` for it, and the beginning.
+    """
+
+    def __init__(self, path: Path | BytesIO, greeting: dict[str, Any]) -> None:
         self._requests: OrderedDict[int, Request] = OrderedDict()
         self._asked: list[tuple[Any, ...]] = []
         self._replies: list[bytes] = []
-        self._file = h5py.File(path, "w")
+        self._written = 0
+        self._disk = None if isinstance(path, BytesIO) else _Disk(path, "w+")
+        self._file = h5py.File(self._disk or path, "w")
         about = {"format": FORMAT, "format_version": FORMAT_VERSION, "scene": greeting["scene"]}
         self._file.attrs.update(about, greeting=json.dumps(greeting))
         for name, kind, unit, meaning, shape in (*ASKED, *REPLY_FIELDS, COMMANDS):
             size = {"shape": (0, *shape), "maxshape": (None, *shape), "chunks": (CHUNK, *shape)}
             dataset = self._file.create_dataset(name, dtype=kind, **size)
             dataset.attrs.update(units=unit, description=meaning)
+        self._file.flush()
+        if self._failure is not None:
+            self.close()
+
+    @property
+    def _failure(self) -> OSError | None:
+        """Why the recording has ended; None if it goes on."""
+        return None if self._disk is None else self._disk.failure
 
     def sent(self, request: Request) -> None:
         """Note a request."""
@@ -85,24 +130,42 @@ class Recorder:
 
     def obeyed(self, command: str, value: float) -> None:
         """Note that a command was obeyed after the replies received so far."""
-        replies = len(self._file["seq"]) + len(self._replies)
+        replies = self._written + len(self._replies)
         self.commands([(replies, ORDERS.index(command), value)])
 
     def commands(self, rows: Sequence[Any] | NDArray[Any]) -> None:
         """Write rows of ``COMMANDS``."""
-        _append(self._file[COMMANDS.name], rows)
+        if self._failure is None:
+            _append(self._file[COMMANDS.name], rows)
 
     def exchanged(self, asked: NDArray[Any], replies: NDArray[Any]) -> None:
         """Write what was asked, with fields as in ``ASKED``, and the replies to it."""
+        if self._failure is not None:
+            return
         for table in (asked, replies):
             for name in table.dtype.names or ():
                 _append(self._file[name], table[name])
         self._file.flush()
+        if self._failure is None:
+            self._written += len(replies)
+        else:
+            logger.warning("%s", self._ending())
 
     def close(self) -> None:
-        """Write what is left and close the file."""
+        """Write what is left and close the file; raise `PalpateError` if some was not written."""
         self._write()
         self._file.close()
+        if self._disk is not None:
+            self._disk.close()
+        if self._failure is not None:
+            raise PalpateError(self._ending())
+
+    def _ending(self) -> str:
+        """Say why the recording has ended, and where."""
+        assert self._disk is not None
+        assert self._disk.failure is not None
+        why = self._disk.failure.strerror
+        return f"{self._disk.name}: {why}; the recording ends after {self._written} replies"
 
     def _write(self) -> None:
         if not self._replies:

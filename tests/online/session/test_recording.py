@@ -1,7 +1,10 @@
 import json
+import re
+import resource
 import threading
 import urllib.error
 import urllib.request
+from contextlib import closing, contextmanager
 
 import h5py
 import numpy as np
@@ -24,6 +27,7 @@ from palpate.online.session.tracker import LONGEST, ToolTracker, replay
 from palpate.shared.errors import PalpateError
 from palpate.shared.model import ReducedModel
 
+from ..conftest import place_comes_free
 from ..fake_model import FakeModel
 
 
@@ -154,7 +158,8 @@ def test_a_replay_gives_the_same_answers_and_tells_what_differs(recorded, stiff)
 
 @pytest.fixture
 def recorder(tmp_path):
-    return Recorder(tmp_path / "session.h5", {"scene": "toy"})
+    with closing(Recorder(tmp_path / "session.h5", {"scene": "toy"})) as recorder:
+        yield recorder
 
 
 def test_requests_that_were_dropped_or_refused_are_not_kept(recorder, tmp_path):
@@ -168,6 +173,42 @@ def test_requests_that_were_dropped_or_refused_are_not_kept(recorder, tmp_path):
         assert not recorder._requests
     recorder.close()
     assert [r.seq for r in read_recording(tmp_path / "session.h5").requests] == [10, 5]
+
+
+@contextmanager
+def room_on_disk(size):
+    """Let no file grow larger, as on a disk with so much room (bytes)."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_full_disk_ends_the_recording_and_not_the_session(url, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr("palpate.online.session.recording.CHUNK", 10)
+    path = tmp_path / "session"  # no name of an artifact, which would be served
+    with room_on_disk(200_000):
+        session = Session(url, "toy", record=path)
+        replies = [session.step((5.0, 5.0, 6.9 - 0.001 * i)) for i in range(400)]
+        session.young(20.0)
+        with pytest.raises(PalpateError) as ended:
+            session.close()
+    assert all(reply.good for reply in replies)
+    told = rf"{path}: File too large; the recording ends after (\d+) replies"
+    count = int(re.fullmatch(told, str(ended.value))[1])
+    assert [record.getMessage() for record in caplog.records] == [str(ended.value)]
+    recording = read_recording(path)
+    assert 0 < count == len(recording.replies) < 400
+    assert replay(recording, FakeModel())["different"] == 0
+
+
+def test_without_room_for_a_recording_there_is_no_session(serving, tmp_path):
+    with serving(max_sessions=1) as url:
+        with room_on_disk(1000), pytest.raises(PalpateError, match="File too large; the recording"):
+            Session(url, "toy", record=tmp_path / "session")
+        place_comes_free(url).close()
 
 
 def test_requests_without_any_reply_do_not_fill_the_memory(recorder, monkeypatch):
