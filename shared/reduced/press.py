@@ -238,7 +238,7 @@ def local_problem(solver, k, slot):
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
 def _solve(solver, k, slot):
     """Equilibrium of model k under ``scratch.load``; its answer goes to memory's slot."""
     models, warm, scratch, outcome = solver.models, solver.warm, solver.scratch, solver.outcome

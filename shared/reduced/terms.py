@@ -75,6 +75,8 @@ class TipScratch(NamedTuple):
     turned: Annotated[Array, "2, 3"]  # derivative of the place in the centre
     last: Annotated[Array, "3"]  # mm, the last place with contact
     before: Annotated[Array, "3"]  # normal there
+    way: Annotated[Array, "3"]  # mm, out to where the tip does not touch
+    at: Annotated[Array, "3"]  # mm, its centre on the way in
     begun: Annotated[Ints, "slots"]  # models whose past is known, in their slots
 
 

@@ -52,8 +52,9 @@ SHALLOW = 4e-3
 """Depth, in radii of the tip, up to which the place is that at rest: the triangles that say where
 the surface is cut its curves by as much."""
 
-RAMPS = 8, 16, 32
-"""Steps of the way in where an equilibrium cannot be found in one jump, one after the other."""
+RAMPS = 1, 8, 16, 32
+"""Steps of the way in that are tried, one after the other: a jump, then from where the tip does not
+touch."""
 
 LEAST_FACING = 0.1
 """Cosine between force and surface normal below which a place is none."""
@@ -149,12 +150,10 @@ def touch(solver, x):
     outcome, depth = solver.outcome, solver.outcome.depth[0]
     solver.scratch.tip.begun[:] = solver.active.number
     outcome.iterations[0] = 0.0
-    _settle(solver, x)
-    if outcome.status[0] not in (newton.CONVERGED, ELSEWHERE) and depth > 0.0:
-        for steps in RAMPS:
-            _walk_in(solver, x, depth, steps)
-            if outcome.status[0] in (newton.CONVERGED, ELSEWHERE):
-                break
+    for steps in RAMPS:
+        _walk_in(solver, x, depth, steps)
+        if outcome.status[0] in (newton.CONVERGED, ELSEWHERE) or depth <= 0.0:
+            break
     if outcome.status[0] == newton.CONVERGED:
         _end_step(solver)
     # or ``transfer.estimate_history`` estimates
@@ -162,17 +161,18 @@ def touch(solver, x):
         _estimate(solver)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
 def _settle(solver, x):
     """Find place, normal, and state under a tip at x, from where the search has begun."""
     outcome, tip = solver.outcome, solver.scratch.tip
-    cold, sure = solver.warm.tip.known[0] == 0.0, False
+    cold = solver.warm.tip.known[0] == 0.0
+    sure = not cold
     tip.wall[:] = 0.0
     for made in range(MOST_ROUNDS):
         if made > 0 and not _choose(solver):
             outcome.status[0] = ELSEWHERE
             break
-        press_at_place(solver, x, sure)
+        press_at_place(solver, x, cold and sure)
         if outcome.status[0] != newton.CONVERGED:
             break
         if outcome.touched[0] == 0.0:
@@ -188,7 +188,7 @@ def _settle(solver, x):
         _step(solver, made)
         moved, turned = _move(solver), _turn(solver)
         if moved < NEAR * solver.tip.radius and turned < NEAR:
-            if sure or not cold:
+            if sure:
                 break
             sure = True
         if made + 1 == MOST_ROUNDS or np.dot(tip.contact.normal, outcome.upward) < LEAST_FACING:
@@ -203,21 +203,24 @@ def _settle(solver, x):
     _remember(solver, x)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
 def _walk_in(solver, x, depth, steps):
-    """Go the way in step by step, from where the tip does not touch: for where a jump fails."""
-    outcome = solver.outcome
-    place(solver, x)
-    way, at = depth * outcome.upward, np.empty(3)
-    solver.warm.number[:] = -1
+    """Go the way in step by step, or in one jump from where the search has begun."""
+    outcome, way, at = solver.outcome, solver.scratch.tip.way, solver.scratch.tip.at
+    way[:] = 0.0
+    if steps > 1:
+        place(solver, x)
+        way += depth * outcome.upward
+        solver.warm.number[:] = -1
     for i in range(1, steps + 1):
         for j in range(3):
             at[j] = x[j] + (1.0 - i / steps) * way[j]
-        place(solver, at)
-        begin(solver, at, outcome.foot)
-        if not _choose(solver):
-            outcome.status[0] = ELSEWHERE
-            return
+        if steps > 1:
+            place(solver, at)
+            begin(solver, at, outcome.foot)
+            if not _choose(solver):
+                outcome.status[0] = ELSEWHERE
+                return
         _settle(solver, at)
         if outcome.status[0] != newton.CONVERGED:
             return
