@@ -44,7 +44,8 @@ CLOSE = 1e-4
 GIVEN_WAY = 0.3
 """Error of displacement, of all or under the footprint, or of the tip's force, beyond which the
 finer mesh has given way where the scene's own has not: that is no error of a size, and the limit
-there is too high.  Training says how many there are."""
+there is too high.  Training says how many there are.  Under the tip all of displacement counts by
+what its error is more than at a smaller depth, since coarse meshes lack the dent at any."""
 
 UNKNOWN = 0.01
 """What references err by themselves: errors below are taken for as much."""
@@ -173,7 +174,7 @@ def fit(found: Sequence[list[Array]], tip: bool = False) -> tuple[Array, dict[st
 
     And what an artifact tells of these errors, of those of ``StressField.peaks`` as well.
     """
-    known = [[_known(row, tip) for row in own] for own in found]
+    known = [[_known(row, own[0] if tip else None) for row in own] for own in found]
     rows = np.array([row for own in found for row in own])
     there = np.array([answer.comparable for own in known for answer in own])
     told = {
@@ -186,10 +187,13 @@ def fit(found: Sequence[list[Array]], tip: bool = False) -> tuple[Array, dict[st
     return fitted, counts | told
 
 
-def _known(row: Array, tip: bool) -> KnownAnswer:
-    """An answer of ``mesh_errors``, comparable unless the finer mesh has given way."""
+def _known(row: Array, first: Array | None) -> KnownAnswer:
+    """An answer of ``mesh_errors``, comparable unless the finer mesh has given way.
+
+    ``first`` is that to the first level under a tip there.
+    """
     level, *errors, _, _, near_rim = row.tolist()
-    moved = errors[2] if tip else max(errors[0], errors[2])
+    moved = max(errors[0] - (0.0 if first is None else first[1]), errors[2])
     return KnownAnswer(
         np.maximum(errors, UNKNOWN),
         np.array([1.0, level, near_rim]),

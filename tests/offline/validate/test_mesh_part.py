@@ -124,11 +124,12 @@ def test_an_estimate_covers_and_leaves_out_what_has_given_way():
     assert (np.exp(coefficients @ [1.0, 0.3, 0.0]) < 2.5 * 0.02 * np.exp(0.3)).all()
 
 
-def test_under_the_tip_only_its_force_tells_what_has_given_way():
+def test_under_the_tip_force_and_what_displacement_is_more_off_deeper_tell_what_has_given_way():
     lacks_dent = [np.array([level, 0.5, 0.6, 0.01, 0.1, 0.1, 0.0]) for level in (0.15, 0.8)]
     slipped = [np.array([level, 0.5, 0.6, 2 * GIVEN_WAY, 0.1, 0.1, 0.0]) for level in (0.15, 0.8)]
-    coefficients, told = fit([lacks_dent] * 5 + [slipped], tip=True)
-    assert told["given_way"] == 2
+    bent = [lacks_dent[0], np.array([0.8, 0.5 + 2 * GIVEN_WAY, 0.6, 0.01, 0.1, 0.1, 0.0])]
+    coefficients, told = fit([lacks_dent] * 5 + [slipped, bent], tip=True)
+    assert told["given_way"] == 3
     np.testing.assert_allclose(np.exp(coefficients[:, 0]), [0.5, 0.6, 0.01], rtol=1e-6)
 
 
