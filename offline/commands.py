@@ -198,22 +198,39 @@ def new(path: Path, shape: str) -> None:
 @click.argument("scene")
 @click.option("--out", type=OUTPUT, help="The artifact to write.  [default: artifacts/NAME.h5]")
 @count_option("--workers", None, "Worker processes.  [default: one for each core]")
+@click.option(
+    "--scheduler",
+    metavar="ADDRESS|FILE",
+    help="Of dask.distributed: its workers train, instead of processes of this machine.",
+)
 @click.option("--force", is_flag=True, help="Train even if the artifact is up to date.")
 @click.option("--check", "only_check", is_flag=True, help="Only say what is wrong with SCENE.")
-def train(scene: str, out: Path | None, workers: int | None, force: bool, only_check: bool) -> None:
+def train(
+    scene: str,
+    out: Path | None,
+    workers: int | None,
+    scheduler: str | None,
+    force: bool,
+    only_check: bool,
+) -> None:
     """Train the artifact of a scene.
 
     SCENE is the name of one that comes along, such as quick or turbinate, or a TOML file, which
     palpate new writes. A run that was stopped continues where it was.
+
+    With --scheduler, tcp://HOST:PORT or the file that dask scheduler --scheduler-file wrote, it is
+    trained on a cluster, whose workers have the same installation and one thread each.
     """
     from palpate.offline.info import closing
     from palpate.offline.train import check, train
 
+    if scheduler is not None:
+        _need({}, {"workers": workers, "check": only_check})
     if only_check:
         click.echo(f"{check(scene, workers)}\nnothing is wrong; next: palpate train {scene}")
         return
     try:
-        artifact = train(scene, out, workers, force)
+        artifact = train(scene, out, workers, force, scheduler)
     except KeyboardInterrupt:
         raise click.ClickException("stopped; the same command continues from here") from None
     click.echo("\n".join(closing(artifact)))

@@ -52,7 +52,15 @@ from palpate.offline.reduce.window import (
 )
 from palpate.offline.run.progress import Teller
 from palpate.offline.run.streams import Stage, stream
-from palpate.offline.run.workers import Checkpoint, Tasks, content_key, open_scene, run, worker_pool
+from palpate.offline.run.workers import (
+    Checkpoint,
+    OnScene,
+    Tasks,
+    content_key,
+    open_scene,
+    run,
+    worker_pool,
+)
 from palpate.offline.scenes import default_artifact, opened_scene
 from palpate.offline.validate import mesh_part
 from palpate.offline.validate.compare import (
@@ -95,9 +103,17 @@ of which is near its rim, 60 are there, as the confidence of 95 % asks for."""
 MOST_HISTORIES = 48
 """Full histories of each kind that validate and calibrate, a quarter of ``samples`` at most."""
 
+Who = Callable[[Scene, str], tuple[Executor, int]]
+"""Gives those who train a scene, by it and its key, and how many processes they are."""
+
 
 def train(
-    scene: str | Path, out: Path | None = None, workers: int | None = None, force: bool = False
+    scene: str | Path,
+    out: Path | None = None,
+    workers: int | None = None,
+    force: bool = False,
+    scheduler: str | None = None,
+    executor: Executor | None = None,
 ) -> Path:
     """Train a scene and write its artifact, unless it is there already; return where.
 
@@ -111,12 +127,17 @@ def train(
         Processes; one per core if absent.
     force : bool
         Train although the artifact is of this very scene and of this code.
+    scheduler : str, optional
+        Address of a scheduler of dask.distributed, or its file: its workers train.
+    executor : Executor, optional
+        Of ``concurrent.futures`` or like it, which trains; its workers must be processes of one
+        thread each that read files where this one does.  It is not shut down.
     """
     with opened_scene(scene) as untrained:
-        return _train(untrained, out, workers, force)
+        return _train(untrained, out, force, partial(_workers, workers, scheduler, executor))
 
 
-def _train(untrained: Scene, out: Path | None, workers: int | None, force: bool) -> Path:
+def _train(untrained: Scene, out: Path | None, force: bool, who: Who) -> Path:
     """Train a scene that is read; see ``train``."""
     started = time.perf_counter()
     path, key = out or default_artifact(untrained), content_key(untrained)
@@ -129,7 +150,7 @@ def _train(untrained: Scene, out: Path | None, workers: int | None, force: bool)
     checkpoint = Checkpoint(folder, key, teller)
     try:
         trained, mesh_choice = with_mesh(untrained)
-        pool = worker_pool(open_scene, trained.text, str(trained.folder), count=workers)
+        pool, workers = who(trained, key)
         with pool:
             pipeline = Pipeline(trained, pool, checkpoint, started)
             tqdm.write(outlook(pipeline.problem, workers), file=sys.stderr)
@@ -139,6 +160,21 @@ def _train(untrained: Scene, out: Path | None, workers: int | None, force: bool)
         teller.end()
         checkpoint.leave()
     return path
+
+
+def _workers(
+    count: int | None, scheduler: str | None, executor: Executor | None, scene: Scene, key: str
+) -> tuple[Executor, int]:
+    """Who trains a scene, and how many processes that are, as far as is known."""
+    count = count or os.cpu_count() or 1
+    if scheduler is not None:
+        from palpate.offline.run.cluster import Cluster  # which not every installation can do
+
+        cluster = Cluster(scheduler, scene, key)
+        return cluster, cluster.workers
+    if executor is not None:
+        return OnScene(executor, scene, key), count
+    return worker_pool(open_scene, scene.text, str(scene.folder), count=count), count
 
 
 def check(scene: str | Path, workers: int | None = None) -> str:

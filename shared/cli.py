@@ -25,7 +25,9 @@ Example, from a scene to an answer:
 """
 
 
-EXTRAS = {"tqdm": "train", "matplotlib": "loadtest", "pyvista": "pictures"}
+EXTRAS = {
+    "tqdm": "train", "distributed": "cluster", "matplotlib": "loadtest", "pyvista": "pictures",
+}  # fmt: skip
 """Extra that brings a package which not every installation has."""
 
 

@@ -1,8 +1,9 @@
 """Tasks on many cores, and their results on disk, so that a killed run goes on where it stopped.
 
-A task is a function of a ``FullProblem`` with its further arguments, which are picklable.  Any
-executor with the ``concurrent.futures`` interface can run it, if ``open_scene`` or
-``open_artifact`` initializes its workers.
+A task is a function of a ``FullProblem`` with its further arguments, which are picklable; a path
+among them is that of a stored result.  Any executor with the ``concurrent.futures`` interface can
+run it, if ``open_scene`` or ``open_artifact`` initializes its workers, or in ``OnScene``; on other
+machines those of ``run.cluster`` do.
 
 Each result is a file of its own, written aside and moved into place: whatever the moment of
 a kill, a result is there or it is not.  It begins with a hash of the rest, so a damaged one is seen
@@ -19,11 +20,13 @@ import signal
 import sys
 import threading
 import weakref
-from collections.abc import Callable, Mapping
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager, suppress
+from functools import cache
+from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 from tqdm import tqdm
 
@@ -37,15 +40,22 @@ Tasks = Mapping[str, tuple[Any, ...]]
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 CODE = ("offline", "shared")
+LIBRARIES = ("numpy", "scipy", "numba", "mkl")
+"""What answers depend on to the last bit, beside ``CODE``."""
 
 _problem: FullProblem | None = None
+_scene = ""
+"""Key of the ``Job`` that the problem is of."""
+
+_at_work = threading.Lock()
 
 
-def _end_with_parent() -> None:
-    """Stop this worker when the process that started it is killed."""
+def _belong_to_parent() -> None:
+    """Leave interrupts to the process that started this worker, and end when that is killed."""
     parent = multiprocessing.parent_process()
     if parent is None:
         return
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:
         parent.join()
@@ -57,20 +67,90 @@ def _end_with_parent() -> None:
 def open_scene(text: str, folder: str) -> None:
     """Initialize a worker process on a scene, given by its text and where its files lie."""
     global _problem
-    _end_with_parent()
+    _belong_to_parent()
     _problem = FullProblem(parse_scene(text, Path(folder)))
 
 
 def open_artifact(path: Path, young: float | None = None) -> None:
     """Initialize a worker process on the mesh of an artifact; see ``FullProblem.of_artifact``."""
     global _problem
-    _end_with_parent()
+    _belong_to_parent()
     _problem = FullProblem.of_artifact(path, young)
 
 
 def run(task: Callable[..., object], *args: object) -> object:
     """Run ``task(problem, *args)`` in a worker."""
     return task(_problem, *args)
+
+
+@cache
+def versions() -> dict[str, str]:
+    """Hash of the code of this process, as it was when first asked for, and its libraries."""
+    sha = hashlib.sha256()
+    for package in CODE:
+        for source in sorted((Path(__file__).parents[2] / package).rglob("*.py")):
+            sha.update(source.read_bytes())
+    found = {"palpate": sha.hexdigest()[:16], "python": "{}.{}".format(*sys.version_info)}
+    for name in LIBRARIES:
+        with suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(name)
+    return found
+
+
+def other_versions(wanted: dict[str, str]) -> str:
+    """Which of the ``versions`` here are not those wanted; nothing if all are."""
+    own = versions()
+    names = (name for name in wanted | own if own.get(name) != wanted.get(name))
+    return ", ".join(f"{name} {own.get(name)} and not {wanted.get(name)}" for name in names)
+
+
+class Job(NamedTuple):
+    """What a worker needs to open a scene."""
+
+    key: str  # of the scene, its files and the code
+    text: str
+    folder: str  # where its files lie
+    versions: dict[str, str]
+
+    @classmethod
+    def of(cls, scene: Scene, key: str) -> Self:
+        """The training of a scene by this very code."""
+        return cls(key, scene.text, str(scene.folder), versions())
+
+
+def on_job(job: Job, function: Callable[..., Any], *args: Any) -> Any:
+    """Run a function in a worker, once that has the problem of a job.
+
+    Raises
+    ------
+    PalpateError
+        If the worker has other code or libraries, or runs another task.
+    """
+    global _problem, _scene
+    if other := other_versions(job.versions):
+        raise PalpateError(f"a worker is refused, since it has {other}")
+    if not _at_work.acquire(blocking=False):
+        raise PalpateError("executor: its workers must be processes of one thread each")
+    try:
+        if _scene != job.key:
+            _problem, _scene = FullProblem(parse_scene(job.text, Path(job.folder))), job.key
+        return function(*args)
+    finally:
+        _at_work.release()
+
+
+class OnScene(Executor):
+    """Somebody's executor, whose workers open a scene with their first task.
+
+    They must be processes of one thread each that read files where this one does.
+    """
+
+    def __init__(self, executor: Executor, scene: Scene, key: str) -> None:
+        self._executor, self._job = executor, Job.of(scene, key)
+
+    def submit(self, function: Callable[..., Any], /, *args: Any, **_: Any) -> Future[Any]:
+        """See ``Executor``; it is not shut down."""
+        return self._executor.submit(on_job, self._job, function, *args)
 
 
 def worker_pool(
@@ -89,25 +169,37 @@ def worker_pool(
         initializer=initializer,
         initargs=args,
     )
-    interrupt = signal.signal(signal.SIGINT, signal.SIG_IGN)  # which workers inherit
-    try:
+    with _deaf_children():
         for _ in range(count):  # each starts one, since none has done anything yet
             pool.submit(os.getpid)
+    return pool
+
+
+@contextmanager
+def _deaf_children() -> Iterator[None]:
+    """Let processes that begin now hear no interrupt; only the main thread can."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    interrupt = signal.signal(signal.SIGINT, signal.SIG_IGN)  # which they inherit
+    try:
+        yield
     finally:
         signal.signal(signal.SIGINT, interrupt)
-    return pool
+
+
+def files_of(scene: Scene) -> dict[str, bytes]:
+    """Content of the files that a scene names, if they are at hand, by their names in it."""
+    if isinstance(scene.geometry, Extrusion) and scene.folder is not None:
+        name = scene.geometry.section
+        return {name: read_section(scene.folder / name)}
+    return {}
 
 
 def content_key(scene: Scene) -> str:
     """Hash of the scene, the files it names and the code that trains it."""
-    root = Path(__file__).parents[2]
-    sha = hashlib.sha256(scene.text.encode())
-    if isinstance(scene.geometry, Extrusion) and scene.folder is not None:
-        sha.update(read_section(scene.folder / scene.geometry.section))
-    for package in CODE:
-        for source in sorted((root / package).rglob("*.py")):
-            sha.update(source.read_bytes())
-    return sha.hexdigest()[:16]
+    parts = scene.text.encode(), *files_of(scene).values(), versions()["palpate"].encode()
+    return hashlib.sha256(b"".join(parts)).hexdigest()[:16]
 
 
 class Checkpoint:

@@ -22,28 +22,9 @@ from ..conftest import PALPATE
 STAGES = ("load range", "windows", "Ritz vectors", "local models", "full solutions")
 
 
-SMALLER = {
-    '"quick"': '"tiny"', "[4, 4, 3]": "[3, 3, 2]", "tip = true": "tip = false",
-    "samples = 120": "samples = 60", "spacing = 2.2": "spacing = 4.0",
-    "region_modes = 200": "region_modes = 100",
-}  # fmt: skip
-"""What makes the quick scene quicker still, and not accurate."""
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    text = find_scene("quick").text
-    for old, new in SMALLER.items():
-        assert old in text
-        text = text.replace(old, new)
-    path = tmp_path_factory.mktemp("scene") / "tiny.toml"
-    path.write_text(text)
-    return path
-
-
-def start(scene, path):
+def start(tiny, path):
     """Start `palpate train` as a group of processes that can be killed together."""
-    command = [*PALPATE, "train", scene, "--out", path]
+    command = [*PALPATE, "train", tiny, "--out", path]
     return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
 
@@ -53,10 +34,10 @@ def finished(path):
 
 
 @pytest.fixture(scope="module")
-def resumed(scene, tmp_path_factory):
+def resumed(tiny, tmp_path_factory):
     """Return an artifact of a run that was killed, what was done by then, and the second's log."""
     path = tmp_path_factory.mktemp("killed") / "tiny.h5"
-    first, deadline = start(scene, path), time.monotonic() + 300
+    first, deadline = start(tiny, path), time.monotonic() + 300
     while not any(result.name.startswith("patch-") for result in finished(path)):
         assert first.poll() is None, first.communicate()
         assert time.monotonic() < deadline
@@ -68,7 +49,7 @@ def resumed(scene, tmp_path_factory):
     stale = done[0].parents[1] / "0123456789abcdef" / done[0].name
     stale.parent.mkdir()
     stale.write_bytes(b"from other code")
-    second = start(scene, path)
+    second = start(tiny, path)
     _, log = second.communicate(timeout=300)
     assert second.returncode == 0, log
     return path, done, log
@@ -86,8 +67,8 @@ def test_finished_tasks_are_kept(resumed):
     assert kept["full solutions"][0] == "0"
 
 
-def test_a_resumed_run_makes_the_artifact_of_an_undisturbed_one(scene, resumed, tmp_path):
-    undisturbed = start(scene, tmp_path / "tiny.h5")
+def test_a_resumed_run_makes_the_artifact_of_an_undisturbed_one(tiny, resumed, tmp_path):
+    undisturbed = start(tiny, tmp_path / "tiny.h5")
     _, log = undisturbed.communicate(timeout=300)
     assert undisturbed.returncode == 0, log
     paths = resumed[0], tmp_path / "tiny.h5"
@@ -112,17 +93,15 @@ def test_the_log_says_beforehand_what_will_be_made_and_the_artifact_how_long_it_
     assert info["provenance"]["wall_seconds"] > sum(info["training"]["seconds"].values())
 
 
-def test_what_is_there_is_not_trained_again_and_a_changed_scene_is(
-    scene, resumed, capsys, tmp_path
-):
+def test_what_is_there_is_not_trained_again_and_a_changed_scene_is(tiny, resumed, capsys, tmp_path):
     path, before = resumed[0], resumed[0].stat().st_mtime_ns
-    assert train(scene, path) == path
+    assert train(tiny, path) == path
     assert "up to date" in capsys.readouterr().err
     assert path.stat().st_mtime_ns == before
     assert sorted(file.name for file in path.parent.iterdir()) == ["tiny", "tiny.h5"]
     changed = tmp_path / "tiny.toml"
-    changed.write_text(scene.read_text().replace("samples = 60", "samples = 61"))
-    for wanted, found in ((changed, False), (scene, True)):
+    changed.write_text(tiny.read_text().replace("samples = 60", "samples = 61"))
+    for wanted, found in ((changed, False), (tiny, True)):
         assert is_of(path, content_key(find_scene(wanted))) == found
         assert not is_of(tmp_path / "none.h5", content_key(find_scene(wanted)))
 
