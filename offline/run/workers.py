@@ -27,8 +27,11 @@ from typing import Any
 
 from tqdm import tqdm
 
+from palpate.offline.bodies.base import base_mesh
+from palpate.offline.bodies.places import files_of
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.section import read_section
+from palpate.shared.anatomy import FileBody
 from palpate.shared.errors import PalpateError
 from palpate.shared.files import write_whole
 from palpate.shared.scene import Extrusion, Scene, parse_scene
@@ -104,6 +107,11 @@ def content_key(scene: Scene) -> str:
     sha = hashlib.sha256(scene.text.encode())
     if isinstance(scene.geometry, Extrusion) and scene.folder is not None:
         sha.update(read_section(scene.folder / scene.geometry.section))
+    if isinstance(scene.geometry, FileBody):
+        sha.update(base_mesh(scene).nodes.tobytes())
+    for patch in (scene.support, scene.surface):
+        for path in files_of(scene, patch):
+            sha.update(path.read_bytes())
     for package in CODE:
         for source in sorted((root / package).rglob("*.py")):
             sha.update(source.read_bytes())
