@@ -117,7 +117,7 @@ def _bytes(base: Base) -> bytes:
 
 def _load(path: Path) -> Base:
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
             kept = {name: arrays[name] for name in arrays.files}
         sets = {
             kind: {name[6:]: own for name, own in kept.items() if name.startswith(kind)}
@@ -204,11 +204,7 @@ def _refuse_far(
     x, y, z = place
     why = "it is thinner there than geometry.deviation can follow: state a smaller one"
     if found.crossings:
-        x, y, z = found.place
-        why = (
-            f"{found.crossings} pairs of triangles cross each other: repair it (MeshLab: Select "
-            "Self Intersecting Faces; Blender: Boolean union)"
-        )
+        why = f"it is cut off; {surface.in_words(found.crossings, found.place)}"
     raise SceneError(
         f"{path}: the mesh lies up to {worst:.2g} mm from the surface, where "
         f"{geometry.deviation:g} are allowed; near ({x:.1f}, {y:.1f}, {z:.1f}) mm {why}"

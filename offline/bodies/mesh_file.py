@@ -60,8 +60,8 @@ def read_mesh(path: Path, unit: Unit) -> tuple[Array, Numbers, Sets]:
     if points.shape[1] != 3:
         raise SceneError(f"{path}: its points have {points.shape[1]} coordinates; save three")
     points = points * MILLIMETRES[unit]
+    refuse_size(path, points, unit)
     corners, cells, middles = _tetrahedra(path, mesh, points)
-    refuse_size(path, points[np.unique(corners)], unit)
     used, compact = np.unique(corners, return_inverse=True)
     nodes, elements = raised(points[used], compact.reshape(-1, 4).astype(np.int32))
     _curve(nodes, elements, used, points, middles)

@@ -14,9 +14,15 @@ from palpate.shared.scene import SceneError
 
 KINDS = ".stl", ".obj", ".ply"
 
-CRUMB, HOLE = 0.01, 0.05
+CRUMB, HOLE, CROSSED = 0.01, 0.2, 0.01
 """Largest share of the area of a loose part that is left out; largest length round a hole that is
-closed, in diagonals of the body's box."""
+closed, in diagonals of the body's box; most pairs of triangles that may cross each other, over the
+triangles: the mesh must then follow the surface all the same."""
+
+BRANCHES = (
+    "{path}: the surface branches: edges belong to more than two triangles, or it has one side "
+    "only; repair it (MeshLab: Repair Non Manifold Edges) and save it anew"
+)
 
 
 class Repaired(NamedTuple):
@@ -40,7 +46,7 @@ def read_surface(path: Path, unit: Unit) -> Any:
             "save it anew, as binary STL for example"
         ) from error
     if not len(triangles):
-        raise SceneError(f"{path}: has no triangles; save the body's surface as triangles")
+        raise SceneError(f"{path}: has no triangles, or is cut short; save the body's surface anew")
     if triangles.min() < 0 or triangles.max() >= len(points):
         raise SceneError(f"{path}: has triangles of points that are not there; save it anew")
     points *= MILLIMETRES[unit]
@@ -72,23 +78,32 @@ def repaired(path: Path, mesh: Any) -> Repaired:
     if not len(mesh.faces):
         raise SceneError(f"{path}: all triangles are without area; save the body's surface anew")
     done["triangles_left_out"] = count - len(mesh.faces)
+    if (np.unique(mesh.edges_sorted, axis=0, return_counts=True)[1] > 2).any():
+        raise SceneError(BRANCHES.format(path=path))
     mesh, done["crumbs_left_out"] = _largest_part(path, mesh)
     if not mesh.is_winding_consistent:
         trimesh.repair.fix_winding(mesh)
         done["turned"] = 1
     done["holes_closed"] = _close(path, mesh)
     if not (mesh.is_watertight and mesh.is_winding_consistent):
-        raise SceneError(
-            f"{path}: the surface branches: edges belong to more than two triangles, or it has "
-            "one side only; repair it (MeshLab: Repair Non Manifold Edges) and save it anew"
-        )
+        raise SceneError(BRANCHES.format(path=path))
     if mesh.volume < 0:
         mesh.invert()
         done["turned"] = 1
-    mesh.remove_unreferenced_vertices()
     points, triangles = np.array(mesh.vertices), np.array(mesh.faces, np.int32)
     crossings, place = _crossings(points, triangles)
+    if crossings > CROSSED * len(triangles):
+        raise SceneError(f"{path}: {in_words(crossings, place)}")
     return Repaired(points, triangles, done, crossings, place)
+
+
+def in_words(crossings: int, place: Array) -> str:
+    """That triangles cross each other, where, and what helps."""
+    x, y, z = place
+    return (
+        f"{crossings} pairs of triangles cross each other, one near ({x:.1f}, {y:.1f}, {z:.1f}) "
+        "mm: repair it (MeshLab: Select Self Intersecting Faces; Blender: Boolean union)"
+    )
 
 
 def _largest_part(path: Path, mesh: Any) -> tuple[Any, int]:
@@ -105,6 +120,7 @@ def _largest_part(path: Path, mesh: Any) -> tuple[Any, int]:
             "body is one: save one of them, without cavities, or join them"
         )
     mesh.update_faces(labels == largest)
+    mesh.remove_unreferenced_vertices()
     return mesh, len(others)
 
 

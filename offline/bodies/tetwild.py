@@ -47,7 +47,13 @@ def filled(
                 f"{ended.returncode}); repair it, or change geometry.deviation"
             )
         with np.load(found) as mesh:
-            return mesh["points"], mesh["tetrahedra"]
+            points, tetrahedra = mesh["points"], mesh["tetrahedra"]
+    if not len(tetrahedra):
+        raise SceneError(
+            f"{path}: nothing of the body remains: it is thinner than geometry.deviation = "
+            f"{deviation:g} mm; state a smaller one"
+        )
+    return points, tetrahedra
 
 
 def main(given: str, found: str) -> None:
