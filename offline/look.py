@@ -19,12 +19,13 @@ from palpate.offline.scenes import find_scene
 from palpate.shared.anatomy import FileBody
 from palpate.shared.arrays import Array, Flags
 from palpate.shared.local_models import Mesh
-from palpate.shared.scene import Scene
+from palpate.shared.scene import Scene, SceneError
 
 SIZE = (1600, 900)
 HELD, TOUCHED, FREE = "#b4463c", "#4c8fc7", "#d9d4cc"
 FACE_TYPES = {4: 9, 6: 22, 8: 23}  # VTK's quadrilateral and quadratic ones, by nodes per face
 SUBDIVISIONS = 2  # of a quadratic face
+FROM = np.array([0.6, -0.7, 0.4])  # whence a body is seen that is touched nowhere
 TITLE = (0.02, 0.86)
 ABOVE = 0.003  # of the size of the body, how far lines lie above its faces
 ASIDE = 0.45  # of the way across, how far a view is turned from the way that is looked along
@@ -43,14 +44,19 @@ def look(scene: str | Path, out: Path | None = None) -> tuple[Path, list[str]]:
     Raises
     ------
     PalpateError
-        If PyVista is missing, the scene is wrong, or its body cannot be meshed.
+        If PyVista is missing, the scene is wrong, or its body cannot be meshed.  Where support or
+        surface are wrong the body is drawn all the same, without them.
     """
     require_pyvista()
     found = find_scene(scene)
     if not isinstance(found.geometry, FileBody) and found.geometry.divisions is None:
         found = divided(found, candidates(found)[0])
-    mesh = build_mesh(found)
     path = out or Path("artifacts") / found.name / "report" / "look.png"
+    try:
+        mesh = build_mesh(found)
+    except SceneError as wrong:
+        _draw(found, build_mesh(found, bare=True), path)
+        raise SceneError(f"{wrong}; {path} shows it") from wrong
     _draw(found, mesh, path)
     return path, labelled(_said(found, mesh))
 
@@ -108,11 +114,9 @@ def _area(mesh: Mesh, chosen: Flags) -> float:
 def _draw(scene: Scene, mesh: Mesh, out: Path) -> None:
     held = _held(mesh)
     centres, normals = boundary_of_corners(_corners(mesh))
-    towards = normals[mesh.accessible].mean(axis=0)
-    middle = centres[mesh.accessible].mean(axis=0)
-    at = np.flatnonzero(mesh.accessible)[
-        np.argmin(np.linalg.norm(centres[mesh.accessible] - middle, axis=1))
-    ]
+    shown = mesh.accessible if mesh.accessible.any() else normals @ FROM > 0.5
+    towards, middle = normals[shown].mean(axis=0), centres[shown].mean(axis=0)
+    at = np.flatnonzero(shown)[np.argmin(np.linalg.norm(centres[shown] - middle, axis=1))]
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
     plotter = new_plotter((1, 2), SIZE)
     parts = {TOUCHED: mesh.accessible, HELD: held & ~mesh.accessible}

@@ -6,16 +6,18 @@ from palpate.offline.bodies.base import Base, base_mesh
 from palpate.offline.bodies.places import Boundary, boundary_of_corners, support_and_surface
 from palpate.offline.bodies.refine import EdgeLength, Refined, refined
 from palpate.offline.bodies.tetrahedra import boundary
-from palpate.shared.arrays import Flags
+from palpate.shared.arrays import Array, Flags
 from palpate.shared.local_models import Mesh
 from palpate.shared.scene import Scene
 
 
-def mesh_of_body(scene: Scene, edge_length_at: EdgeLength | None = None) -> Mesh:
+def mesh_of_body(
+    scene: Scene, edge_length_at: EdgeLength | None = None, bare: bool = False
+) -> Mesh:
     """Mesh the body of a scene, as fine as wanted; as its base mesh is if nothing is said.
 
     Whatever is held or can be touched is made of whole faces of the base mesh, and so is the same
-    in every mesh.
+    in every mesh; of a ``bare`` one nothing is.
 
     Raises
     ------
@@ -23,19 +25,19 @@ def mesh_of_body(scene: Scene, edge_length_at: EdgeLength | None = None) -> Mesh
         If the file is no body, or support or surface hold no face, or the same.
     """
     base = base_mesh(scene)
-    support, accessible = held_and_touched(scene, base)
+    faces = boundary_of(base)
+    support, accessible = faces.nowhere() if bare else support_and_surface(scene, faces)
     finer = refined(base, edge_length_at or _as_it_is)
     return _mesh(finer, support, accessible)
 
 
-def held_and_touched(scene: Scene, base: Base) -> tuple[Flags, Flags]:
-    """Flags (f,) of faces of a scene's base mesh, as ``boundary`` numbers them."""
+def boundary_of(base: Base) -> Boundary:
+    """Faces of a base mesh and their sets."""
     faces, _, _ = boundary(base.elements)
-    centres, normals = boundary_of_corners(base.nodes[faces[:, :3]])
-    return support_and_surface(scene, Boundary(centres, normals, sets=base.faces))
+    return Boundary(*boundary_of_corners(base.nodes[faces[:, :3]]), sets=base.faces)
 
 
-def _as_it_is(points: np.ndarray) -> np.ndarray:
+def _as_it_is(points: Array) -> Array:
     return np.full(len(points), np.inf)
 
 

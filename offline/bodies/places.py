@@ -22,6 +22,11 @@ class Boundary(NamedTuple):
     sides: Mapping[str, Flags] = {}
     sets: Mapping[str, Flags] = {}
 
+    def nowhere(self) -> tuple[Flags, Flags]:
+        """Flags (f,) of a support and a surface without faces."""
+        none = np.zeros(len(self.centres), dtype=bool)
+        return none, none
+
 
 def boundary_of_corners(corners: Array) -> tuple[Array, Array]:
     """Centres (f, 3) mm and outward unit normals (f, 3) of faces with corners (f, 3 or 4, 3)."""
@@ -59,7 +64,7 @@ def _found(scene: Scene, name: str, patch: Patch, faces: Boundary) -> Flags:
         )
         raise SceneError(
             f"{name}: no face of the body is there; of {len(faces.centres)} faces {each}; their "
-            f"centres have {box} mm{_where(patch, faces)}; palpate look draws the body"
+            f"centres have {box} mm{_where(patch, faces)}"
         )
     return chosen
 

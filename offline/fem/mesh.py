@@ -51,10 +51,11 @@ SAG, SQUARES, STRAIGHT = 0.002, (4, 16), 2
 many as that takes.  Faces of straight edges have as many squares as the last."""
 
 
-def build_mesh(scene: Scene, ticks: Ticks | None = None) -> Mesh:
+def build_mesh(scene: Scene, ticks: Ticks | None = None, bare: bool = False) -> Mesh:
     """Mesh the body of a scene.
 
-    ``ticks`` are those of the scene's divisions if absent; a body from a file has none.
+    ``ticks`` are those of the scene's divisions if absent; a body from a file has none.  A ``bare``
+    mesh is neither held nor touched anywhere, whatever the scene says.
 
     Raises
     ------
@@ -63,7 +64,7 @@ def build_mesh(scene: Scene, ticks: Ticks | None = None) -> Mesh:
         surface hold no face, or the same.
     """
     if ticks is None and isinstance(scene.geometry, FileBody):
-        return mesh_of_body(scene)
+        return mesh_of_body(scene, bare=bare)
     geometry = scene.lattice
     if ticks is None:
         ticks = ticks_of(geometry)
@@ -74,7 +75,7 @@ def build_mesh(scene: Scene, ticks: Ticks | None = None) -> Mesh:
     _refuse_inverted(nodes, elements)
     named = {name: sides == number for number, name in enumerate(geometry.sides)}
     on_sides = Boundary(*boundary_of_corners(nodes[faces[:, :4]]), sides=named)
-    support, accessible = support_and_surface(scene, on_sides)
+    support, accessible = on_sides.nowhere() if bare else support_and_surface(scene, on_sides)
     clamped = np.zeros(len(nodes), dtype=bool)
     clamped[faces[support]] = True
     return Mesh(nodes, elements, faces, clamped, accessible)

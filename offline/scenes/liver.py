@@ -1,6 +1,6 @@
 """A liver of our own making, of the size and about the form of one: ``liver.stl``.
 
-Two lobes, hollowed out below, are a level of a sum of Gaussians; smaller ones, drawn at random, make
+Two lobes, hollowed out below, are a level of a sum of Gaussians; smaller ones at random places make
 it uneven.  ``python -m palpate.offline.scenes.liver`` writes the file anew (needs PyVista).
 """
 
@@ -32,8 +32,8 @@ def level(points: Array) -> Array:
     for centre, widths, height in LOBES:
         found += height * np.exp(-0.5 * np.sum(((points - centre) / widths) ** 2, axis=1))
     for _ in range(BUMPS):
-        centre = rng.uniform([-80.0, -50.0, -50.0], [90.0, 50.0, 60.0])
-        away = np.sum((points - centre) ** 2, axis=1) / BUMP**2
+        at = rng.uniform([-80.0, -50.0, -50.0], [90.0, 50.0, 60.0])
+        away = np.sum((points - at) ** 2, axis=1) / BUMP**2
         found += rng.uniform(-UNEVEN, UNEVEN) * np.exp(-0.5 * away)
     return found
 

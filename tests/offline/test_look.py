@@ -37,6 +37,17 @@ def test_a_body_from_a_file_is_drawn_with_its_report(run, tmp_path, monkeypatch)
     assert drawn(tmp_path / "artifacts" / "turbinate-mri" / "report" / "look.png")
 
 
+def test_a_body_is_drawn_even_if_it_is_held_nowhere(run, tmp_path):
+    pytest.importorskip("pyvista")
+    text = (FOLDER / "quick.toml").read_text().replace('"bottom"', '"bottom"\nsupport.z = [2, 3]')
+    (tmp_path / "own.toml").write_text(text)
+    result = run("look", tmp_path / "own.toml", "--out", tmp_path / "look.png")
+    assert result.exit_code == 2
+    assert "support: no face of the body is there; of " in result.output
+    assert "16 by side" in result.output
+    assert drawn(tmp_path / "look.png")
+
+
 def test_missing_pyvista_is_named(run, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyvista", None)
     monkeypatch.chdir(tmp_path)
