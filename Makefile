@@ -72,7 +72,7 @@ all := --extra train --extra loadtest
 
 lock: | .venv/bin/python
 	$(pip) install uv
-	$(resolve) $(all) --extra test --extra dev --output-file requirements-dev.lock
+	$(resolve) $(all) --extra anatomy --extra test --extra dev --output-file requirements-dev.lock
 	$(resolve) $(all) --constraint requirements-dev.lock --output-file requirements.lock
 
 clean:

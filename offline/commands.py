@@ -237,6 +237,24 @@ def train(
 
 
 @click.command()
+@click.argument("scene")
+@click.option("--out", type=_Output(".png"), metavar="PNG", help="Where to draw.")
+def look(scene: str, out: Path | None) -> None:
+    """Draw a scene before anything is trained, and say what its body is.
+
+    The body and its mesh, what is held and what can be touched, and the endoscope to scale. SCENE
+    is the name of one that comes along or a TOML file. A body from a file is meshed once, and its
+    mesh stored beside the file. Draws artifacts/NAME/report/look.png if not told where.
+
+    Needs PyVista: pip install 'palpate[pictures]'.
+    """
+    from palpate.offline.look import look
+
+    picture, lines = look(scene, out)
+    click.echo("\n".join([*lines, f"{picture} drawn"]))
+
+
+@click.command()
 @artifact_argument
 @click.option("--errors", is_flag=True, help="Show where errors come from instead.")
 @click.option("--json", "as_json", is_flag=True, help="Print all that is known as JSON.")

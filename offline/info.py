@@ -12,7 +12,7 @@ from palpate.shared.geometry.surface import Surface
 from palpate.shared.local_models import LoadRange, Mesh
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.reduced.press import TOLERANCE
-from palpate.shared.scene import Patch, Scene, SceneError, parse_scene
+from palpate.shared.scene import Scene, SceneError, parse_scene
 
 LABELS, WIDTH = 14, 14  # of the columns of ``lines`` and ``budget``
 
@@ -80,8 +80,8 @@ def lines(report: Mapping[str, Any]) -> list[str]:
         + f" mm; {report['body']['elements']} elements {scene.geometry.element}, "
         f"{report['body']['dofs']} DOFs",
         "tissue": _tissue(scene),
-        "held": _patch(scene.support),
-        "touchable": _patch(scene.surface),
+        "held": scene.support.in_words(),
+        "touchable": scene.surface.in_words(),
         "loads": f"pressure up to {loads['smallest_pressure_limit']:.3g} (softest place) to "
         f"{loads['largest_pressure']:.3g} kPa (stiffest), radius {loads['radius']:g} mm, tilt up "
         f"to {loads['largest_tilt']:g} degrees",
@@ -227,9 +227,3 @@ def _tissue(scene: Scene) -> str:
             said.append(f"{name} {value:g} {unit}".rstrip())
     lost = sum(share for share, _ in tissue.prony)
     return ", ".join([*said, f"{percent(lost)} relaxes with time" if lost else "elastic"])
-
-
-def _patch(patch: Patch) -> str:
-    ranges = [(axis, getattr(patch, axis)) for axis in "xyz"]
-    ends = [f"{axis} {r[0]:g} to {r[1]:g} mm" for axis, r in ranges if r]
-    return ", ".join([f"side {patch.side}", *ends])

@@ -187,7 +187,7 @@ def check(scene: str | Path, workers: int | None = None) -> str:
     """
     with opened_scene(scene) as found:
         content_key(found)
-        coarsest = found.geometry.divisions is None
+        coarsest = found.lattice.divisions is None
         meshed = divided(found, candidates(found)[0]) if coarsest else found
         return outlook(FullProblem(meshed), workers, coarsest)
 
@@ -230,8 +230,8 @@ def forecast(problem: FullProblem, workers: int, coarsest: bool = False) -> str:
     cores = "1 free core" if workers == 1 else f"{workers} free cores"
     about = "at least" if coarsest or more else "about"
     return (
-        f"{scene.name}: {' x '.join(map(str, divisions_of(scene.geometry)))} elements "
-        f"{scene.geometry.element}{' or more' if coarsest else ''}, {dofs} DOFs; about "
+        f"{scene.name}: {' x '.join(map(str, divisions_of(scene.lattice)))} elements "
+        f"{scene.lattice.element}{' or more' if coarsest else ''}, {dofs} DOFs; about "
         f"{models}{more} local models; {about} {duration(seconds)} on {cores}, and some 3 min more "
         "the first time, while code is compiled"
     )

@@ -1,6 +1,6 @@
 """What every table of a scene file is: immutable, strict about types, closed to unknown keys."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -13,3 +13,9 @@ class Part(BaseModel):
     """A table of a scene file."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
+
+
+def in_radii(multiple: float, description: str) -> Any:
+    """Field of a length (mm) that is a multiple of the endoscope's radius unless it is given."""
+    extra: Any = {"absent": f"{multiple:g} radii of the endoscope", "radii": multiple}
+    return Field(description=description, json_schema_extra=extra)

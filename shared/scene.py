@@ -24,15 +24,16 @@ from pydantic import (
     ValidationError,
     ValidationInfo,
     field_validator,
-    model_validator,
 )
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
+from palpate.shared.anatomy import FileBody, LabelBody, MeshBody, SurfaceBody
 from palpate.shared.errors import PalpateError
 from palpate.shared.files import open_regular
 from palpate.shared.mechanics.laws import AnyTissue
-from palpate.shared.part import Fraction, Length, Part, Positive
+from palpate.shared.part import Fraction, Length, Part, Positive, in_radii
+from palpate.shared.place import Patch
 
 ElementName = Literal["hex8", "hex20"]
 Element = Annotated[ElementName, Field(description="hex20, or hex8, which locks")]
@@ -52,17 +53,12 @@ def _not_too_many(divisions: tuple[int, int, int]) -> tuple[int, int, int]:
 Divisions = Annotated[tuple[Division, Division, Division], AfterValidator(_not_too_many)]
 CHOSEN = "the coarsest mesh whose errors leave the reduction its share of the tolerance"
 Point2 = tuple[float, float]
-Range = tuple[float, float]
+WITHIN = ("any", "without", *range(100))
+"""What in a path leads to a table within one of its own kind."""
 
 
 class SceneError(PalpateError):
     """A scene that cannot be used; the message names the file, the field and what is allowed."""
-
-
-def _in_radii(multiple: float, description: str) -> Any:
-    """Field of a length (mm) that is a multiple of the endoscope's radius unless it is given."""
-    extra: Any = {"absent": f"{multiple:g} radii of the endoscope", "radii": multiple}
-    return Field(description=description, json_schema_extra=extra)
 
 
 def _chosen(absent: str, description: str) -> Any:
@@ -131,27 +127,6 @@ def divisions_of(geometry: Extrusion | Block) -> Divisions:
     return geometry.divisions
 
 
-class Patch(Part):
-    """The part of one side of the body whose points lie within the given ranges."""
-
-    side: str = Field(
-        description="side of the body, such as top of a block or outer of an extrusion"
-    )
-    x: Range | None = _chosen("all of it", "[from, to] mm")
-    y: Range | None = _chosen("all of it", "[from, to] mm")
-    z: Range | None = _chosen("all of it", "[from, to] mm")
-
-    @model_validator(mode="after")
-    def _ranges_ascend(self) -> Self:
-        for axis in "xyz":
-            bounds = getattr(self, axis)
-            if bounds is not None and not bounds[0] <= bounds[1]:
-                raise PydanticCustomError(
-                    "range", "{axis} must be [from, to] with from <= to", {"axis": axis}
-                )
-        return self
-
-
 class Endoscope(Part):
     """The instrument that presses."""
 
@@ -159,7 +134,7 @@ class Endoscope(Part):
     max_tilt: float = Field(
         ge=0, lt=90, description="largest angle of a load to the inward normal, degrees"
     )
-    reach: Length = _in_radii(1.5, "largest distance of a queried position from the body, mm")
+    reach: Length = in_radii(1.5, "largest distance of a queried position from the body, mm")
     tip: bool = Field(
         False, description="whether a rigid spherical tip may press too, for sessions"
     )
@@ -254,11 +229,11 @@ class Size(Part):
 class Training(Part):
     """How the reduced model is trained."""
 
-    limit_spacing: Length = _in_radii(
+    limit_spacing: Length = in_radii(
         2.0, "distance of points where the largest pressure is found, mm"
     )
-    region_spacing: Length = _in_radii(3.75, "distance of the regions that share a basis, mm")
-    blend: Positive = _in_radii(0.1, "width over which neighbouring local models blend, mm")
+    region_spacing: Length = in_radii(3.75, "distance of the regions that share a basis, mm")
+    blend: Positive = in_radii(0.1, "width over which neighbouring local models blend, mm")
     samples: int = Field(
         300, ge=60, description="full solutions to validate by; fewer for a looser tolerance"
     )
@@ -278,9 +253,9 @@ class Scene(Part):
         description="one line for people", json_schema_extra={"absent": "the name"}
     )
     seed: int = Field(1, ge=0, description="seed of all random numbers of training")
-    geometry: Annotated[Extrusion | Block, Field(discriminator="kind")] = Field(
-        description="the shape of the body"
-    )
+    geometry: Annotated[
+        Extrusion | Block | SurfaceBody | MeshBody | LabelBody, Field(discriminator="kind")
+    ] = Field(description="the shape of the body")
     tissue: Annotated[AnyTissue, Field(discriminator="law")] = Field(
         description="what the body is made of"
     )
@@ -311,16 +286,35 @@ class Scene(Part):
         """The same scene of tissue that differs in what is given."""
         return self.model_copy(update={"tissue": self.tissue.model_copy(update=changes)})
 
+    @property
+    def lattice(self) -> Extrusion | Block:
+        """Geometry of a body that is meshed by a lattice; raise `SceneError` for another."""
+        if isinstance(self.geometry, FileBody):
+            raise SceneError(
+                f"geometry.kind = {self.geometry.kind!r}: training takes blocks and extrusions "
+                "only; palpate look draws this body"
+            )
+        return self.geometry
+
     @field_validator("support", "surface")
     @classmethod
-    def _side_exists(cls, patch: Patch, info: ValidationInfo) -> Patch:
-        sides = info.context  # of the kind of body, whatever else is wrong with that
-        if sides is not None and patch.side not in sides:
-            raise PydanticCustomError(
-                "side",
-                "side is '{side}', but the sides of this body are {sides}",
-                {"side": patch.side, "sides": ", ".join(sides)},
-            )
+    def _body_has_such(cls, patch: Patch, info: ValidationInfo) -> Patch:
+        body = info.context  # its kind, whatever else is wrong with it
+        if body is None:
+            return patch
+        for table in patch.tables():
+            if table.side is not None and table.side not in body.sides:
+                raise PydanticCustomError(
+                    "side",
+                    "side is '{side}', but the sides of this body are {sides}",
+                    {"side": table.side, "sides": ", ".join(body.sides) or "none"},
+                )
+            if table.set is not None and body not in (MeshBody, LabelBody):
+                raise PydanticCustomError(
+                    "set",
+                    "set is '{set}', but only bodies of kind mesh or labels have sets",
+                    {"set": table.set},
+                )
         return patch
 
 
@@ -333,24 +327,20 @@ def _derived(data: dict[str, Any]) -> dict[str, Any]:
     # a wrong radius is an error by itself, and no reason for errors of what follows from it
     if not (isinstance(radius, int | float) and 0 < radius < 1e300):
         radius = 1.0
-    for name, part in (("endoscope", Endoscope), ("training", Training)):
-        if isinstance(data[name], dict):
+    for name, given in data.items():
+        if isinstance(given, dict) and (part := _kind_of(name, given)):
             lengths = {
                 key: float(f"{said['radii'] * radius:.6g}")
                 for key, field in part.model_fields.items()
                 if "radii" in (said := _said(field))
             }
-            data[name] = lengths | data[name]
+            data[name] = lengths | given
     return data
 
 
-def _sides(geometry: object) -> tuple[str, ...] | None:
-    """Sides of the kind of body that is given; None if it is none."""
-    kind = geometry.get("kind") if isinstance(geometry, dict) else None
-    for body in (Extrusion, Block):
-        if kind in get_args(body.model_fields["kind"].annotation):
-            return body.sides
-    return None
+def _kind_of(name: str, given: dict[str, Any]) -> type[Part] | None:
+    """Kind of a table of a scene."""
+    return _tables().get((name,)) or _tables().get((name, str(given.get("kind"))))
 
 
 def _said(field: FieldInfo) -> dict[str, Any]:
@@ -379,6 +369,8 @@ def _walk(part: type[Part], path: tuple[str, ...]) -> Iterator[tuple[tuple[str, 
     yield path, part
     for name, field in part.model_fields.items():
         for kind in kinds_of(field):
+            if kind is part:  # a table of its own kind within
+                continue
             tag = field.discriminator
             own = get_args(kind.model_fields[tag].annotation) if isinstance(tag, str) else ()
             yield from _walk(kind, (*path, name, *own))
@@ -415,7 +407,7 @@ def parse_scene(text: str, folder: Path | None = None, source: str = "scene") ->
     try:
         data = _derived(tomllib.loads(text))
         scene = Scene.model_validate_json(
-            json.dumps(data, default=str), context=_sides(data["geometry"])
+            json.dumps(data, default=str), context=_kind_of("geometry", data["geometry"])
         )
     except ValidationError as error:
         faults = [_explain(dict(detail)) for detail in error.errors(include_url=False)]
@@ -434,7 +426,7 @@ def _explain(detail: dict[str, Any]) -> str:
     # The tag of a discriminated union is in pydantic's path, but not in the file.
     steps = [loc[i] for i in range(len(loc)) if loc[:i] in tables or loc[: i + 1] not in tables]
     path = ".".join(map(str, steps)) or "scene"
-    table = tables.get(loc[:-1])
+    table = tables.get(tuple(step for step in loc[:-1] if step not in WITHIN))
     if table and kind == "extra_forbidden":
         near = difflib.get_close_matches(loc[-1], table.model_fields, n=1, cutoff=0.5)
         return f"{path}: unknown key" + (f"; did you mean {near[0]!r}?" if near else "")

@@ -67,7 +67,7 @@ def with_mesh(scene: Scene) -> tuple[Scene, dict[str, Any] | None]:
     SceneError
         If the text has its geometry as an inline table, which they cannot be written to.
     """
-    if scene.geometry.divisions is not None:
+    if scene.lattice.divisions is not None:
         return scene, None
     allowed, tried = scene.tolerance.mesh, list[dict[str, Any]]()
     coarsest, *_ = meshes = candidates(scene)
@@ -112,7 +112,7 @@ def candidates(scene: Scene) -> list[Divisions]:
     even = np.linspace(0, 1, PROBE + 1)
     grid = shape_of(scene).grid(even, even, even)
     steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).mean() for axis in range(3)]
-    lengths = PROBE * np.array(in_order(scene.geometry, steps))
+    lengths = PROBE * np.array(in_order(scene.lattice, steps))
     found: list[Divisions] = []
     for k in range(SIZES):
         edge = COARSEST * FINER**k * scene.endoscope.radius
@@ -136,7 +136,7 @@ def _references(scene: Scene, problem: FullProblem) -> list[Reference]:
 
 def _errors(problem: FullProblem, references: list[Reference]) -> Errors:
     """95th percentiles of a mesh's errors; without a tip none of force."""
-    at = parameters_of(problem.scene, ticks_of(problem.scene.geometry))
+    at = parameters_of(problem.scene, ticks_of(problem.scene.lattice))
     found = []
     for place, ticks, elements, exact in references:
         own = _pressed(problem, place)

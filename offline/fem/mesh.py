@@ -1,4 +1,4 @@
-"""All-hexahedral meshes: a lattice of elements mapped onto the body of a scene.
+"""Meshes of hexahedra: a lattice of elements mapped onto the body of a scene.
 
 Nodes, elements and faces are numbered by the lattice, first index slowest; degree of freedom
 3·node + axis. Element and face node order is VTK's.
@@ -9,8 +9,12 @@ from typing import TypeVar
 
 import numpy as np
 
+from palpate.offline.bodies.mesh import mesh_of_body
+from palpate.offline.bodies.places import Boundary, boundary_of_corners, support_and_surface
+from palpate.offline.bodies.report import thickness
 from palpate.offline.fem.shapes import shape_of
-from palpate.shared.arrays import Array, Flags, Ints, Numbers
+from palpate.shared.anatomy import FileBody
+from palpate.shared.arrays import Array, Ints, Numbers
 from palpate.shared.geometry.elements import (
     HEX20_NODES,
     HEX_CORNERS,
@@ -22,7 +26,7 @@ from palpate.shared.geometry.elements import (
 )
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.local_models import Mesh
-from palpate.shared.scene import Block, Extrusion, Patch, Scene, SceneError, divisions_of
+from palpate.shared.scene import Block, Extrusion, Scene, SceneError, divisions_of
 
 T = TypeVar("T")
 Cells = tuple[int, int, int]
@@ -47,18 +51,21 @@ SAG, SQUARES, STRAIGHT = 0.002, (4, 16), 2
 many as that takes.  Faces of straight edges have as many squares as the last."""
 
 
-def build_mesh(scene: Scene, ticks: Ticks | None = None) -> Mesh:
+def build_mesh(scene: Scene, ticks: Ticks | None = None, bare: bool = False) -> Mesh:
     """Mesh the body of a scene.
 
-    ``ticks`` are those of the scene's divisions if absent.
+    ``ticks`` are those of the scene's divisions if absent; a body from a file has none.  A ``bare``
+    mesh is neither held nor touched anywhere, whatever the scene says.
 
     Raises
     ------
     SceneError
-        If the section cannot be read or mapped, if an element is inverted somewhere, or if support
-        or surface hold no face, or the same.
+        If a file cannot be read or meshed, if an element is inverted somewhere, or if support or
+        surface hold no face, or the same.
     """
-    geometry = scene.geometry
+    if ticks is None and isinstance(scene.geometry, FileBody):
+        return mesh_of_body(scene, bare=bare)
+    geometry = scene.lattice
     if ticks is None:
         ticks = ticks_of(geometry)
     a, b, c = cells = cells_of(ticks)
@@ -66,24 +73,11 @@ def build_mesh(scene: Scene, ticks: Ticks | None = None) -> Mesh:
     grid = shape_of(scene).grid(*divided(ticks, (2 * a, 2 * b, 2 * c)))
     nodes = grid.reshape(-1, 3)[np.ravel_multi_index(places.T, grid.shape[:3])]
     _refuse_inverted(nodes, elements)
-    centres = nodes[faces[:, :4]].mean(axis=1)
-
-    def patch(name: str, patch: Patch) -> Flags:
-        inside = sides == geometry.sides.index(patch.side)
-        for axis, bounds in enumerate((patch.x, patch.y, patch.z)):
-            if bounds is not None:
-                inside &= (bounds[0] <= centres[:, axis]) & (centres[:, axis] <= bounds[1])
-        if not inside.any():
-            raise SceneError(
-                f"{name}: no face of side {patch.side!r} has its centre in the given ranges"
-            )
-        return inside
-
+    named = {name: sides == number for number, name in enumerate(geometry.sides)}
+    on_sides = Boundary(*boundary_of_corners(nodes[faces[:, :4]]), sides=named)
+    support, accessible = on_sides.nowhere() if bare else support_and_surface(scene, on_sides)
     clamped = np.zeros(len(nodes), dtype=bool)
-    clamped[faces[patch("support", scene.support)]] = True
-    accessible = patch("surface", scene.surface)
-    if clamped[faces[accessible]].all():
-        raise SceneError("surface: the support holds all of it, so nothing can be pressed")
+    clamped[faces[support]] = True
     return Mesh(nodes, elements, faces, clamped, accessible)
 
 
@@ -200,7 +194,7 @@ def parameters_of(scene: Scene, ticks: Ticks) -> Array:
     """Parameters (n, 3) of the nodes of a scene's mesh of these ticks."""
     a, b, c = cells = cells_of(ticks)
     first, second, third = divided(ticks, (2 * a, 2 * b, 2 * c))
-    i, j, k = _lattice(cells, _reference(scene.geometry))[0].T
+    i, j, k = _lattice(cells, _reference(scene.lattice))[0].T
     through = third[k] if third.ndim == 1 else third[i, k]
     return np.column_stack([first[i], second[j], through])
 
@@ -265,14 +259,7 @@ def least_volume_ratio(mesh: Mesh, displacement: Array) -> float:
 def local_thickness(mesh: Mesh, points: Array, normals: Array) -> Array:
     """How thick the body is (p,) mm under points (p, 3) of its boundary of given outward normals.
 
-    This is the diameter of the largest ball that touches the surface at the point from inside and
-    does not reach through the opposite side; inf where there is none.
-
-    Notes
-    -----
-    The ball through ``x`` (normal ``n``) and ``y`` has diameter ``|x - y|^2 / (n . (x - y))``; the
-    opposite side is where the normal differs by more than 120 degrees (cf. Hildebrand & Ruegsegger,
-    J. Microscopy 1997).
+    See ``bodies.report.thickness``.
     """
     at, _ = gauss(4, 2)
     N, dN = shape(quadrilateral(mesh.faces.shape[1]), at)
@@ -281,13 +268,7 @@ def local_thickness(mesh: Mesh, points: Array, normals: Array) -> Array:
     tangent = np.einsum("fai,qaj->fqij", X, dN)
     outward = np.cross(tangent[..., 0], tangent[..., 1]).reshape(-1, 3)
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-    thickness = np.full(len(points), np.inf)
-    for i, (point, normal) in enumerate(zip(points, normals, strict=True)):
-        across = point - opposite[outward @ normal < -0.5]
-        depth = across @ normal
-        diameter = np.sum(across**2, axis=1)[depth > 0] / depth[depth > 0]
-        thickness[i] = diameter.min(initial=np.inf)
-    return thickness
+    return thickness(points, normals, opposite, outward)
 
 
 def accessible_surface(mesh: Mesh, scene: Scene | None = None) -> Surface:
@@ -343,7 +324,7 @@ def _on_body(scene: Scene, N: Array, dN: Array, faces: Numbers) -> tuple[Array, 
 
     ``N`` (q, a) and ``dN`` (q, a, 2) are shape functions at points of faces (f, a).
     """
-    body, own = shape_of(scene), parameters_of(scene, ticks_of(scene.geometry))[faces]
+    body, own = shape_of(scene), parameters_of(scene, ticks_of(scene.lattice))[faces]
     at, ways = N @ own, SLIGHTLY * np.einsum("qaj,fai->jfqi", dN, own)
     one, two = (
         body.at(np.minimum(at + way, 1.0)) - body.at(np.maximum(at - way, 0.0)) for way in ways

@@ -77,8 +77,9 @@ def shape_of(scene: Scene) -> Shape:
     SceneError
         If the section cannot be read or mapped.
     """
-    if isinstance(scene.geometry, Block):
-        return BlockShape(scene.geometry)
+    geometry = scene.lattice
+    if isinstance(geometry, Block):
+        return BlockShape(geometry)
     if scene.folder is None:
         raise SceneError("geometry.section: the scene's folder is not known")
-    return ExtrusionShape(scene.geometry, scene.folder)
+    return ExtrusionShape(geometry, scene.folder)

@@ -56,10 +56,10 @@ class Remeshed(Method):
     def __init__(
         self, problem: FullProblem, factor: float, element: ElementName | None = None
     ) -> None:
-        own = ticks_of(problem.scene.geometry)
+        own = ticks_of(problem.scene.lattice)
         a, b, c = (int(np.ceil(factor * n - SAME)) for n in cells_of(own))
         ticks = divided(own, (a, b, c))
-        geometry = problem.scene.geometry
+        geometry = problem.scene.lattice
         divisions = in_order(geometry, (a, b, c))
         geometry = geometry.model_copy(update={"element": element or geometry.element})
         scene = problem.scene.model_copy(update={"geometry": geometry})

@@ -30,8 +30,10 @@ from typing import Any, NamedTuple, Self
 
 from tqdm import tqdm
 
+from palpate.offline.bodies import base, places
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.section import read_section
+from palpate.shared.anatomy import FileBody
 from palpate.shared.errors import PalpateError
 from palpate.shared.files import write_whole
 from palpate.shared.scene import Extrusion, Scene, parse_scene
@@ -189,11 +191,20 @@ def _deaf_children() -> Iterator[None]:
 
 
 def files_of(scene: Scene) -> dict[str, bytes]:
-    """Content of the files that a scene names, if they are at hand, by their names in it."""
-    if isinstance(scene.geometry, Extrusion) and scene.folder is not None:
-        name = scene.geometry.section
-        return {name: read_section(scene.folder / name)}
-    return {}
+    """Content of the files that a scene names, if they are at hand, by their names in it.
+
+    With the stored mesh of a body from a file.
+    """
+    geometry, folder, files = scene.geometry, scene.folder, dict[str, bytes]()
+    if folder is None:
+        return files
+    if isinstance(geometry, Extrusion):
+        files[geometry.section] = read_section(folder / geometry.section)
+    paths = [path for at in (scene.support, scene.surface) for path in places.files_of(scene, at)]
+    if isinstance(geometry, FileBody):
+        base.base_mesh(scene)
+        paths += [base.body_file(scene)[1], base.stored_at(scene)]
+    return files | {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
 
 def content_key(scene: Scene) -> str:

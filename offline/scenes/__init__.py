@@ -92,7 +92,10 @@ def _lines(part: Part, path: str, said: Mapping[str, Any] | None = None) -> Iter
 
 
 def _toml(value: object) -> str:
-    """A value as TOML writes it: as JSON does, but for the brackets of tuples."""
+    """A value as TOML writes it: as JSON does, but for the brackets of tuples and tables."""
+    if isinstance(value, Part):
+        pairs = ((key, getattr(value, key)) for key in type(value).model_fields)
+        return f"{{{', '.join(f'{k} = {_toml(v)}' for k, v in pairs if v is not None)}}}"
     if isinstance(value, tuple):
         return f"[{', '.join(map(_toml, value))}]"
     return json.dumps(value, ensure_ascii=False)
@@ -110,6 +113,8 @@ def _rows(part: type[Part], path: str) -> Iterator[str]:
         name = f"`{path}{key}`" if not kinds else f"**`[{path}{key}]`**"
         yield f"| {name} | {'' if kinds else _default(field)} | {field.description} |"
         for kind in kinds:
+            if kind is part:  # a table of its own kind within
+                continue
             yield from _rows(kind, f"{path}{key}.")
 
 

@@ -61,7 +61,7 @@ def convergence(scene: Scene, places: int, report: Path, how: Grading = GRADING)
 
 def at_place(scene: Scene, x: Array, how: Grading) -> Iterator[dict[str, Any]]:
     """Rows of all meshes graded towards a point (3,) mm, those of the middle one with orders."""
-    at = parameters_of(scene, ticks_of(scene.geometry))
+    at = parameters_of(scene, ticks_of(scene.lattice))
     seen: dict[int, list[tuple[float, Array, int]]] = {2: [], 3: []}
     kept = FullProblem(scene).beyond_clamped_layer
     for factor in EDGES:

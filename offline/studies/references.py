@@ -149,5 +149,5 @@ def graded(problem: FullProblem, scene: Scene, load: Load) -> tuple[Array, Array
     except NoEquilibrium:
         return None
     stress = fine.problem.von_mises(u, contact=fine.problem.footprint(load))
-    at = parameters_of(scene, ticks_of(scene.geometry))
+    at = parameters_of(scene, ticks_of(scene.lattice))
     return fine.at(at, u), fine.at(at, stress)

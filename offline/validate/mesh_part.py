@@ -110,7 +110,7 @@ def compared(
     The tip presses the latter as a sphere integrated over its faces.  Levels without equilibrium
     are left out.
     """
-    fine, ticks = Graded(scene, levels[0][1].position, how), ticks_of(scene.geometry)
+    fine, ticks = Graded(scene, levels[0][1].position, how), ticks_of(scene.lattice)
     at, near = parameters_of(scene, ticks), None
     fine_at = parameters_of(scene, fine.ticks)
     own, exact = Pressed(problem), Pressed(fine.problem, integrated=True)

@@ -32,8 +32,8 @@ def shipped_mesh(name):
 
 BODIES = {(scene.geometry, scene.support, scene.surface): scene.name
           for scene in map(find_scene, shipped_scenes())
-          if scene.geometry.divisions is not None}  # fmt: skip
-"""A scene of every body that comes along with its mesh."""
+          if getattr(scene.geometry, "divisions", None) is not None}  # fmt: skip
+"""A scene of every body that comes along with the divisions of its mesh."""
 
 
 @pytest.fixture(params=BODIES.values())

@@ -1,0 +1,194 @@
+"""A scene before anything is trained: its body, what is held and touched, the endoscope to scale.
+
+Needs the extra ``pictures`` (PyVista).
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate.offline.bodies.places import boundary_of_corners
+from palpate.offline.bodies.report import report
+from palpate.offline.choose.mesh import candidates, divided
+from palpate.offline.fem.mesh import build_mesh, mesh_quality
+from palpate.offline.info import labelled, percent
+from palpate.offline.pictures import INK, SHINE, STEEL, new_plotter, require_pyvista, save
+from palpate.offline.scenes import find_scene
+from palpate.shared.anatomy import FileBody
+from palpate.shared.arrays import Array, Flags
+from palpate.shared.local_models import Mesh
+from palpate.shared.scene import Scene, SceneError
+
+SIZE = (1600, 900)
+HELD, TOUCHED, FREE = "#b4463c", "#4c8fc7", "#d9d4cc"
+FACE_TYPES = {4: 9, 6: 22, 8: 23}  # VTK's quadrilateral and quadratic ones, by nodes per face
+SUBDIVISIONS = 2  # of a quadratic face
+FROM = np.array([0.6, -0.7, 0.4])  # whence a body is seen that is touched nowhere
+TITLE = (0.02, 0.86)
+ABOVE = 0.003  # of the size of the body, how far lines lie above its faces
+ASIDE = 0.45  # of the way across, how far a view is turned from the way that is looked along
+
+
+def look(scene: str | Path, out: Path | None = None) -> tuple[Path, list[str]]:
+    """Draw a scene; return the picture's file and what there is to know of its body, in lines.
+
+    Parameters
+    ----------
+    scene : str or Path
+        Shipped name or TOML file.
+    out : Path, optional
+        ``artifacts/NAME/report/look.png`` if absent.
+
+    Raises
+    ------
+    PalpateError
+        If PyVista is missing, the scene is wrong, or its body cannot be meshed.  Where support or
+        surface are wrong the body is drawn all the same, without them.
+    """
+    require_pyvista()
+    found = find_scene(scene)
+    if not isinstance(found.geometry, FileBody) and found.geometry.divisions is None:
+        found = divided(found, candidates(found)[0])
+    path = out or Path("artifacts") / found.name / "report" / "look.png"
+    try:
+        mesh = build_mesh(found)
+    except SceneError as wrong:
+        _draw(found, build_mesh(found, bare=True), path)
+        raise SceneError(f"{wrong}; {path} shows it") from wrong
+    _draw(found, mesh, path)
+    return path, labelled(_said(found, mesh))
+
+
+def _held(mesh: Mesh) -> Flags:
+    """Faces that are held (f,)."""
+    return np.asarray(mesh.clamped[mesh.faces].all(axis=1))
+
+
+def _corners(mesh: Mesh) -> Array:
+    """Corners (f, 3 or 4, 3) mm of the boundary's faces."""
+    return mesh.nodes[mesh.faces[:, : 3 if mesh.faces.shape[1] == 6 else 4]]
+
+
+def _said(scene: Scene, mesh: Mesh) -> Mapping[str, str]:
+    """What there is to know of a body, by what it is about."""
+    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    box = ", ".join(f"{a} {x:z.1f} to {y:.1f}" for a, x, y in zip("xyz", low, high, strict=True))
+    said = {
+        "scene": f"{scene.name}: {scene.description}",
+        "body": f"{box} mm; {len(mesh.elements)} elements {scene.geometry.element}, "
+        f"{mesh.nodes.size} DOFs",
+        "held": f"{scene.support.in_words()}; {_area(mesh, _held(mesh)):.3g} mm²",
+        "touchable": f"{scene.surface.in_words()}; {_area(mesh, mesh.accessible):.3g} mm²",
+    }
+    if not isinstance(scene.geometry, FileBody):
+        return said | {"volume": f"{mesh_quality(mesh)['volume_mm3']:.4g} mm³"}
+    told = report(scene)
+    quality, thick = told["quality"], told["thickness_mm"]
+    volume = f"{quality['volume_mm3']:.4g} mm³"
+    if "volume_change" in told:
+        gaps = told["deviation_mm"]
+        volume += f", {percent(abs(told['volume_change']))} from that of the file"
+        said["surface"] = (
+            f"the mesh is within {gaps['mesh_p95']:.2g} mm of the file's (95 of 100), the file's "
+            f"within {gaps['surface_p95']:.2g} of the mesh; at most {gaps['max']:.2g}"
+        )
+    return said | {
+        "volume": volume,
+        "elements": f"angles of {quality['dihedral_min']:.1f} degrees or more (99 of 100 "
+        f"{quality['dihedral_1_percent']:.1f}), scaled Jacobians of "
+        f"{quality['scaled_jacobian_min']:.2f} or more",
+        "thickness": f"{thick['median']:.2g} mm in the middle, {thick['p5']:.2g} or more at 95 of "
+        f"100 places; {told['thickness_over_edge']['p5']:.1f} elements or more through it there",
+    }
+
+
+def _area(mesh: Mesh, chosen: Flags) -> float:
+    corners = _corners(mesh)[chosen]
+    halves = [corners[:, [0, 1, 2]], corners[:, [0, 2, -1]]]
+    cross = [np.cross(h[:, 1] - h[:, 0], h[:, 2] - h[:, 0]) for h in halves]
+    return float(sum(np.linalg.norm(c, axis=1).sum() for c in cross)) / 2.0
+
+
+def _draw(scene: Scene, mesh: Mesh, out: Path) -> None:
+    held = _held(mesh)
+    centres, normals = boundary_of_corners(_corners(mesh))
+    shown = mesh.accessible if mesh.accessible.any() else normals @ FROM > 0.5
+    towards, middle = normals[shown].mean(axis=0), centres[shown].mean(axis=0)
+    at = np.flatnonzero(shown)[np.argmin(np.linalg.norm(centres[shown] - middle, axis=1))]
+    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    plotter = new_plotter((1, 2), SIZE)
+    parts = {TOUCHED: mesh.accessible, HELD: held & ~mesh.accessible}
+    parts[FREE] = ~(mesh.accessible | held)
+    radius = scene.endoscope.radius
+    names = {"blue: can be touched": TOUCHED, "red: held": HELD, "grey: free": FREE}
+    for view, (way, title) in enumerate(
+        [(towards, "From where it is touched"), (-towards, "From the other side")]
+    ):
+        plotter.subplot(0, view)
+        for colour, chosen in parts.items():
+            if chosen.any():
+                plotter.add_mesh(_faces(mesh, chosen), color=colour, **SHINE)
+        plotter.add_mesh(_edges(mesh), color=INK, line_width=1, opacity=0.35)
+        for part in _endoscope(centres[at], normals[at], radius):
+            plotter.add_mesh(part, color=STEEL, opacity=0.75, smooth_shading=True)
+        words = "\n".join(names) if view == 0 else f"steel: the endoscope, radius {radius:g} mm"
+        plotter.add_text(
+            f"{scene.name}. {title}\n{words}", position=TITLE, viewport=True, font_size=11,
+            color=INK,
+        )  # fmt: skip
+        plotter.show_bounds(
+            xtitle="x, mm", ytitle="y, mm", ztitle="z, mm", color=INK, font_size=10, fmt="%.0f",
+            bounds=np.column_stack([low, high]).ravel(), location="outer",
+        )  # fmt: skip
+        _turn(plotter, way, mesh.nodes)
+    save(plotter, out)
+
+
+def _faces(mesh: Mesh, chosen: Flags) -> Any:
+    """The chosen faces, curved as they are."""
+    pv = require_pyvista()
+    faces = mesh.faces[chosen]
+    grid = pv.UnstructuredGrid({FACE_TYPES[faces.shape[1]]: faces}, mesh.nodes)
+    return grid.extract_surface(algorithm="dataset_surface", nonlinear_subdivision=SUBDIVISIONS)
+
+
+def _edges(mesh: Mesh) -> Any:
+    """The sides of all faces as lines, a little above the body."""
+    pv = require_pyvista()
+    corners = 3 if mesh.faces.shape[1] == 6 else 4
+    ways = [mesh.faces[:, :corners], np.roll(mesh.faces[:, :corners], -1, axis=1)]
+    if mesh.faces.shape[1] > corners:
+        ways.insert(1, mesh.faces[:, corners:])
+    path = np.stack(ways, axis=-1).reshape(-1, len(ways))
+    lines = np.column_stack([np.full(len(path), path.shape[1]), path])
+    outward = np.zeros_like(mesh.nodes)
+    np.add.at(outward, mesh.faces, boundary_of_corners(_corners(mesh))[1][:, None])
+    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-12)
+    above = ABOVE * np.linalg.norm(np.ptp(mesh.nodes, axis=0))
+    return pv.PolyData(mesh.nodes + above * outward, lines=lines.ravel())
+
+
+def _endoscope(at: Array, normal: Array, radius: float) -> list[Any]:
+    """A ball that touches a point of the surface, and the rim of the footprint there."""
+    pv = require_pyvista()
+    ball = pv.Sphere(radius=radius, center=at + radius * normal)
+    rim = pv.Disc(center=at + 0.02 * radius * normal, normal=normal, inner=0.95 * radius,
+                  outer=1.05 * radius, c_res=60)  # fmt: skip
+    return [ball, rim]
+
+
+def _turn(plotter: Any, towards: Array, nodes: Array) -> None:
+    """Look from ``towards``, turned a little to the side, at all nodes."""
+    towards = towards / np.linalg.norm(towards)
+    z = np.array([0.0, 0.0, 1.0])
+    up = z if abs(towards[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    across = np.cross(up, towards)
+    way = towards + ASIDE * (across / np.linalg.norm(across) + 0.6 * up)
+    centre = (nodes.min(axis=0) + nodes.max(axis=0)) / 2.0
+    size = np.linalg.norm(np.ptp(nodes, axis=0))
+    plotter.camera_position = [centre + 3.0 * size * way / np.linalg.norm(way), centre, up]
+    plotter.camera.parallel_projection = True
+    plotter.camera.parallel_scale = 0.62 * size
+    plotter.reset_camera_clipping_range()

@@ -1,0 +1,66 @@
+"""Bodies that come from files, as a scene names them: surfaces, meshes and images of labels."""
+
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field
+
+from palpate.shared.part import Length, Part, in_radii
+
+Unit = Annotated[Literal["mm", "cm", "m"], Field(description="of lengths in the file: mm, cm or m")]
+
+MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+"""Of each unit."""
+
+DEVIATION, EDGE = 0.15, 2.0
+"""Of a mesh that is made of a surface, in radii of the endoscope."""
+
+Label = Annotated[int, Field(ge=1, le=65_535)]
+
+
+class SurfaceBody(Part):
+    """The inside of a closed surface."""
+
+    sides: ClassVar = ()
+    element: ClassVar = "tet10"
+
+    kind: Literal["surface"] = Field(description="inside of a closed surface from a file")
+    file: str = Field(min_length=1, description="STL, OBJ or PLY file beside the scene file")
+    unit: Unit
+    deviation: Length = in_radii(DEVIATION, "how far the mesh may lie from the surface, mm")
+    edge: Length = in_radii(EDGE, "longest edges of the mesh before it is refined, mm")
+
+
+class MeshBody(Part):
+    """A mesh of tetrahedra or of cells that are split into tetrahedra."""
+
+    sides: ClassVar = ()
+    element: ClassVar = "tet10"
+
+    kind: Literal["mesh"] = Field(description="mesh from a file, of tetrahedra or hexahedra")
+    file: str = Field(min_length=1, description="VTU, VTK or MSH file beside the scene file")
+    unit: Unit
+
+
+class LabelBody(Part):
+    """What has some of the labels of a segmented image."""
+
+    sides: ClassVar = ()
+    element: ClassVar = "tet10"
+
+    kind: Literal["labels"] = Field(description="labels of a segmented image; x right, y anterior")
+    file: str = Field(
+        min_length=1, description="NIfTI (.nii, .nii.gz) or NRRD file beside the scene file"
+    )
+    labels: tuple[Label, ...] = Field(min_length=1, description="numbers of the body's labels")
+    smoothing: float | None = Field(
+        None,
+        ge=0,
+        le=100,
+        description="standard deviation of the Gauss filter that rounds the steps of voxels, mm",
+        json_schema_extra={"absent": "half the longest edge of a voxel"},
+    )
+    deviation: Length = in_radii(DEVIATION, "how far the mesh may lie from the surface, mm")
+    edge: Length = in_radii(EDGE, "longest edges of the mesh before it is refined, mm")
+
+
+FileBody = SurfaceBody | MeshBody | LabelBody

@@ -1,0 +1,65 @@
+"""Pictures of scenes before they are trained."""
+
+import sys
+
+import pytest
+
+from palpate.offline.scenes import FOLDER
+
+from .conftest import drawn
+
+
+@pytest.mark.parametrize(
+    ("scene", "words"),
+    [
+        ("quick", ["side bottom; 100 mm²", "side top; 100 mm²", "800 mm³"]),
+        ("layer", ["side bottom", "elements hex20"]),
+        ("turbinate", ["side outer, z 0 to 15.4 mm"]),
+    ],
+)
+def test_a_scene_is_drawn_and_told(run, tmp_path, scene, words):
+    pytest.importorskip("pyvista")
+    out = tmp_path / "new" / "look.png"
+    result = run("look", scene, "--out", out)
+    assert result.exit_code == 0, result.output
+    assert all(word in result.output for word in words), result.output
+    assert drawn(out)
+
+
+def test_a_body_from_a_file_is_drawn_with_its_report(run, tmp_path, monkeypatch):
+    for library in ("pyvista", "trimesh"):
+        pytest.importorskip(library)
+    monkeypatch.chdir(tmp_path)
+    result = run("look", "turbinate-mri")
+    assert result.exit_code == 0, result.output
+    for word in ("elements tet10", "the mesh is within 0.0", "angles of 1", "mm²"):
+        assert word in result.output
+    assert drawn(tmp_path / "artifacts" / "turbinate-mri" / "report" / "look.png")
+
+
+def test_a_body_is_drawn_even_if_it_is_held_nowhere(run, tmp_path):
+    pytest.importorskip("pyvista")
+    text = (FOLDER / "quick.toml").read_text().replace('"bottom"', '"bottom"\nsupport.z = [2, 3]')
+    (tmp_path / "own.toml").write_text(text)
+    result = run("look", tmp_path / "own.toml", "--out", tmp_path / "look.png")
+    assert result.exit_code == 2
+    assert "support: no face of the body is there; of " in result.output
+    assert "16 by side" in result.output
+    assert drawn(tmp_path / "look.png")
+
+
+def test_missing_pyvista_is_named(run, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyvista", None)
+    monkeypatch.chdir(tmp_path)
+    result = run("look", "quick")
+    assert result.exit_code == 2
+    assert "palpate[pictures]" in result.output
+    assert not list(tmp_path.iterdir())
+
+
+def test_training_a_body_from_a_file_is_refused_until_it_is_possible(run):
+    for command in (["train", "turbinate-mri", "--check"], ["train", "turbinate-mri"]):
+        result = run(*command)
+        assert result.exit_code == 2
+        assert "training takes blocks and extrusions only" in result.output
+    assert (FOLDER / "turbinate-mri.toml").exists()
