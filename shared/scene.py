@@ -448,4 +448,5 @@ def _explain(detail: dict[str, Any]) -> str:
 def _needed(part: type[Part], tag: str) -> list[str]:
     """Keys that a kind of table must have beside the ``tag`` that names it."""
     fields = part.model_fields.items()
-    return [name for name, field in fields if field.is_required() and name != tag]
+    needed = (name for name, field in fields if field.is_required() and absent(field) is None)
+    return [name for name in needed if name != tag]
