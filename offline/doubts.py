@@ -4,7 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from palpate.offline.fem.problem import FullProblem
+from palpate.shared.arrays import Array
+from palpate.shared.scene import Scene
 
 SMALLEST, LARGEST = 2.0, 1000.0
 """Sizes of a body, mm."""
@@ -12,13 +13,16 @@ SMALLEST, LARGEST = 2.0, 1000.0
 SOFTEST, STIFFEST = 0.1, 1000.0
 """Young's moduli of soft tissue, kPa: brain has one, cartilage some hundreds."""
 
+SLENDEREST = 0.01
+"""Radius of a tip over the size of the body; a liver's is a thirtieth."""
+
 SLIGHT = 2.0
 """Largest tilt, degrees, that may be one in radians."""
 
 
-def doubts(problem: FullProblem) -> Iterator[str]:
-    """Say what to look at once more, key by key."""
-    scene, sizes = problem.scene, np.ptp(problem.mesh.nodes, axis=0)
+def doubts(scene: Scene, nodes: Array) -> Iterator[str]:
+    """Say what to look at once more of a scene with nodes (n, 3) mm of its body, key by key."""
+    sizes = np.ptp(nodes, axis=0)
     body = " x ".join(f"{size:.3g}" for size in sizes) + " mm"
     if not SMALLEST <= sizes.max() <= LARGEST:
         yield f"geometry: a body of {body}; lengths are in mm"
@@ -27,5 +31,7 @@ def doubts(problem: FullProblem) -> Iterator[str]:
         yield f"tissue.young = {young:g}: soft tissue has {SOFTEST:g} to {STIFFEST:g} kPa"
     if 2.0 * radius > np.median(sizes):
         yield f"endoscope.radius = {radius:g}: its tip is wider than the body of {body}"
+    if radius < SLENDEREST * sizes.max():
+        yield f"endoscope.radius = {radius:g}: its tip is tiny beside the body of {body}"
     if 0.0 < tilt < SLIGHT:
         yield f"endoscope.max_tilt = {tilt:g}: angles are in degrees"

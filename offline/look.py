@@ -12,6 +12,7 @@ import numpy as np
 from palpate.offline.bodies.places import boundary_of_corners
 from palpate.offline.bodies.report import report
 from palpate.offline.choose.mesh import candidates, divided
+from palpate.offline.doubts import doubts
 from palpate.offline.fem.mesh import build_mesh, mesh_quality
 from palpate.offline.info import labelled, percent
 from palpate.offline.pictures import INK, SHINE, STEEL, new_plotter, require_pyvista, save
@@ -58,7 +59,8 @@ def look(scene: str | Path, out: Path | None = None) -> tuple[Path, list[str]]:
         _draw(found, build_mesh(found, bare=True), path)
         raise SceneError(f"{wrong}; {path} shows it") from wrong
     _draw(found, mesh, path)
-    return path, labelled(_said(found, mesh))
+    slips = (f"is this meant? {doubt}" for doubt in doubts(found, mesh.nodes))
+    return path, [*labelled(_said(found, mesh)), *slips]
 
 
 def _held(mesh: Mesh) -> Flags:

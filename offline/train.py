@@ -194,7 +194,7 @@ def check(scene: str | Path, workers: int | None = None) -> str:
 
 def outlook(problem: FullProblem, workers: int | None, coarsest: bool = False) -> str:
     """What people look at before a training: its ``forecast``, and what is likely a slip."""
-    slips = (f"is this meant? {doubt}" for doubt in doubts(problem))
+    slips = (f"is this meant? {doubt}" for doubt in doubts(problem.scene, problem.mesh.nodes))
     return "\n".join([forecast(problem, workers or os.cpu_count() or 1, coarsest), *slips])
 
 

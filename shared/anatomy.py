@@ -26,7 +26,9 @@ class SurfaceBody(Part):
     kind: Literal["surface"] = Field(description="inside of a closed surface from a file")
     file: str = Field(min_length=1, description="STL, OBJ or PLY file beside the scene file")
     unit: Unit
-    deviation: Length = in_radii(DEVIATION, "how far the mesh may lie from the surface, mm")
+    deviation: Length = in_radii(
+        DEVIATION, "how far the mesh may lie from the surface, mm; sharp edges twice as far from it"
+    )
     edge: Length = in_radii(EDGE, "longest edges of the mesh before it is refined, mm")
 
 
@@ -59,7 +61,9 @@ class LabelBody(Part):
         description="standard deviation of the Gauss filter that rounds the steps of voxels, mm",
         json_schema_extra={"absent": "half the longest edge of a voxel"},
     )
-    deviation: Length = in_radii(DEVIATION, "how far the mesh may lie from the surface, mm")
+    deviation: Length = in_radii(
+        DEVIATION, "how far the mesh may lie from the surface, mm; sharp edges twice as far from it"
+    )
     edge: Length = in_radii(EDGE, "longest edges of the mesh before it is refined, mm")
 
 

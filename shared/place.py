@@ -35,20 +35,24 @@ class Patch(Part):
     y: Range | None = _unless("all of it", "[from, to] mm")
     z: Range | None = _unless("all of it", "[from, to] mm")
     normal: Point | None = _unless("all of it", "direction [x, y, z] of outward normals")
-    within: Angle | None = _unless("all of it", "largest angle of outward normals to it, degrees")
+    within: Angle | None = _unless(
+        "needed with normal", "largest angle of outward normals to it, degrees"
+    )
     near: Point | None = _unless("all of it", "point [x, y, z] mm")
-    radius: Length | None = _unless("all of it", "largest distance from that point, mm")
+    radius: Length | None = _unless("needed with near", "largest distance from that point, mm")
     close_to: str | None = _unless(
         "all of it", "file of another surface (STL, OBJ, PLY), in the unit of the body's own"
     )
-    distance: Length | None = _unless("all of it", "largest distance from that surface, mm")
+    distance: Length | None = _unless(
+        "needed with close_to", "largest distance from that surface, mm"
+    )
     set: str | None = _unless(
         "all of it", "named set of the body's file; of labels, one that the body borders on"
     )
     any: tuple["Patch", ...] | None = _unless(
         "all of it", "list of such tables, one of which holds"
     )
-    without: "Patch | None" = _unless("all of it", "such a table, which does not hold")
+    without: "Patch | None" = _unless("nothing", "such a table, which does not hold")
 
     @model_validator(mode="after")
     def _says_a_place(self) -> Self:

@@ -40,6 +40,10 @@ PULL, LEAST, HALVINGS = 0.2, 0.4, 5
 """How far a node moves onto the surface, over the lengths of edges there; least share of its volume
 ratio that an element keeps; how often a pull that takes more is halved before it is given up."""
 
+LEFT_OUT = 2.0
+"""How far the surface may be from its mesh, in how far that may be from the surface: sharp edges
+are cut off."""
+
 SAMPLES = 20_000
 """Points at which distances of mesh and surface are taken."""
 
@@ -89,11 +93,12 @@ def base_mesh(scene: Scene) -> Base:
     if path.exists():
         return _load(path)
     base = _made(*body_file(scene))
-    try:
-        write_whole(path, _bytes(base))
-    except OSError as error:
-        raise SceneError(f"{path}: the mesh of the body cannot be stored: {error}") from error
-    return base
+    if not path.exists():  # or another process has been faster
+        try:
+            write_whole(path, _bytes(base))
+        except OSError as error:
+            raise SceneError(f"{path}: the mesh of the body cannot be stored: {error}") from error
+    return _load(path)
 
 
 def surface_of(scene: Scene) -> tuple[Array, Numbers] | None:
@@ -198,16 +203,16 @@ def _refuse_far(
     geometry: SurfaceBody | LabelBody, path: Path, gaps: dict[str, Any], found: surface.Repaired
 ) -> None:
     """Refuse a mesh that leaves out part of the surface, or lies elsewhere."""
-    worst, place = gaps["max"], gaps["place"]
-    if worst <= 2.0 * geometry.deviation:
+    worst, most = gaps["max"], geometry.deviation
+    if gaps["mesh_max"] <= most and gaps["surface_max"] <= LEFT_OUT * most:
         return
-    x, y, z = place
+    x, y, z = gaps["place"]
     why = "it is thinner there than geometry.deviation can follow: state a smaller one"
     if found.crossings:
         why = f"it is cut off; {surface.in_words(found.crossings, found.place)}"
     raise SceneError(
-        f"{path}: the mesh lies up to {worst:.2g} mm from the surface, where "
-        f"{geometry.deviation:g} are allowed; near ({x:.1f}, {y:.1f}, {z:.1f}) mm {why}"
+        f"{path}: the mesh lies up to {worst:.2g} mm from the surface, with "
+        f"geometry.deviation = {most:g}; near ({x:.1f}, {y:.1f}, {z:.1f}) mm {why}"
     )
 
 

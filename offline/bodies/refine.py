@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from palpate.offline.bodies.base import Base
-from palpate.offline.bodies.tetrahedra import EDGES, boundary, shape
+from palpate.offline.bodies.tetrahedra import EDGES, boundary, curved, shape
 from palpate.shared.arrays import Array, Flags, Ints, Numbers
 from palpate.shared.scene import SceneError
 
@@ -147,6 +147,14 @@ def growing(points: Array, finest: float, growth: float, coarsest: float) -> Edg
         return np.minimum(finest + growth * away, coarsest)
 
     return edge_length_at
+
+
+def spread_over(base: Base, chosen: Flags, spacing: float) -> Array:
+    """Points (k, 3) mm so close together (mm) all over chosen faces of the boundary."""
+    faces = boundary(base.elements)[0][chosen]
+    corners = base.nodes[faces[:, :3]]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
+    return curved(faces, base.nodes, squares=int(np.ceil(longest / spacing)))[0]
 
 
 def _keys(corners: Ints) -> Ints:

@@ -8,7 +8,7 @@ import itertools
 
 import numpy as np
 
-from palpate.shared.arrays import Array, Flags, Ints, Numbers
+from palpate.shared.arrays import Array, Ints, Numbers
 
 EDGES = np.array([(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)])
 FACES = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])
@@ -170,10 +170,3 @@ def curved(faces: Numbers, nodes: Array, squares: int = 4) -> tuple[Array, Numbe
         points.reshape(-1, 3).round(9), axis=0, return_index=True, return_inverse=True
     )
     return points.reshape(-1, 3)[first], weld.ravel()[triangles.reshape(-1, 3)].astype(np.int32)
-
-
-def flags(count: int, chosen: Ints) -> Flags:
-    """Which of so many are chosen."""
-    found = np.zeros(count, dtype=bool)
-    found[chosen] = True
-    return found

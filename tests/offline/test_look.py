@@ -37,6 +37,15 @@ def test_a_body_from_a_file_is_drawn_with_its_report(run, tmp_path, monkeypatch)
     assert drawn(tmp_path / "artifacts" / "turbinate-mri" / "report" / "look.png")
 
 
+def test_a_body_that_is_large_for_its_endoscope_is_asked_about(run, tmp_path):
+    pytest.importorskip("pyvista")
+    text = (FOLDER / "quick.toml").read_text().replace("[10.0, 10.0", "[400.0, 400.0")
+    (tmp_path / "own.toml").write_text(text)
+    result = run("look", tmp_path / "own.toml", "--out", tmp_path / "look.png")
+    assert result.exit_code == 0
+    assert "is this meant? endoscope.radius = 2: its tip is tiny" in result.output
+
+
 def test_a_body_is_drawn_even_if_it_is_held_nowhere(run, tmp_path):
     pytest.importorskip("pyvista")
     text = (FOLDER / "quick.toml").read_text().replace('"bottom"', '"bottom"\nsupport.z = [2, 3]')

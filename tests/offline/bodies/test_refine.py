@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from palpate.offline.bodies.base import Base
 from palpate.offline.bodies.mesh_file import HEXAHEDRON, _split
-from palpate.offline.bodies.refine import growing, placed, refined
+from palpate.offline.bodies.refine import growing, placed, refined, spread_over
 from palpate.offline.bodies.tetrahedra import (
     boundary,
     curved,
@@ -111,3 +112,12 @@ def test_fields_of_the_base_mesh_are_found_at_the_nodes_of_a_finer_one(base):
     where = mesh.at[mesh.elements[inside, :4]].mean(axis=1)
     own = np.einsum("ka,ka->k", shape(where)[0], field[base.elements[mesh.element_of[inside]]])
     np.testing.assert_allclose(fine[mesh.elements[inside]] @ N, own, atol=1e-12)
+
+
+def test_points_are_spread_over_chosen_faces(base):
+    faces, _, _ = boundary(base.elements)
+    chosen = base.nodes[faces[:, :3], 2].mean(axis=1) > 7
+    points = spread_over(base, chosen, 0.5)
+    assert points[:, 2].min() > 3.5  # a face of a side reaches down to the next row
+    gap = cKDTree(points).query(points, k=2)[0][:, 1]
+    assert 0 < gap.max() < 0.6

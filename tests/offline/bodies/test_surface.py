@@ -8,6 +8,7 @@ from palpate.offline.bodies.base import base_mesh, stored_at
 from palpate.offline.bodies.report import report
 from palpate.offline.bodies.tetrahedra import boundary, quality
 from palpate.offline.fem.mesh import build_mesh
+from palpate.offline.run.workers import content_key
 from palpate.offline.scenes import FOLDER, find_scene
 from palpate.shared.scene import SceneError
 
@@ -130,3 +131,17 @@ def test_the_turbinate_comes_with_its_mesh_which_no_extra_is_needed_for():
     held, touched = mesh.nodes[mesh.clamped], mesh.nodes[mesh.faces[mesh.accessible]]
     assert held[:, 0].mean() < 7 < 12 < touched[..., 0].mean()  # lateral and medial
     assert held[:, 2].mean() > 14 > touched[..., 2].mean()  # above and below
+
+
+def test_results_depend_on_the_mesh_and_on_surfaces_that_places_name(scene):
+    near = 'close_to = "bone.stl"\ndistance = 3.0'
+    ball(radius=4.0).apply_translation([0, 0, -13]).export(scene.folder / "bone.stl")
+    hung = scene_of(scene.folder, BALL, support=near)
+    keys = [content_key(scene), content_key(hung)]
+    assert content_key(hung) == keys[1]
+    ball(radius=4.5).apply_translation([0, 0, -13]).export(scene.folder / "bone.stl")
+    keys.append(content_key(hung))
+    stored_at(scene).unlink()
+    keys += [content_key(hung)]
+    assert len(set(keys)) == 4
+    (scene.folder / "bone.stl").unlink()
