@@ -182,7 +182,7 @@ REFUSED = {
     "validate text.h5": "text.h5: not an artifact of this software",
     "bench text.h5": "text.h5: not an artifact of this software",
     f"solve cube {AT} 1": "neither a file 'cube' nor artifacts/cube.h5, which palpate train",
-    "train septum": "neither a .toml file nor one of cube, cube-visco, layer, quick",
+    "train septum": "neither a .toml file nor one of cube, cube-visco, layer, liver, quick",
     "study stability cube": "cube.h5: cannot be read: No such file",
     "study relaxation A": "is elastic",
     "study chart-in-time A": "is elastic",
@@ -272,7 +272,7 @@ def test_all_that_is_wrong_with_a_scene_is_told_a_line_each(run, tmp_path):
     first, *faults = result.stderr.splitlines()
     assert first == f"Error: {path}:"
     (geometry,) = (fault for fault in faults if fault.startswith("  geometry.kind = 'ball': not "))
-    assert geometry.endswith("length; block, which needs size)")
+    assert "length; block, which needs size; surface, which needs file, unit; " in geometry
     assert "  loads: unknown key; did you mean 'load'?" in faults
     assert len(faults) == 8
 
