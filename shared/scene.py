@@ -328,7 +328,7 @@ def _derived(data: dict[str, Any]) -> dict[str, Any]:
     if not (isinstance(radius, int | float) and 0 < radius < 1e300):
         radius = 1.0
     for name, given in data.items():
-        if isinstance(given, dict) and (part := _kind_of(name, given)):
+        if part := _kind_of(name, given):
             lengths = {
                 key: float(f"{said['radii'] * radius:.6g}")
                 for key, field in part.model_fields.items()
@@ -338,8 +338,10 @@ def _derived(data: dict[str, Any]) -> dict[str, Any]:
     return data
 
 
-def _kind_of(name: str, given: dict[str, Any]) -> type[Part] | None:
-    """Kind of a table of a scene."""
+def _kind_of(name: str, given: Any) -> type[Part] | None:
+    """Kind of a table of a scene; None if what is given is no table, or of no kind."""
+    if not isinstance(given, dict):
+        return None
     return _tables().get((name,)) or _tables().get((name, str(given.get("kind"))))
 
 

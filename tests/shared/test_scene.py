@@ -189,6 +189,12 @@ def test_what_kinds_need_is_told_at_once_with_a_side_that_they_do_not_have() -> 
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize("table", ["geometry", "endoscope", "support"])
+def test_what_should_be_a_table_is_named(table: str) -> None:
+    with pytest.raises(SceneError, match=rf"(?m)^  {table} = 3: "):
+        parse_scene(f"{table} = 3\n")
+
+
 def test_what_each_kind_needs_is_told_where_there_is_none() -> None:
     with pytest.raises(SceneError) as error:
         parse_scene("")
