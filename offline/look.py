@@ -70,7 +70,12 @@ def _held(mesh: Mesh) -> Flags:
 
 def _corners(mesh: Mesh) -> Array:
     """Corners (f, 3 or 4, 3) mm of the boundary's faces."""
-    return mesh.nodes[mesh.faces[:, : 3 if mesh.faces.shape[1] == 6 else 4]]
+    return mesh.nodes[mesh.faces[:, : _sides(mesh)]]
+
+
+def _sides(mesh: Mesh) -> int:
+    """How many sides the boundary's faces have."""
+    return 3 if mesh.faces.shape[1] == 6 else 4
 
 
 def _said(scene: Scene, mesh: Mesh) -> Mapping[str, str]:
@@ -159,7 +164,7 @@ def _faces(mesh: Mesh, chosen: Flags) -> Any:
 def _edges(mesh: Mesh) -> Any:
     """The sides of all faces as lines, a little above the body."""
     pv = require_pyvista()
-    corners = 3 if mesh.faces.shape[1] == 6 else 4
+    corners = _sides(mesh)
     ways = [mesh.faces[:, :corners], np.roll(mesh.faces[:, :corners], -1, axis=1)]
     if mesh.faces.shape[1] > corners:
         ways.insert(1, mesh.faces[:, corners:])

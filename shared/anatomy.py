@@ -11,43 +11,43 @@ Unit = Annotated[Literal["mm", "cm", "m"], Field(description="of lengths in the 
 MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 """Of each unit."""
 
-DEVIATION, EDGE = 0.15, 2.0
-"""Of a mesh that is made of a surface, in radii of the endoscope."""
-
 Label = Annotated[int, Field(ge=1, le=65_535)]
 
 
-class SurfaceBody(Part):
-    """The inside of a closed surface."""
+Deviation = Annotated[
+    Length,
+    in_radii(
+        0.15, "how far the mesh may lie from the surface, mm; sharp edges twice as far from it"
+    ),
+]
+Edge = Annotated[Length, in_radii(2.0, "longest edges of the mesh before it is refined, mm")]
 
+
+class _OfFile(Part):
     sides: ClassVar = ()
     element: ClassVar = "tet10"
+
+
+class SurfaceBody(_OfFile):
+    """The inside of a closed surface."""
 
     kind: Literal["surface"] = Field(description="inside of a closed surface from a file")
     file: str = Field(min_length=1, description="STL, OBJ or PLY file beside the scene file")
     unit: Unit
-    deviation: Length = in_radii(
-        DEVIATION, "how far the mesh may lie from the surface, mm; sharp edges twice as far from it"
-    )
-    edge: Length = in_radii(EDGE, "longest edges of the mesh before it is refined, mm")
+    deviation: Deviation
+    edge: Edge
 
 
-class MeshBody(Part):
+class MeshBody(_OfFile):
     """A mesh of tetrahedra or of cells that are split into tetrahedra."""
-
-    sides: ClassVar = ()
-    element: ClassVar = "tet10"
 
     kind: Literal["mesh"] = Field(description="mesh from a file, of tetrahedra or hexahedra")
     file: str = Field(min_length=1, description="VTU, VTK or MSH file beside the scene file")
     unit: Unit
 
 
-class LabelBody(Part):
+class LabelBody(_OfFile):
     """What has some of the labels of a segmented image."""
-
-    sides: ClassVar = ()
-    element: ClassVar = "tet10"
 
     kind: Literal["labels"] = Field(description="labels of a segmented image; x right, y anterior")
     file: str = Field(
@@ -61,10 +61,8 @@ class LabelBody(Part):
         description="standard deviation of the Gauss filter that rounds the steps of voxels, mm",
         json_schema_extra={"absent": "half the longest edge of a voxel"},
     )
-    deviation: Length = in_radii(
-        DEVIATION, "how far the mesh may lie from the surface, mm; sharp edges twice as far from it"
-    )
-    edge: Length = in_radii(EDGE, "longest edges of the mesh before it is refined, mm")
+    deviation: Deviation
+    edge: Edge
 
 
 FileBody = SurfaceBody | MeshBody | LabelBody

@@ -23,6 +23,7 @@ from palpate.offline.bodies.tetrahedra import (
     EDGES,
     boundary,
     curved,
+    edge_lengths,
     least_determinants,
     manifold,
     raised,
@@ -275,17 +276,15 @@ def _moved(nodes: Array, elements: Numbers, step: Array) -> Array:
 
 def _least_ratio(nodes: Array, elements: Numbers) -> Array:
     """Least determinant of elements (e,) over the cube of their mean edge."""
-    ends = nodes[elements[:, EDGES]]
-    edge = np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=2).mean(axis=1)
+    edge = edge_lengths(nodes, elements).mean(axis=1)
     ratio: Array = least_determinants(nodes, elements) / edge**3
     return ratio
 
 
 def _shortest_edges(nodes: Array, elements: Numbers) -> Array:
     """Length (n,) mm of the shortest edge at each node, of its own for a middle."""
-    ends = elements[:, EDGES]
-    length = np.linalg.norm(nodes[ends[:, :, 0]] - nodes[ends[:, :, 1]], axis=2)
+    length = edge_lengths(nodes, elements)
     shortest = np.full(len(nodes), np.inf)
-    np.minimum.at(shortest, ends, length[:, :, None])
+    np.minimum.at(shortest, elements[:, EDGES], length[:, :, None])
     np.minimum.at(shortest, elements[:, 4:], length)
     return shortest

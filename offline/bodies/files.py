@@ -27,6 +27,11 @@ def require(module: str) -> Any:
         ) from error
 
 
+def first_line(error: BaseException) -> str:
+    """What a library's reader says of a file, in a few words."""
+    return (str(error) or type(error).__name__).splitlines()[0][:80]
+
+
 def checked(folder: Path | None, name: str, key: str, kinds: tuple[str, ...]) -> Path:
     """Path of a file that a scene names by a key; raise `SceneError` if it cannot be read."""
     if folder is None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from palpate.offline.bodies.files import refuse_size, require
+from palpate.offline.bodies.files import first_line, refuse_size, require
 from palpate.shared.anatomy import LabelBody
 from palpate.shared.arrays import Array, Ints
 from palpate.shared.scene import SceneError
@@ -66,8 +66,9 @@ def read_image(path: Path) -> Image:
     except SceneError:
         raise
     except Exception as error:  # of the library's readers, whatever they trip over
-        said = (str(error) or type(error).__name__).splitlines()[0][:80]
-        raise SceneError(f"{path}: cannot be read as an image ({said}); save it anew") from error
+        raise SceneError(
+            f"{path}: cannot be read as an image ({first_line(error)}); save it anew"
+        ) from error
     if labels.ndim != 3:
         raise SceneError(f"{path}: has {labels.ndim} dimensions; save one volume of labels")
     if labels.dtype.kind == "f" and not (labels == np.rint(labels)).all():

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.bodies.files import refuse_size, require
+from palpate.offline.bodies.files import first_line, refuse_size, require
 from palpate.offline.bodies.tetrahedra import (
     EDGES,
     boundary,
@@ -74,9 +74,9 @@ def _read(path: Path) -> Any:
     try:
         return meshio.read(path)
     except (Exception, SystemExit) as error:  # the library ends the program at unknown files
-        said = (str(error) or type(error).__name__).splitlines()[0][:80]
         raise SceneError(
-            f"{path}: cannot be read as {path.suffix[1:].upper()} ({said}); save it anew"
+            f"{path}: cannot be read as {path.suffix[1:].upper()} ({first_line(error)}); "
+            "save it anew"
         ) from error
 
 

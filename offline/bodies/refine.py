@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from palpate.offline.bodies.base import Base
-from palpate.offline.bodies.tetrahedra import EDGES, boundary, curved, shape
+from palpate.offline.bodies.tetrahedra import EDGES, boundary, curved, edge_lengths, shape
 from palpate.shared.arrays import Array, Flags, Ints, Numbers
 from palpate.shared.scene import SceneError
 
@@ -60,7 +60,7 @@ class _Cut:
     def longest(self) -> tuple[Ints, Array]:
         """Which of its edges (e,) is cut of every tetrahedron, and its length (e,) mm."""
         ends = self.points[self.corners[:, EDGES]]
-        length = np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=2)
+        length = edge_lengths(self.points, self.corners)
         most = length.max(axis=1)
         alike = length >= (1.0 - ALIKE) * most[:, None]
         along = np.where(alike, (ends[:, :, 0] + ends[:, :, 1]) @ ASKEW, -np.inf)
@@ -92,7 +92,7 @@ class _Cut:
         order = np.argsort(self.keys)
         self.keys, self.middles = self.keys[order], self.middles[order]
         number = self.middles[np.searchsorted(self.keys, keys)]
-        self.points[numbers] = self.place(self.element_of[chosen[first]], middle[first])
+        self.points[numbers] = placed(self.base, self.element_of[chosen[first]], middle[first])
         halves = []
         for end in (one, two):
             own, where = corners.copy(), at.copy()
@@ -102,10 +102,6 @@ class _Cut:
         self.corners = np.vstack([self.corners, halves[1][0]])
         self.at = np.vstack([self.at, halves[1][1]])
         self.element_of = np.concatenate([self.element_of, self.element_of[chosen]])
-
-    def place(self, element: Ints, at: Array) -> Array:
-        """Points (k, 3) mm at barycentric coordinates (k, 4) of base elements (k,)."""
-        return placed(self.base, element, at)
 
 
 def placed(base: Base, element: Ints, at: Array) -> Array:

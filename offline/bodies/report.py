@@ -5,9 +5,16 @@ from typing import Any
 import numpy as np
 
 from palpate.offline.bodies import surface
-from palpate.offline.bodies.base import Base, base_mesh, deviations, parts_of, surface_of
+from palpate.offline.bodies.base import (
+    Base,
+    base_mesh,
+    body_file,
+    deviations,
+    parts_of,
+    surface_of,
+)
 from palpate.offline.bodies.places import boundary_of_corners
-from palpate.offline.bodies.tetrahedra import EDGES, boundary, curved, manifold, quality
+from palpate.offline.bodies.tetrahedra import boundary, curved, edge_lengths, manifold, quality
 from palpate.shared.arrays import Array
 from palpate.shared.scene import Scene
 
@@ -26,7 +33,7 @@ def report(scene: Scene) -> dict[str, Any]:
     base = base_mesh(scene)
     faces, _, _ = boundary(base.elements)
     found: dict[str, Any] = {
-        "file": scene.geometry.file if hasattr(scene.geometry, "file") else None,
+        "file": body_file(scene)[0].file,
         "tetrahedra": len(base.elements),
         "dofs": base.nodes.size,
         "components": parts_of(base.elements),
@@ -57,8 +64,7 @@ def _thickness(base: Base) -> dict[str, Any]:
     at, outward = boundary_of_corners(points[triangles])
     places, normals = boundary_of_corners(base.nodes[faces[chosen, :3]])
     found = thickness(places, normals, at, outward)
-    ends = base.nodes[base.elements[owner[chosen]][:, EDGES]]
-    edges = np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=2).mean(axis=1)
+    edges = edge_lengths(base.nodes, base.elements[owner[chosen]]).mean(axis=1)
     return {
         "thickness_mm": _spread(found),
         "thickness_over_edge": _spread(found / edges),

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from palpate.offline.bodies.files import refuse_size, require
+from palpate.offline.bodies.files import first_line, refuse_size, require
 from palpate.shared.anatomy import MILLIMETRES, Unit
 from palpate.shared.arrays import Array, Ints, Numbers
 from palpate.shared.geometry.surface import Surface
@@ -44,7 +44,7 @@ def read_surface(path: Path, unit: Unit) -> Any:
         points, triangles = np.array(mesh.vertices, float), np.array(mesh.faces, np.int64)
     except Exception as error:  # of the library's readers, whatever they trip over
         raise SceneError(
-            f"{path}: cannot be read as {path.suffix[1:].upper()} ({_first_line(error)}); "
+            f"{path}: cannot be read as {path.suffix[1:].upper()} ({first_line(error)}); "
             "save it anew, as binary STL for example"
         ) from error
     if not len(triangles) or points.shape[1:] != (3,) or triangles.shape[1:] != (3,):
@@ -60,10 +60,6 @@ def read_surface(path: Path, unit: Unit) -> Any:
 def mesh_of(points: Array, triangles: Ints | Numbers) -> Any:
     """Points (p, 3) mm and triangles (t, 3) as a mesh of trimesh, as they are."""
     return require("trimesh").Trimesh(points, triangles, process=False)
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0][:80]
 
 
 def repaired(path: Path, mesh: Any) -> Repaired:

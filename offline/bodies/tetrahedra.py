@@ -65,6 +65,13 @@ def least_determinants(nodes: Array, elements: Numbers) -> Array:
     return least
 
 
+def edge_lengths(nodes: Array, elements: Numbers | Ints) -> Array:
+    """Lengths (e, 6) mm of the straight ``EDGES`` of elements (e, 4 or 10)."""
+    ends = nodes[elements[:, EDGES]]
+    lengths: Array = np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=2)
+    return lengths
+
+
 def volumes(corners: Array) -> Array:
     """Volumes (e,) mm³ of straight tetrahedra of corners (e, 4, 3)."""
     found: Array = np.linalg.det(corners[:, 1:4] - corners[:, :1]) / 6.0
