@@ -266,6 +266,7 @@ class Checkpoint:
             executor.submit(run, *task): name for name, task in tasks.items() if name not in self
         }
         done = len(tasks) - len(missing)
+        self._told(title, done, len(tasks))
         try:
             for future in tqdm(as_completed(missing), title, len(tasks), initial=done):
                 self.store(missing[future], future.result())
