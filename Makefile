@@ -16,7 +16,7 @@ pip := $(bin)/pip --disable-pip-version-check --quiet
 .PHONY: help serve test lint format bench lock clean
 
 help:
-	@echo "make serve   serve a slab, train the turbinate beside it; open http://$(HOST):$(PORT)"
+	@echo "make serve   serve a pad, train the turbinate beside it; open http://$(HOST):$(PORT)"
 	@echo "make test    style, types, import rules and every test"
 	@echo "make lint    the same without the tests"
 	@echo "make format  put the code in the project's style"

@@ -156,7 +156,7 @@ def load_options(command: Callable[..., Any]) -> Callable[..., Any]:
 def scene(name: str | None, keys: bool) -> None:
     """Print a scene with every default filled in.
 
-    SCENE is the name of one that comes along, such as quick or turbinate, or a TOML file. What is
+    SCENE is the name of one that comes along, such as pad or turbinate, or a TOML file. What is
     printed, with unit and meaning of each key, is a scene file itself: write your own from it, or
     start from an empty file, for which this command says what is missing.
     """
@@ -215,7 +215,7 @@ def train(
 ) -> None:
     """Train the artifact of a scene.
 
-    SCENE is the name of one that comes along, such as quick or turbinate, or a TOML file, which
+    SCENE is the name of one that comes along, such as pad or turbinate, or a TOML file, which
     palpate new writes. A run that was stopped continues where it was.
 
     With --scheduler, tcp://HOST:PORT or the file that dask scheduler --scheduler-file wrote, it is

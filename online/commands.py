@@ -17,6 +17,7 @@ Examples:
 _DEMO_EXAMPLES = """\b
 Examples:
   palpate demo
+  palpate demo quick-visco
   palpate demo --beside turbinate --port 8080
 """
 
@@ -44,6 +45,7 @@ def serve(**settings: Any) -> None:
 
 
 @click.command(epilog=_DEMO_EXAMPLES, context_settings={"auto_envvar_prefix": "PALPATE"})
+@click.argument("scene", default="pad")
 @click.option(
     "--beside",
     multiple=True,
@@ -56,14 +58,14 @@ def serve(**settings: Any) -> None:
     help="Open the page.",
 )  # fmt: skip
 @options(Settings)
-def demo(beside: tuple[str, ...], browser: bool, **settings: Any) -> None:
-    """Press a first piece of tissue: train a small slab, serve it and open its page.
+def demo(scene: str, beside: tuple[str, ...], browser: bool, **settings: Any) -> None:
+    """Press a first piece of tissue: train SCENE (or a small pad), serve it and open its page.
 
     The other options are those of palpate serve.
     """
     from palpate.online.demo import demo
 
-    demo(Settings(**settings), beside, browser)
+    demo(Settings(**settings), scene, beside, browser)
 
 
 @click.command(epilog=_LOADTEST_EXAMPLES)

@@ -1,4 +1,4 @@
-"""A first look: a slab that trains in a minute is served, and other scenes train beside it."""
+"""A first look: tissue that trains in a minute is served, and other scenes train beside it."""
 
 import os
 import subprocess
@@ -14,21 +14,18 @@ from palpate.online.serve.process import serve
 from palpate.online.settings import Settings
 from palpate.shared.errors import PalpateError
 
-FIRST = "quick"
-"""The scene that is there at once."""
-
 NICE = 19
 """How far the trainings beside it stand back for the service."""
 
 
-def demo(settings: Settings, beside: Sequence[str], browser: bool) -> None:
-    """Train the first scene if needed and serve it until a signal says to end; open its page.
+def demo(settings: Settings, first: str, beside: Sequence[str], browser: bool) -> None:
+    """Train the ``first`` scene if needed and serve it until a signal says to end; open its page.
 
     Scenes ``beside`` it are trained meanwhile and served when they are there.  Raises
     `PalpateError` if the first one cannot be trained; it has said why.
     """
-    if subprocess.run(_training(FIRST, settings.artifacts)).returncode:
-        raise PalpateError(f"scene {FIRST!r} cannot be trained")
+    if subprocess.run(_training(first, settings.artifacts)).returncode:
+        raise PalpateError(f"scene {first!r} cannot be trained")
     trainings = [_train(scene, settings.artifacts) for scene in beside]
 
     def stop() -> None:

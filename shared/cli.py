@@ -16,11 +16,11 @@ from palpate.shared.files import printable
 
 EXAMPLE = """\b
 Example, from a scene to an answer:
-  palpate scene quick                                   every key of the scene, explained
+  palpate scene pad                                     every key of the scene, explained
   palpate new own.toml                                  a first scene of your own
-  palpate train quick                                   writes artifacts/quick.h5
-  palpate info quick
-  palpate solve quick --at 5 5 8 --pressure 1.5
+  palpate train pad                                     writes artifacts/pad.h5
+  palpate info pad
+  palpate solve pad --at 6 6 8 --pressure 1.5
   palpate serve --artifacts artifacts
 """
 

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.service
 
 def test_a_slab_is_served_and_what_trains_beside_it_is_told_and_ends_with_it(artifact, tmp_path):
     shutil.copy(artifact, tmp_path / "quick.h5")
-    command = [*PALPATE, "demo", "--artifacts", tmp_path, "--port", "0", "--no-browser"]
+    command = [*PALPATE, "demo", "quick", "--artifacts", tmp_path, "--port", "0", "--no-browser"]
     demo = subprocess.Popen(
         [*command, "--beside", "quick-visco"], stdout=subprocess.PIPE, text=True, stderr=-3
     )

@@ -27,7 +27,7 @@ def test_help_lists_every_command_and_an_example(run):
     assert result.exit_code == 0
     for command in COMMANDS:
         assert f"\n  {command} " in result.output
-    assert "palpate solve quick --at" in result.output
+    assert "palpate solve pad --at" in result.output
 
 
 @pytest.mark.parametrize(
