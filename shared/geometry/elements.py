@@ -278,21 +278,13 @@ class Triangle(Simplex, Face):
     def cells(self, *counts: int) -> tuple[Array, Numbers]:
         """See ``Face``: from one edge to the next, upright and upside down."""
         (n,) = counts
-        i, j = (k.ravel() for k in np.indices((n + 1, n + 1)))
-        inside = i + j <= n
-        number = np.cumsum(inside) - 1
-        number = number.reshape(n + 1, n + 1)
-        i, j = i[inside], j[inside]
-        up, down = i + j < n, i + j < n - 1
-        one, two = (i[up], j[up]), (i[down], j[down])
-        upright = number[one], number[one[0] + 1, one[1]], number[one[0], one[1] + 1]
-        others = (
-            number[two[0] + 1, two[1]],
-            number[two[0] + 1, two[1] + 1],
-            number[two[0], two[1] + 1],
-        )
-        corners = np.concatenate([np.stack(upright, axis=1), np.stack(others, axis=1)])
-        return np.column_stack([i, j]) / n, corners.astype(np.int32)
+        i, j = np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]).T
+        number = np.full((n + 2, n + 2), -1, np.int32)
+        number[i, j] = np.arange(len(i))
+        upright = number[i, j], number[i + 1, j], number[i, j + 1]
+        others = number[i + 1, j], number[i + 1, j + 1], number[i, j + 1]
+        corners = np.hstack([upright, others]).T
+        return np.column_stack([i, j]) / n, corners[(corners >= 0).all(axis=1)]
 
     def spread(self, *counts: int) -> tuple[Array, Array]:
         """See ``Face``: three in each cell, of which there are half as many along an axis."""

@@ -18,7 +18,7 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_matrix, diags
 
 from palpate.shared.arrays import Array, Flags, Ints, Numbers
 from palpate.shared.geometry.elements import (
@@ -33,6 +33,9 @@ from palpate.shared.geometry.elements import (
 
 ELEMENTS, CORNERS = 24, 20
 """Elements round a corner, and corners round a midside, to which a quadratic is fitted."""
+
+RINGS = 2
+"""How often their neighbours are taken in, too, where those that meet there are too few."""
 
 NEARER = 4
 """Power of nearness with which a corner counts for a midside."""
@@ -205,17 +208,14 @@ def _nearest(
 ) -> tuple[Ints, Flags]:
     """Which of things ``there`` (e, 3) are near those ``here`` (k, 3), (k, most), as far as known.
 
-    First those that meet (k, e), then those beside these (e, e), and so on; the nearest of each.
+    First those that meet (k, e), then, where these are too few, those beside them (e, e), and once
+    more; the nearest of each.
     """
     most = min(most, len(there))
-    reached, rings = meeting, meeting.copy()
-    rings.data[:] = 1.0
-    while np.diff(reached.indptr).min() < most:
-        grown = (reached @ beside).tocsr()
-        if grown.nnz == reached.nnz:
-            break
-        reached = grown
-        reached.data[:] = 1.0
+    reached, rings = 1.0 * (meeting > 0), 1.0 * (meeting > 0)
+    for _ in range(RINGS):
+        few = diags((np.diff(reached.indptr) < most).astype(float))
+        reached = 1.0 * ((reached + few @ reached @ beside).tocsr() > 0)
         rings = rings + reached
     rings = rings.tocsr()
     rows = np.repeat(np.arange(len(here)), np.diff(rings.indptr))
