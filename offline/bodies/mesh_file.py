@@ -56,9 +56,9 @@ class Sets(NamedTuple):
 def read_mesh(path: Path, unit: Unit) -> tuple[Array, Numbers, Sets]:
     """Nodes (n, 3) mm, elements (e, 10) and sets of a file; raise `SceneError` if it is no body."""
     mesh = _read(path)
-    points = np.array(mesh.points, float).reshape(len(mesh.points), -1)
-    if points.shape[1] != 3:
-        raise SceneError(f"{path}: its points have {points.shape[1]} coordinates; save three")
+    points = np.array(mesh.points, float)
+    if points.ndim != 2 or points.shape[1] != 3 or not len(points):
+        raise SceneError(f"{path}: has no points in three dimensions; save a mesh of a solid body")
     points = points * MILLIMETRES[unit]
     refuse_size(path, points, unit)
     corners, cells, middles = _tetrahedra(path, mesh, points)
@@ -92,16 +92,16 @@ def _tetrahedra(
     for block in mesh.cells:
         data, kind = np.asarray(block.data), block.type
         if kind in SOLID and len(data):
-            if data.min() < 0 or data.max() >= len(points):
-                raise SceneError(f"{path}: has cells of points that are not there; save it anew")
             faces, edges = SOLID[kind]
             own = 1 + max(max(face) for face in faces)
+            if data.shape[1] < own or data.min() < 0 or data.max() >= len(points):
+                raise SceneError(f"{path}: has cells of points that are not there; save it anew")
             tetrahedra, of = _split(data[:, :own], faces)
             if np.median(volumes(points[tetrahedra])) < 0:
                 tetrahedra = tetrahedra[:, [0, 2, 1, 3]]
             corners.append(tetrahedra)
             cells.append(first + of)
-            if data.shape[1] > own:
+            if data.shape[1] >= own + len(edges) > own:
                 ends = np.sort(data[:, np.array(edges)], axis=2).reshape(-1, 2).tolist()
                 own_middles = data[:, own : own + len(edges)].ravel().tolist()
                 middles |= dict(zip(map(tuple, ends), own_middles, strict=True))

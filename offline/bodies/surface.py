@@ -19,6 +19,8 @@ CRUMB, HOLE, CROSSED = 0.01, 0.2, 0.01
 closed, in diagonals of the body's box; most pairs of triangles that may cross each other, over the
 triangles: the mesh must then follow the surface all the same."""
 
+COINCIDE = 6  # decimals of mm in which points that coincide agree
+
 BRANCHES = (
     "{path}: the surface branches: edges belong to more than two triangles, or it has one side "
     "only; repair it (MeshLab: Repair Non Manifold Edges) and save it anew"
@@ -45,13 +47,14 @@ def read_surface(path: Path, unit: Unit) -> Any:
             f"{path}: cannot be read as {path.suffix[1:].upper()} ({_first_line(error)}); "
             "save it anew, as binary STL for example"
         ) from error
-    if not len(triangles):
+    if not len(triangles) or points.shape[1:] != (3,) or triangles.shape[1:] != (3,):
         raise SceneError(f"{path}: has no triangles, or is cut short; save the body's surface anew")
     if triangles.min() < 0 or triangles.max() >= len(points):
         raise SceneError(f"{path}: has triangles of points that are not there; save it anew")
-    points *= MILLIMETRES[unit]
-    refuse_size(path, points[np.unique(triangles)], unit)
-    return mesh_of(points, triangles)
+    used, compact = np.unique(triangles, return_inverse=True)
+    points = MILLIMETRES[unit] * points[used]
+    refuse_size(path, points, unit)
+    return mesh_of(points, compact.reshape(-1, 3))
 
 
 def mesh_of(points: Array, triangles: Ints | Numbers) -> Any:
@@ -70,14 +73,14 @@ def repaired(path: Path, mesh: Any) -> Repaired:
     small holes closed, and all triangles turned outward.
     """
     trimesh = require("trimesh")
-    done, before = {}, len(mesh.vertices)
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    done["points_joined"] = before - len(mesh.vertices)
-    count = len(mesh.faces)
-    mesh.update_faces(mesh.nondegenerate_faces(height=None) & mesh.unique_faces())
-    if not len(mesh.faces):
+    points, triangles = _joined(mesh)
+    done = {
+        "points_joined": len(mesh.vertices) - len(points),
+        "triangles_left_out": len(mesh.faces) - len(triangles),
+    }
+    if not len(triangles):
         raise SceneError(f"{path}: all triangles are without area; save the body's surface anew")
-    done["triangles_left_out"] = count - len(mesh.faces)
+    mesh = mesh_of(points, triangles)
     if (np.unique(mesh.edges_sorted, axis=0, return_counts=True)[1] > 2).any():
         raise SceneError(BRANCHES.format(path=path))
     mesh, done["crumbs_left_out"] = _largest_part(path, mesh)
@@ -90,11 +93,11 @@ def repaired(path: Path, mesh: Any) -> Repaired:
     if mesh.volume < 0:
         mesh.invert()
         done["turned"] = 1
-    points, triangles = np.array(mesh.vertices), np.array(mesh.faces, np.int32)
-    crossings, place = _crossings(points, triangles)
-    if crossings > CROSSED * len(triangles):
+    found = np.array(mesh.vertices), np.array(mesh.faces, np.int32)
+    crossings, place = _crossings(*found)
+    if crossings > CROSSED * len(mesh.faces):
         raise SceneError(f"{path}: {in_words(crossings, place)}")
-    return Repaired(points, triangles, done, crossings, place)
+    return Repaired(*found, done, crossings, place)
 
 
 def in_words(crossings: int, place: Array) -> str:
@@ -104,6 +107,19 @@ def in_words(crossings: int, place: Array) -> str:
         f"{crossings} pairs of triangles cross each other, one near ({x:.1f}, {y:.1f}, {z:.1f}) "
         "mm: repair it (MeshLab: Select Self Intersecting Faces; Blender: Boolean union)"
     )
+
+
+def _joined(mesh: Any) -> tuple[Array, Ints]:
+    """Points and triangles with points that coincide made one, but triangles that are then none."""
+    points, triangles = np.array(mesh.vertices), np.array(mesh.faces)
+    _, first, number = np.unique(
+        points.round(COINCIDE), axis=0, return_index=True, return_inverse=True
+    )
+    triangles = number.ravel()[triangles]
+    ordered = np.sort(triangles, axis=1)
+    distinct = np.zeros(len(triangles), dtype=bool)
+    distinct[np.unique(ordered, axis=0, return_index=True)[1]] = True
+    return points[first], triangles[distinct & (np.diff(ordered, axis=1) > 0).all(axis=1)]
 
 
 def _largest_part(path: Path, mesh: Any) -> tuple[Any, int]:

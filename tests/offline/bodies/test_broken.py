@@ -8,8 +8,9 @@ import sys
 import numpy as np
 import pytest
 
-from palpate.offline.bodies import files
+from palpate.offline.bodies import files, labels, mesh_file, surface
 from palpate.offline.fem.mesh import build_mesh
+from palpate.shared.anatomy import LabelBody
 from palpate.shared.scene import SceneError
 
 from .conftest import ball, bricks, scene_of
@@ -288,3 +289,53 @@ def test_a_missing_library_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "trimesh", None)
     with pytest.raises(PalpateError, match=r"need trimesh: pip install 'palpate\[anatomy\]'"):
         build_mesh(scene_of(tmp_path, SURFACE.replace("{file}", "b.stl")))
+
+
+def written(folder):
+    """A sound file of each kind."""
+    points, cells = bricks()
+    for name, how in {"a.vtu": {}, "b.vtk": {}, "c.msh": {"file_format": "gmsh"}}.items():
+        meshio.Mesh(points, [("hexahedron", cells)]).write(folder / name, **how)
+    for name in ("d.stl", "e.obj", "f.ply"):
+        ball().export(folder / name)
+    image(name="g.nii")(folder)
+    image(name="h.nii.gz")(folder)
+    space = {"space": "left-posterior-superior", "space directions": np.eye(3)}
+    nrrd.write(str(folder / "i.nrrd"), np.pad(np.ones((4, 4, 4), np.uint8), 2), space)
+    return sorted(folder.iterdir())
+
+
+def read(path):
+    """Read a file as far as it is meshed."""
+    if path.suffix in mesh_file.KINDS:
+        mesh_file.read_mesh(path, "mm")
+    elif path.suffix in surface.KINDS:
+        surface.repaired(path, surface.read_surface(path, "mm"))
+    else:
+        body = LabelBody(kind="labels", file=path.name, labels=(1,), deviation=0.5, edge=4.0)
+        points, triangles, _ = labels.surface_round(path, labels.read_image(path), body)
+        surface.repaired(path, surface.mesh_of(points, triangles))
+
+
+@pytest.mark.filterwarnings("ignore")  # of the libraries that read
+def test_damaged_files_are_refused_or_read_and_never_end_otherwise(tmp_path):
+    rng = np.random.default_rng(0)
+    for path in written(tmp_path):
+        read(path)
+        sound, said = path.read_bytes(), list[str]()
+        for _ in range(20):
+            content = bytearray(sound)
+            start, length = rng.integers(len(content)), rng.integers(1, 60)
+            if rng.random() < 0.4:
+                del content[start : start + length]
+            elif rng.random() < 0.5:
+                del content[start:]
+            for at in rng.integers(min(len(content), 900) or 1, size=min(len(content), 3)):
+                content[at] = rng.integers(256)
+            path.write_bytes(content)
+            try:
+                read(path)
+            except SceneError as error:
+                said.append(str(error))
+        assert said
+        assert all(path.name in text and "\n" not in text for text in said)

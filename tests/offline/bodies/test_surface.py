@@ -10,6 +10,7 @@ from palpate.offline.bodies.tetrahedra import boundary, quality
 from palpate.offline.fem.mesh import build_mesh
 from palpate.offline.run.workers import content_key
 from palpate.offline.scenes import FOLDER, find_scene
+from palpate.offline.scenes.liver import LEVEL, level
 from palpate.shared.scene import SceneError
 
 from .conftest import ball, scene_of
@@ -131,6 +132,14 @@ def test_the_turbinate_comes_with_its_mesh_which_no_extra_is_needed_for():
     held, touched = mesh.nodes[mesh.clamped], mesh.nodes[mesh.faces[mesh.accessible]]
     assert held[:, 0].mean() < 7 < 12 < touched[..., 0].mean()  # lateral and medial
     assert held[:, 2].mean() > 14 > touched[..., 2].mean()  # above and below
+
+
+def test_the_liver_is_what_its_generator_draws():
+    points = surface.read_surface(FOLDER / "liver.stl", "mm").vertices
+    np.testing.assert_allclose(level(points), LEVEL, atol=0.01)
+    assert np.ptp(points, axis=0).max() == pytest.approx(146, abs=1)
+    mesh = build_mesh(find_scene("liver"))
+    assert mesh.nodes[mesh.clamped][:, 1].mean() < mesh.nodes[mesh.faces[mesh.accessible], 1].mean()
 
 
 def test_results_depend_on_the_mesh_and_on_surfaces_that_places_name(scene):
