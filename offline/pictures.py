@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.offline.solve import CELL_TYPES, cautions
+from palpate.offline.solve import cautions
 from palpate.shared.answer import Answer
 from palpate.shared.arrays import Array
 from palpate.shared.errors import PalpateError
+from palpate.shared.geometry.elements import kind_of
 from palpate.shared.model import ReducedModel
 
 Fields = Mapping[str, NDArray[np.floating[Any]]]
@@ -45,7 +46,7 @@ def require_pyvista() -> Any:
 def body(nodes: Array, elements: NDArray[np.integer[Any]], at: Array, fields: Fields) -> Any:
     """A body's grid and its surface, with nodal fields and the distance ``from_contact``."""
     pv = require_pyvista()
-    grid = pv.UnstructuredGrid({CELL_TYPES[elements.shape[1]]: elements}, nodes)
+    grid = pv.UnstructuredGrid({kind_of(elements).vtk: elements}, nodes)
     for name, values in fields.items():
         grid[name] = values
     surface = grid.extract_surface(algorithm="dataset_surface", nonlinear_subdivision=SUBDIVISIONS)

@@ -23,9 +23,9 @@ from palpate.offline.info import percent
 from palpate.shared.answer import Answer, describe, peak
 from palpate.shared.arrays import Array
 from palpate.shared.errors import QueryError
+from palpate.shared.geometry.elements import kind_of
 from palpate.shared.model import ReducedModel
 
-CELL_TYPES = {8: 12, 20: 25}  # VTK_HEXAHEDRON and VTK_QUADRATIC_HEXAHEDRON, by nodes per element
 TYPE_NAMES = {"f": "Float64", "i": "Int64", "u": "UInt8"}
 
 
@@ -168,7 +168,7 @@ def write_vtu(
     elements: NDArray[np.integer[Any]],
     point_data: Mapping[str, NDArray[Any]],
 ) -> None:
-    """Write a mesh of hexahedra (e, 8) or (e, 20) and fields (n,) or (n, k) on its nodes (n, 3).
+    """Write a mesh of elements (e, k) and fields (n,) or (n, k) on its nodes (n, 3).
 
     Floats are written with 8 bytes, truth values as 0 and 1.
     """
@@ -183,7 +183,7 @@ def write_vtu(
     cells = ET.SubElement(piece, "Cells")
     _add(cells, "connectivity", elements.ravel())
     _add(cells, "offsets", size * np.arange(1, count + 1))
-    _add(cells, "types", np.full(count, CELL_TYPES[size], np.uint8))
+    _add(cells, "types", np.full(count, kind_of(elements).vtk, np.uint8))
     fields = ET.SubElement(piece, "PointData")
     for name, values in point_data.items():
         _add(fields, name, values)

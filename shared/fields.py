@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 
 from palpate.shared.answer import Answer
 from palpate.shared.arrays import Array, Field, Ints, Numbers
+from palpate.shared.geometry.elements import kind_of
 from palpate.shared.local_models import Body, LocalModels
+from palpate.shared.mechanics.tensors import SYMMETRIC
 from palpate.shared.reduced.points import expand
 from palpate.shared.reduced.transfer import Transfer
 from palpate.shared.stress_field import StressField
@@ -125,11 +127,11 @@ class FieldRecovery:
         return answer.stiffness * found[0], answer.stiffness * found[1]
 
     def _remembered(self, answer: Answer) -> Array | None:
-        """``B`` of ``mechanics.viscosity`` (e, 6, 8) at the points of all elements, of a past."""
+        """``B`` of ``mechanics.viscosity`` (e, 6, q) at the points of all elements, of a past."""
         if answer.past is None:
             return None
         transfer = self._transfer()
-        B = np.zeros((len(self._body.elements), 6, 8))
+        B = np.zeros((len(self._body.elements), SYMMETRIC, kind_of(self._body.elements).points))
         for k, share, knot in transfer.knots(answer.active):
             u = self._field(self._by_region([(k, 1.0, knot)]))
             self._stress.remember(u, share, B)

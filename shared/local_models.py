@@ -18,10 +18,11 @@ from scipy.spatial import cKDTree
 from palpate.shared.arrays import Array, Field, Flags, Ints, Numbers
 from palpate.shared.artifact import values_of
 from palpate.shared.geometry.edges import sharp_points
+from palpate.shared.geometry.elements import kind_of
 from palpate.shared.geometry.quadrature import surface_quadrature, volume_quadrature
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, SurfaceQuadrature
-from palpate.shared.mechanics.laws import law_of
+from palpate.shared.mechanics.laws import law_at_points, law_of
 from palpate.shared.mechanics.tip import CURVED_WITHIN, Tip, tip_of
 from palpate.shared.mechanics.tissue import Law
 from palpate.shared.reduced.features import (
@@ -47,7 +48,7 @@ class Mesh:
     """A body of n nodes, e elements and f boundary faces, outward by the right-hand rule."""
 
     nodes: Annotated[Array, "nodes", "mm", "n, 3", "nodes; dof = 3 node + axis"]
-    elements: Annotated[Numbers, "elements", "1", "e, k", "nodes of hexahedra, VTK order", "< n"]
+    elements: Annotated[Numbers, "elements", "1", "e, k", "nodes of elements, VTK order", "< n"]
     faces: Annotated[Numbers, "faces", "1", "f, h", "nodes of boundary faces, VTK order", "< n"]
     clamped: Annotated[Flags, "clamped", "1", "n", "nodes held fixed"]
     accessible: Annotated[Flags, "accessible", "1", "f", "faces an endoscope can touch"]
@@ -69,9 +70,14 @@ class Body(Mesh):
         )
 
     @cached_property
+    def point_law(self) -> Law:
+        """Parameters (e, q) of the law at the quadrature points."""
+        return law_at_points(self.law, kind_of(self.elements).integration[2])
+
+    @cached_property
     def gradients(self) -> Array:
-        """Gradients of the shape functions (e, 8, n, 3) at the quadrature points, 1/mm."""
-        return volume_quadrature(self.nodes, self.elements, 2)[0]
+        """Gradients of the shape functions (e, q, n, 3) at the quadrature points, 1/mm."""
+        return volume_quadrature(self.nodes, self.elements)[0]
 
     def beyond_clamped_layer(self, points: Array) -> Flags:
         """Which of points (k, 3) are farther from the support than ``CLAMPED_LAYER``, (k,).

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.shared.arrays import Array, Flags
-from palpate.shared.geometry.elements import gauss, hexahedron, shape
+from palpate.shared.geometry.elements import POINTS, kind_of
 from palpate.shared.geometry.quadrature import stress_recovery, volume_quadrature
 from palpate.shared.local_models import Body
 from palpate.shared.mechanics.stress import NearField, nodal_von_mises, point_von_mises, remember
@@ -21,7 +21,7 @@ Displacement = NDArray[np.floating]
 class StressField:
     """Recovers stress from displacements (n, 3) mm; not to be shared between threads.
 
-    ``B`` (e, 6, 8) is the past at the points of all elements, see ``mechanics.viscosity``; a
+    ``B`` (e, 6, q) is the past at the points of all elements, see ``mechanics.viscosity``; a
     contact is what presses, and has a near field; that of a tip is in ``u`` by ``add_dent``.
     """
 
@@ -68,10 +68,11 @@ class StressField:
 
     @cached_property
     def _points(self) -> tuple[Array, Array, Flags]:
-        """Integration points (8 e, 3) mm, volumes (k,) mm^3 of those that count, and which do."""
+        """Integration points (q e, 3) mm, volumes (k,) mm^3 of those that count, and which do."""
         body = self._body
-        N, _ = shape(hexahedron(body.elements.shape[1]), gauss(2, 3)[0])
+        kind = kind_of(body.elements)
+        N, _ = kind.shape(kind.rule(POINTS)[0])
         points = np.ascontiguousarray((N @ body.nodes[body.elements]).reshape(-1, 3))
         counts = body.beyond_clamped_layer(points)
-        _, volumes = volume_quadrature(body.nodes, body.elements, 2)
+        _, volumes = volume_quadrature(body.nodes, body.elements, POINTS)
         return points, volumes.reshape(-1)[counts], counts

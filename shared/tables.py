@@ -80,14 +80,13 @@ def _compact(numbers: Numbers) -> tuple[Numbers, Numbers]:
 def _no_points(body: Body, models: LocalModels) -> Points:
     """Room for the points of all models: of their tissue, but without gradients and weights."""
     counts, modes = np.diff(models.point_from), models.modes.shape[2]
-    elements = np.zeros((len(counts), -(-int(counts.max()) // LANES) * LANES), int)
-    filled = np.arange(elements.shape[1]) < counts[:, None]
-    elements[filled] = models.points // body.gradients.shape[1]
+    points = np.zeros((len(counts), -(-int(counts.max()) // LANES) * LANES), int)
+    points[np.arange(points.shape[1]) < counts[:, None]] = models.points
     return Points(
-        np.zeros((len(counts), modes, 9 * elements.shape[1]), np.int16),
+        np.zeros((len(counts), modes, 9 * points.shape[1]), np.int16),
         np.ones((len(counts), modes), np.float32),
-        np.zeros(elements.shape),
-        body.law.at(elements),
+        np.zeros(points.shape),
+        body.point_law.at(np.divmod(points, body.gradients.shape[1])),
     )
 
 

@@ -50,18 +50,18 @@ def _add_point_force(conn, grad, w, P, r):
 def elastic_residual(conn, grad, weight, law, u, r):
     """Add the internal force of ``u`` to ``r``; return (energy, smallest J).
 
-    conn (e, n) int32; grad (e, q, n, 3) 1/mm; weight (e, q) mm^3; law (e,);
+    conn (e, n) int32; grad (e, q, n, 3) 1/mm; weight (e, q) mm^3; law (e, q);
     u, r (3 nodes,) mm and mN.
     """
     energy, smallest = 0.0, np.inf
     for e in range(len(conn)):
         for q in range(weight.shape[1]):
             F = _deformation_gradient(conn[e], grad[e, q], u)
-            J, part, P = law.at(e).first_piola(F)
+            J, part, P = law.at((e, q)).first_piola(F)
             smallest = min(smallest, J)
             if not J > 0.0:
                 return tissue.INVERTED, smallest
-            energy += weight[e, q] * law.at(e).energy(J, part)
+            energy += weight[e, q] * law.at((e, q)).energy(J, part)
             _add_point_force(conn[e], grad[e, q], weight[e, q], P, r)
     return energy, smallest
 
@@ -78,8 +78,8 @@ def paired_residuals(conn, grad, weight, law, u, combined, sign, r):
     H, F, P = np.empty((9, m)), np.empty((9, 2 * k)), np.empty((9, k))
     tensors, pairs = F.reshape(-1), P.reshape(-1)
     for e in range(len(conn)):
-        point = law.at(e)
         for q in range(weight.shape[1]):
+            point = law.at((e, q))
             H[:] = 0.0
             for a in range(conn.shape[1]):
                 x, y, z = grad[e, q, a, 0], grad[e, q, a, 1], grad[e, q, a, 2]
@@ -162,7 +162,7 @@ def elastic_tangent(conn, grad, weight, law, u, slots, data):
         K[:] = 0.0
         for q in range(weight.shape[1]):
             F = _deformation_gradient(conn[e], grad[e, q], u)
-            laws.tangent(law.at(e), F, A)
+            laws.tangent(law.at((e, q)), F, A)
             _add_point_tangent(grad[e, q], A, weight[e, q], G, C, K)
         _scatter(K, slots[e], data)
 
@@ -187,7 +187,7 @@ def viscous_residual(conn, grad, weight, mu, B, u, r):
         for q in range(weight.shape[1]):
             F = _deformation_gradient(conn[e], grad[e, q], u)
             J = det(F, cofactor(F))
-            modulus = mu[e] * isochoric(J)
+            modulus = mu[e, q] * isochoric(J)
             past = unpacked(load_packed(B[e, q], 0, 1))
             contraction, P = viscosity.overstress(F, past, J, modulus)
             energy += weight[e, q] * 0.5 * modulus * contraction
@@ -205,6 +205,6 @@ def viscous_tangent(conn, grad, weight, mu, B, u, slots, data):
         for q in range(weight.shape[1]):
             F = _deformation_gradient(conn[e], grad[e, q], u)
             A[:] = 0.0
-            viscosity.add_tangent(F, unpacked(load_packed(B[e, q], 0, 1)), mu[e], A)
+            viscosity.add_tangent(F, unpacked(load_packed(B[e, q], 0, 1)), mu[e, q], A)
             _add_point_tangent(grad[e, q], A, weight[e, q], G, C, K)
         _scatter(K, slots[e], data)

@@ -12,7 +12,7 @@ from palpate.offline.fem.mesh import Ticks, build_mesh, cells_of
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.shapes import shape_of
 from palpate.shared.arrays import Array, Ints, Numbers
-from palpate.shared.geometry.elements import hexahedron, shape
+from palpate.shared.geometry.elements import kind_of
 from palpate.shared.scene import Extrusion, Scene
 
 STEPS = 400
@@ -69,7 +69,7 @@ def interpolated(grid: Ticks, elements: Numbers, parameters: Array, field: Array
     share = (along[:, None] + 1.0) / 2.0
     k, through = _cell((1.0 - share) * rows[i] + share * rows[i + 1], v)
     nodes = elements[np.ravel_multi_index((i, j, k), cells_of(grid))]
-    N, _ = shape(hexahedron(elements.shape[1]), np.column_stack([along, across, through]))
+    N, _ = kind_of(elements).shape(np.column_stack([along, across, through]))
     return np.einsum("ka,ka...->k...", N, field[nodes])
 
 

@@ -15,25 +15,13 @@ from palpate.offline.bodies.report import thickness
 from palpate.offline.fem.shapes import shape_of
 from palpate.shared.anatomy import FileBody
 from palpate.shared.arrays import Array, Ints, Numbers
-from palpate.shared.geometry.elements import (
-    HEX20_NODES,
-    HEX_CORNERS,
-    HEX_EDGES,
-    gauss,
-    hexahedron,
-    quadrilateral,
-    shape,
-)
+from palpate.shared.geometry.elements import HEX8, HEX20, Face, Kind, face_kind_of, kind_of
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.local_models import Mesh
 from palpate.shared.scene import Block, Extrusion, Scene, SceneError, divisions_of
 
 T = TypeVar("T")
 Cells = tuple[int, int, int]
-
-# Corners of an element's faces, outward by the right-hand rule: low and high end of each axis,
-# the order in which a geometry names its sides.
-HEX_FACES = ((0, 4, 7, 3), (1, 2, 6, 5), (0, 1, 5, 4), (3, 7, 6, 2), (0, 3, 2, 1), (4, 5, 6, 7))
 
 Ticks = tuple[Array, Array, Array]
 """Parameters, rising from 0 to 1, of the corners of elements along each axis of a shape: (a + 1,),
@@ -46,9 +34,9 @@ and last layer over the whole, and how far along the section its layers go over 
 SLIGHTLY = 1e-5
 """Step in parameters, over that of a face, by which its tangents are found."""
 
-SAG, SQUARES, STRAIGHT = 0.002, (4, 16), 2
-"""Millimetres between a curved face and its triangles, and least and most squares along an edge: as
-many as that takes.  Faces of straight edges have as many squares as the last."""
+SAG, STRAIGHT, LEAST, MOST = 0.002, 2, {4: 4, 3: 2}, 16
+"""Millimetres between a curved face and its cells, and how many lie along an edge: that many where
+edges have no middles, else at least so many on faces of so many corners, and at most so many."""
 
 
 def build_mesh(scene: Scene, ticks: Ticks | None = None, bare: bool = False) -> Mesh:
@@ -69,7 +57,7 @@ def build_mesh(scene: Scene, ticks: Ticks | None = None, bare: bool = False) -> 
     if ticks is None:
         ticks = ticks_of(geometry)
     a, b, c = cells = cells_of(ticks)
-    places, elements, faces, sides = _lattice(cells, _reference(geometry))
+    places, elements, faces, sides = _lattice(cells, _kind(geometry))
     grid = shape_of(scene).grid(*divided(ticks, (2 * a, 2 * b, 2 * c)))
     nodes = grid.reshape(-1, 3)[np.ravel_multi_index(places.T, grid.shape[:3])]
     _refuse_inverted(nodes, elements)
@@ -151,13 +139,13 @@ def _refuse_inverted(nodes: Array, elements: Numbers) -> None:
         )
 
 
-def _reference(geometry: Extrusion | Block) -> Array:
-    """Nodes (8 or 20, 3) of an element on [-1, 1]^3."""
-    return HEX20_NODES if geometry.element == "hex20" else HEX_CORNERS
+def _kind(geometry: Extrusion | Block) -> Kind:
+    """Kind of the elements of a geometry."""
+    return HEX20 if geometry.element == "hex20" else HEX8
 
 
-def _lattice(divisions: Cells, reference: Array) -> tuple[Ints, Numbers, Numbers, Ints]:
-    """Hexahedra of a lattice whose nodes on [-1, 1]^3 are ``reference`` (8 or 20, 3).
+def _lattice(divisions: Cells, kind: Kind) -> tuple[Ints, Numbers, Numbers, Ints]:
+    """Hexahedra of a kind in a lattice.
 
     Returns the places of the nodes (n, 3) in the grid of corners and half-way places, elements and
     faces as in ``Mesh``, and on which side each face lies (f,), as an index into the sides of a
@@ -165,7 +153,7 @@ def _lattice(divisions: Cells, reference: Array) -> tuple[Ints, Numbers, Numbers
     """
     grid = 2 * np.array(divisions) + 1
     cells = np.moveaxis(np.indices(divisions), 0, -1).reshape(-1, 3)
-    points = 2 * cells[:, None] + (reference + 1).astype(int)
+    points = 2 * cells[:, None] + (kind.nodes + 1).astype(int)
     used, numbers = np.unique(
         np.ravel_multi_index(np.moveaxis(points, -1, 0), grid), return_inverse=True
     )
@@ -173,28 +161,19 @@ def _lattice(divisions: Cells, reference: Array) -> tuple[Ints, Numbers, Numbers
     places = np.column_stack(np.unravel_index(used, grid))
 
     faces, sides = [], []
-    for side, corners in enumerate(HEX_FACES):
+    for side, corners in enumerate(kind.faces):
         axis, high = divmod(side, 2)
         boundary = cells[:, axis] == (divisions[axis] - 1 if high else 0)
-        faces.append(elements[boundary][:, _face_nodes(corners, len(reference))])
+        faces.append(elements[boundary][:, kind.on_face(corners)])
         sides.append(np.full(boundary.sum(), side))
     return places, elements, np.concatenate(faces), np.concatenate(sides)
-
-
-def _face_nodes(corners: tuple[int, ...], nodes_per_element: int) -> list[int]:
-    """Element-local nodes of the face with these corners."""
-    if nodes_per_element == 8:
-        return list(corners)
-    edges = [{corners[i], corners[(i + 1) % 4]} for i in range(4)]
-    lookup = [set(edge) for edge in HEX_EDGES]
-    return [*corners, *(8 + lookup.index(edge) for edge in edges)]
 
 
 def parameters_of(scene: Scene, ticks: Ticks) -> Array:
     """Parameters (n, 3) of the nodes of a scene's mesh of these ticks."""
     a, b, c = cells = cells_of(ticks)
     first, second, third = divided(ticks, (2 * a, 2 * b, 2 * c))
-    i, j, k = _lattice(cells, _reference(scene.lattice))[0].T
+    i, j, k = _lattice(cells, _kind(scene.lattice))[0].T
     through = third[k] if third.ndim == 1 else third[i, k]
     return np.column_stack([first[i], second[j], through])
 
@@ -206,17 +185,19 @@ def mesh_quality(mesh: Mesh) -> dict[str, float]:
     -------
     dict
         ``scaled_jacobian_min`` and ``scaled_jacobian_median``: per element the smallest det J over
-        the product of edge lengths, at the corners of the straight-edged hexahedron (Verdict);
-        ``jacobian_ratio_min``: per element the smallest det J over the mean one, at the nodes and
-        5³ Gauss points of the true, curved element; ``aspect_ratio_max``: longest over shortest
+        the product of edge lengths, at the corners of the straight-edged element, 1 at best
+        (Verdict); ``jacobian_ratio_min``: per element the smallest det J over the mean one, at the
+        nodes and 5³ points of the true, curved element; ``aspect_ratio_max``: longest over shortest
         edge; ``volume_mm3``.
     """
-    corners = mesh.nodes[mesh.elements[:, :8]]
-    _, slopes = shape(HEX_CORNERS, HEX_CORNERS)
-    edges = np.einsum("eni,qnj->eqij", corners, slopes)
-    scaled = np.linalg.det(edges) / np.linalg.norm(edges, axis=2).prod(axis=2)
-    ends = np.array(HEX_EDGES)
-    lengths = np.linalg.norm(corners[:, ends[:, 0]] - corners[:, ends[:, 1]], axis=2)
+    kind = kind_of(mesh.elements).straight
+    corners = mesh.nodes[mesh.elements[:, : kind.corners]]
+    jacobian = _determinants_at(kind, corners, kind.nodes)
+    at_corners, lengths = (
+        np.linalg.norm(corners[:, ends[..., 0]] - corners[:, ends[..., 1]], axis=-1)
+        for ends in (kind.edges_at, np.array(kind.edges))
+    )
+    scaled = jacobian / at_corners.prod(axis=2) / kind.best
     everywhere = determinants(mesh.nodes, mesh.elements)
     jacobian, weights = jacobians(mesh, points=3)
     return {
@@ -229,24 +210,25 @@ def mesh_quality(mesh: Mesh) -> dict[str, float]:
 
 
 def jacobians(mesh: Mesh, points: int) -> tuple[Array, Array]:
-    """Jacobian determinants at Gauss points, shape (e, points³) mm³, and weights (points³,)."""
-    at, weights = gauss(points, 3)
-    return _determinants_at(mesh.nodes, mesh.elements, at), weights
+    """Jacobian determinants (e, q) mm³ at points of elements, see ``Kind.rule``; weights (q,)."""
+    kind = kind_of(mesh.elements)
+    at, weights = kind.rule(points)
+    return _determinants_at(kind, mesh.nodes[mesh.elements], at), weights
 
 
 def determinants(nodes: Array, elements: Numbers) -> Array:
-    """Jacobian determinants (e, n + 125) mm³ at the n nodes of elements and at 5³ Gauss points.
+    """Jacobian determinants (e, n + 125) mm³ at the n nodes of elements and at 5³ points.
 
     Where these are positive, an element may be trusted to be nowhere inverted.
     """
-    at, _ = gauss(5, 3)
-    return _determinants_at(nodes, elements, np.vstack([hexahedron(elements.shape[1]), at]))
+    kind = kind_of(elements)
+    return _determinants_at(kind, nodes[elements], np.vstack([kind.nodes, kind.rule(5)[0]]))
 
 
-def _determinants_at(nodes: Array, elements: Numbers, at: Array) -> Array:
-    """Jacobian determinants (e, q) mm³ at reference coordinates (q, 3)."""
-    _, slopes = shape(hexahedron(elements.shape[1]), at)
-    determinants: Array = np.linalg.det(np.einsum("eni,qnj->eqij", nodes[elements], slopes))
+def _determinants_at(kind: Kind, X: Array, at: Array) -> Array:
+    """Jacobian determinants (e, q) mm³ at coordinates (q, 3) of elements with nodes (e, n, 3)."""
+    _, slopes = kind.shape(at)
+    determinants: Array = np.linalg.det(np.einsum("eni,qnj->eqij", X, slopes))
     return determinants
 
 
@@ -261,8 +243,8 @@ def local_thickness(mesh: Mesh, points: Array, normals: Array) -> Array:
 
     See ``bodies.report.thickness``.
     """
-    at, _ = gauss(4, 2)
-    N, dN = shape(quadrilateral(mesh.faces.shape[1]), at)
+    kind = face_kind_of(mesh.faces)
+    N, dN = kind.shape(kind.rule(4)[0])
     X = mesh.nodes[mesh.faces]
     opposite = np.einsum("qa,fai->fqi", N, X).reshape(-1, 3)
     tangent = np.einsum("fai,qaj->fqij", X, dN)
@@ -279,39 +261,35 @@ def accessible_surface(mesh: Mesh, scene: Scene | None = None) -> Surface:
     hangs from a lip as a push aside.
     """
     faces = mesh.faces[mesh.accessible]
-    a, b = _squares(mesh.nodes[faces])
-    grid = np.array([(x, y) for y in np.linspace(-1, 1, b + 1) for x in np.linspace(-1, 1, a + 1)])
-    N, dN = shape(quadrilateral(faces.shape[1]), grid)
+    kind = face_kind_of(faces)
+    grid, cells = kind.cells(*_counts(kind, mesh.nodes[faces]))
+    N, dN = kind.shape(grid)
     if scene is None:
         points, normals = N @ mesh.nodes[faces], N @ _nodal_normals(mesh, faces)[faces]
     else:
         points, normals = _on_body(scene, N, dN, faces)
     points, normals = points.reshape(-1, 3), normals.reshape(-1, 3)
-    corner = np.arange((a + 1) * b).reshape(b, a + 1)[:, :-1].ravel()
-    squares = corner[:, None] + np.array([0, 1, a + 2, a + 1])
-    quads = (squares[None] + len(grid) * np.arange(len(faces))[:, None, None]).reshape(-1, 4)
+    cells = cells + len(grid) * np.arange(len(faces))[:, None, None]
+    cells = cells.reshape(-1, kind.corners)
     _, first, weld = np.unique(points.round(9), axis=0, return_index=True, return_inverse=True)
-    triangles = weld[np.vstack([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])]
+    fan = [[0, i, i + 1] for i in range(1, kind.corners - 1)]
+    triangles = weld[np.vstack([cells[:, corners] for corners in fan])]
     unit = normals[first] / np.linalg.norm(normals[first], axis=1, keepdims=True)
     return Surface(points[first], triangles.astype(np.int32), unit)
 
 
-def _squares(faces: Array) -> tuple[int, int]:
-    """Squares along both axes of faces (f, 4 or 8, 3) mm, as many as their curvature asks for."""
-    if faces.shape[1] == 4:
-        return STRAIGHT, STRAIGHT
-    # edges 0-1 and 2-3 run along the first axis, 1-2 and 3-0 along the second
-    chords = (faces[:, :4] + faces[:, [1, 2, 3, 0]]) / 2
-    bent = np.linalg.norm(faces[:, 4:] - chords, axis=2).max(axis=0)
-    wanted = np.ceil(np.sqrt(np.array([max(bent[0::2]), max(bent[1::2])]) / SAG))
-    a, b = np.clip(wanted, *SQUARES).astype(int)
-    return int(a), int(b)
+def _counts(kind: Face, X: Array) -> Sequence[int]:
+    """Cells along the axes of faces with nodes X (f, n, 3) mm, as many as their curvature wants."""
+    if not kind.quadratic:
+        return [STRAIGHT] * kind.axes
+    wanted = np.ceil(np.sqrt(kind.bent(X).max(axis=0) / SAG))
+    return [int(count) for count in np.clip(wanted, LEAST[kind.corners], MOST)]
 
 
 def _nodal_normals(mesh: Mesh, faces: Numbers) -> Array:
     """Outward unit normals (nodes, 3): area-weighted mean over the given faces, 0 elsewhere."""
-    reference = quadrilateral(faces.shape[1])
-    _, dN = shape(reference, reference)
+    kind = face_kind_of(faces)
+    _, dN = kind.shape(kind.nodes)
     tangents = np.einsum("fai,qaj->fqij", mesh.nodes[faces], dN)
     normals = np.zeros_like(mesh.nodes)
     np.add.at(normals, faces, np.cross(tangents[..., 0], tangents[..., 1]))

@@ -25,11 +25,13 @@ from palpate.offline.fem.terms import (
 )
 from palpate.shared.arrays import Array, Ints, Numbers
 from palpate.shared.errors import PalpateError
+from palpate.shared.geometry.elements import POINTS, kind_of
 from palpate.shared.geometry.quadrature import volume_quadrature
 from palpate.shared.local_models import Mesh
 from palpate.shared.mechanics import newton
-from palpate.shared.mechanics.laws import AnyTissue, law_of
+from palpate.shared.mechanics.laws import AnyTissue, law_at_points, law_of
 from palpate.shared.mechanics.tensors import SYMMETRIC
+from palpate.shared.mechanics.tissue import WHOLE
 from palpate.shared.mechanics.viscosity import step_weights
 
 TOLERANCE = 1e-9
@@ -78,7 +80,7 @@ class FullModel:
     mesh: Mesh
     tissue: AnyTissue
     terms: tuple[Term, ...] = ()  # of the tissue beside its elasticity, whatever the load
-    quadrature: int = 2  # points along each side of an element
+    quadrature: int | None = None  # points along an axis of an element, see ``Kind.integration``
 
     def __post_init__(self) -> None:
         mesh = self.mesh
@@ -86,10 +88,18 @@ class FullModel:
         self.gradients, self.weights = volume_quadrature(mesh.nodes, mesh.elements, self.quadrature)
         self.connectivity = np.ascontiguousarray(mesh.elements, dtype=np.int32)
         self.law = law_of(self.tissue, len(mesh.elements))
-        self._elements = self.connectivity, self.gradients, self.weights, self.law
+        kind, count = kind_of(mesh.elements), self.weights.shape[1]
+        parts = np.full(count, WHOLE) if self.quadrature else kind.integration[2]
+        self.point_law = law_at_points(self.law, parts)
+        self._elements = self.connectivity, self.gradients, self.weights, self.point_law
         self.prony = self.tissue.prony
         self.slots, self.pattern = self._sparsity()
         self.solver = sparse_solver(self.pattern)
+
+    @cached_property
+    def volumes(self) -> Array:
+        """Volumes (e,) mm^3 of the elements."""
+        return volume_quadrature(self.mesh.nodes, self.mesh.elements, POINTS)[1].sum(axis=1)
 
     @cached_property
     def relaxed(self) -> FullModel:
@@ -276,7 +286,7 @@ class FullModel:
             tissue = [PastStress(self, before, weights)]
         if start is None and past is not None:
             start = past.displacement
-        volume = float(self.weights.sum())
+        volume = float(self.volumes.sum())
         young = self.tissue.young
         floor, noise = ROUND_OFF * young * volume ** (2 / 3), NOISE * young * volume
         target = max(tolerance * max(term.size for term in (load, *tissue)), floor)

@@ -17,6 +17,7 @@ from palpate.offline.fem.sphere import sphere_of, sphere_surface
 from palpate.offline.fem.terms import Past, TipLoad
 from palpate.shared.arrays import Array, Field, Flags, Numbers
 from palpate.shared.artifact import read_artifact, values_of
+from palpate.shared.geometry.elements import kind_of
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.local_models import Body, Mesh
 from palpate.shared.mechanics.footprint import MEANS, footprint, means
@@ -126,7 +127,7 @@ class FullProblem:
     def nodal_volumes(self) -> Array:
         """Volumes (n,) mm^3 that nodes stand for: those of the elements around, shared out."""
         elements = self.mesh.elements
-        shares = np.repeat(self.model.weights.sum(axis=1) / elements.shape[1], elements.shape[1])
+        shares = np.repeat(self.model.volumes / elements.shape[1], elements.shape[1])
         return np.bincount(elements.ravel(), shares, len(self.mesh.nodes)).astype(float)
 
     @cached_property
@@ -354,7 +355,8 @@ class FullProblem:
         u, B = np.ascontiguousarray(displacement, dtype=float), None
         if past is not None and self.model.prony:
             shares = np.array([share for share, _ in self.model.prony])
-            B = np.ascontiguousarray(np.einsum("a,aeqi->eiq", shares, past.points[:-1]))
+            known = past.points[:-1, :, : kind_of(self.mesh.elements).points]
+            B = np.ascontiguousarray(np.einsum("a,aeqi->eiq", shares, known))
         return self.stress_field.von_mises(u, B, contact)
 
     def under(self, position: Array, displacement: Array) -> Array:

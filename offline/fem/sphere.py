@@ -36,7 +36,7 @@ from scipy.spatial import cKDTree
 from palpate.shared.arrays import Array, Flags, Ints, Numbers
 from palpate.shared.compiled import room
 from palpate.shared.geometry.edges import shared_edges
-from palpate.shared.geometry.elements import quadrilateral, shape
+from palpate.shared.geometry.elements import Face, face_kind_of
 
 HARDNESS = 12000.0
 """Of the penalty, in units of Young's modulus over the tip's radius."""
@@ -49,7 +49,7 @@ SPACING = 0.05
 
 SIDE = 4
 BLOCK = SIDE * SIDE
-"""Points of a block: two vectors of double precision."""
+"""Points of a block, ``SIDE`` along an edge of it: two vectors of double precision."""
 
 SAG = 4.0
 """By which the squared distance of the tip's centre from a point of a block is at most less than
@@ -115,23 +115,24 @@ def sphere_surface(nodes: Array, faces: Numbers, accessible: Flags, radius: floa
     Parameters
     ----------
     nodes : ndarray, shape (n, 3), mm
-    faces : ndarray, shape (f, 4) or (f, 8)
+    faces : ndarray, shape (f, k)
         Of the whole boundary.
     accessible : ndarray, shape (f,), bool
     radius : float, mm
         Of the tip; sets the distance of integration points.
     """
     touched = faces[_with_smooth_neighbours(nodes, faces, accessible, radius)]
-    reference = quadrilateral(faces.shape[1])
-    at, ends, corners = _grid(nodes[touched], SPACING * radius)
-    N, dN = shape(reference, at)
+    kind = face_kind_of(faces)
+    at, ends, corners = _grid(kind, nodes[touched], SPACING * radius)
+    N, dN = kind.shape(at)
     tangents = np.einsum("fai,qaj->fijq", nodes[touched], dN)
     normals = np.cross(tangents[:, :, 0], tangents[:, :, 1], axis=1)
     areas = np.linalg.norm(normals, axis=1)
     blocks = len(touched), -1, BLOCK
-    at_ends, _ = shape(reference, ends)
+    at_ends, _ = kind.shape(ends)
     placed = np.einsum("fai,qa->fqi", nodes[touched], at_ends)[:, corners]  # (f, b, 4, 3)
-    diagonals = np.linalg.norm(placed[:, :, :2] - placed[:, :, 2:], axis=-1).max(axis=-1)
+    across = placed[:, :, :, None] - placed[:, :, None]
+    diagonals = np.linalg.norm(across, axis=-1).max(axis=(-1, -2))
     return SphereSurface(
         nodes=nodes,
         faces=np.ascontiguousarray(touched, dtype=np.int32),
@@ -139,15 +140,15 @@ def sphere_surface(nodes: Array, faces: Numbers, accessible: Flags, radius: floa
         corner_shape=np.ascontiguousarray(at_ends.T),
         corners=corners,
         reach=np.ascontiguousarray(radius**2 + SAG * (diagonals / 2) ** 2),
-        areas=(areas * 4 / len(N)).reshape(blocks),
+        areas=(areas * kind.rule(1)[1].sum() / len(N)).reshape(blocks),
         normals=np.ascontiguousarray(
             np.moveaxis((normals / areas[:, None]).reshape(len(touched), 3, -1, BLOCK), 1, 2)
         ),
     )
 
 
-def _grid(nodes: Array, spacing: float) -> tuple[Array, Array, Numbers]:
-    """Blocks of equal cells of the reference face, at most ``spacing`` mm wide on any face.
+def _grid(kind: Face, X: Array, spacing: float) -> tuple[Array, Array, Numbers]:
+    """Blocks of equal cells of a face, at most ``spacing`` mm wide on any with nodes (f, k, 3).
 
     Returns
     -------
@@ -156,18 +157,14 @@ def _grid(nodes: Array, spacing: float) -> tuple[Array, Array, Numbers]:
     ends : ndarray, shape (e, 2)
         Corners of the blocks.
     corners : ndarray, shape (b, 4)
-        Which those of a block are; the first and third, and the others, are opposite.
+        Which those of a block are; the first stands twice where there are three.
     """
-    edges = np.linalg.norm(nodes[:, [1, 2, 3, 0]] - nodes[:, :4], axis=2)
     # a block more or less must not hang on round-off
-    m, n = (max(1, int(np.ceil(edges[:, i::2].max() / (SIDE * spacing) - 1e-6))) for i in range(2))
-    cells = [(np.arange(SIDE * count) + 0.5) * 2 / (SIDE * count) - 1 for count in (m, n)]
-    centres = np.stack(np.meshgrid(*cells, indexing="ij"), axis=-1)
-    centres = centres.reshape(m, SIDE, n, SIDE, 2).transpose(0, 2, 1, 3, 4).reshape(-1, 2)
-    borders = np.meshgrid(np.linspace(-1, 1, m + 1), np.linspace(-1, 1, n + 1), indexing="ij")
-    number = np.arange((m + 1) * (n + 1), dtype=np.int32).reshape(m + 1, n + 1)
-    corners = [number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]]
-    return centres, np.stack(borders, axis=-1).reshape(-1, 2), np.stack(corners, -1).reshape(-1, 4)
+    wanted = np.ceil(kind.lengths(X).max(axis=0) / (SIDE * spacing) - 1e-6)
+    ends, corners = kind.cells(*np.maximum(wanted, 1).astype(int))
+    grid, cells = kind.cells(*[SIDE] * kind.axes)
+    own, _ = kind.straight.shape(grid[cells].mean(axis=1))
+    return (own @ ends[corners]).reshape(-1, 2), ends, corners[:, np.arange(4) % kind.corners]
 
 
 def _with_smooth_neighbours(nodes: Array, faces: Numbers, accessible: Flags, reach: float) -> Ints:
@@ -177,7 +174,9 @@ def _with_smooth_neighbours(nodes: Array, faces: Numbers, accessible: Flags, rea
     """
     edges = shared_edges(nodes, faces)
     joined = edges.faces[edges.turn < SMOOTH]
-    away, _ = cKDTree(nodes[np.unique(faces[accessible])]).query(nodes[faces[:, :4]])
+    away, _ = cKDTree(nodes[np.unique(faces[accessible])]).query(
+        nodes[faces[:, : face_kind_of(faces).corners]]
+    )
     joined = joined[(away.min(axis=1) < reach)[joined].all(axis=1)]
     graph = coo_matrix((np.ones(len(joined)), joined.T), shape=(len(faces), len(faces)))
     _, part = connected_components(graph, directed=False)
@@ -224,12 +223,13 @@ def _within_reach(tip, surface, face, x, moved, at):
 def _gaps(shape, at, gap):
     """Points of a face from the tip's centre and their squared distances, into ``gap`` (4, n).
 
-    shape (k, n); k is 4 or 8.
+    shape (k, n); four nodes are taken at once.
     """
     x, y, z, squared = gap[0], gap[1], gap[2], gap[3]
     for q in range(len(x)):
         x[q] = y[q] = z[q] = 0.0
-    for k in range(0, len(at), 4):
+    fours = len(at) // 4 * 4
+    for k in range(0, fours, 4):
         K, L, M, N = shape[k], shape[k + 1], shape[k + 2], shape[k + 3]
         a0, b0, c0, d0 = at[k, 0], at[k + 1, 0], at[k + 2, 0], at[k + 3, 0]
         a1, b1, c1, d1 = at[k, 1], at[k + 1, 1], at[k + 2, 1], at[k + 3, 1]
@@ -238,6 +238,12 @@ def _gaps(shape, at, gap):
             x[q] += K[q] * a0 + L[q] * b0 + M[q] * c0 + N[q] * d0
             y[q] += K[q] * a1 + L[q] * b1 + M[q] * c1 + N[q] * d1
             z[q] += K[q] * a2 + L[q] * b2 + M[q] * c2 + N[q] * d2
+    for k in range(fours, len(at)):
+        K, a0, a1, a2 = shape[k], at[k, 0], at[k, 1], at[k, 2]
+        for q in range(len(x)):
+            x[q] += K[q] * a0
+            y[q] += K[q] * a1
+            z[q] += K[q] * a2
     for q in range(len(x)):
         squared[q] = x[q] * x[q] + y[q] * y[q] + z[q] * z[q]
 

@@ -238,7 +238,7 @@ class PastStress:
     """What a past does to the stress at the end of a time step of given weights."""
 
     def __init__(self, model: FullModel, past: Past, weights: viscosity.Weights) -> None:
-        self._mesh = model.connectivity, model.gradients, model.weights, model.law.mu
+        self._mesh = model.connectivity, model.gradients, model.weights, model.point_law.mu
         self._slots = model.slots
         points = past.points
         self._B = np.empty(points.shape[1:])

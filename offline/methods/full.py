@@ -9,7 +9,7 @@ from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.terms import Past
 from palpate.offline.methods.method import Answer, Case, Method
 from palpate.shared.arrays import Array, Ints
-from palpate.shared.geometry.elements import hexahedron, shape
+from palpate.shared.geometry.elements import kind_of
 from palpate.shared.local_models import Mesh
 from palpate.shared.scene import ElementName
 
@@ -102,7 +102,7 @@ def _interpolation(source: Mesh, its_ticks: Ticks, target: Mesh, own: Ticks) -> 
     u, v, w = divided(own, (2 * a, 2 * b, 2 * c))
     corners = np.moveaxis(np.indices((a, b, c)), 0, -1).reshape(-1, 1, 3)
     places = np.empty((len(target.nodes), 3), int)
-    places[target.elements] = 2 * corners + (hexahedron(target.elements.shape[1]) + 1).astype(int)
+    places[target.elements] = 2 * corners + (kind_of(target.elements).nodes + 1).astype(int)
     i, j, k = places.T
     first, second, third = its_ticks
     row, along = _within(u[i], first)
@@ -112,7 +112,7 @@ def _interpolation(source: Mesh, its_ticks: Ticks, target: Mesh, own: Ticks) -> 
     column, across = _within(v[j], second)
     layer, through = _within(np.broadcast_to(w, (len(u), w.shape[-1]))[i, k], layers)
     local = np.column_stack([along, across, through])
-    N, _ = shape(hexahedron(source.elements.shape[1]), local)
+    N, _ = kind_of(source.elements).shape(local)
     N[abs(N) < SAME] = 0.0
     nodes = source.elements[np.ravel_multi_index((row, column, layer), cells_of(its_ticks))]
     rows = np.repeat(np.arange(len(N)), N.shape[1])

@@ -144,14 +144,13 @@ class Galerkin(Method):
         cubature = cubature or Cubature(np.arange(model.weights.size), model.weights.ravel())
         self.points, self._accurate = cubature.points, accurate
         super().__init__(problem, m, f"{m} modes, {len(self.points)} points")
-        element = self.points // model.weights.shape[1]
         rows, count = -(-m // 4) * 4, -(-len(self.points) // LANES) * LANES
         fill = (0, count - len(self.points))
         points = Points(
             gradients=np.zeros((rows, 9 * count), np.float32),
             steps=np.ones(rows, np.float32),
             weights=np.pad(cubature.weights, fill),
-            law=model.law.at(np.pad(element, fill)),
+            law=model.point_law.at(np.divmod(np.pad(self.points, fill), model.weights.shape[1])),
         )
         past: Elastic | Remembering = Elastic()
         if in_time:

@@ -15,7 +15,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from palpate.offline.fem.model import FullModel
 from palpate.offline.reduce.ritz import energy_pod, ritz_vectors
 from palpate.shared.arrays import Array
-from palpate.shared.geometry.elements import gauss, hexahedron, shape
+from palpate.shared.geometry.elements import kind_of
 from palpate.shared.geometry.quadrature import volume_quadrature
 
 Inner = Literal["energy", "euclidean"]
@@ -24,13 +24,14 @@ EXHAUSTED = 1e-10
 """A vector adds only round-off to a space if it adds less than this share of its own energy."""
 
 MASS_POINTS = 3
-"""Gauss points per edge: with 2, the mass of a hex20 would have rank 24 instead of 60."""
+"""Points along an axis: with 2, the mass of a hex20 would have rank 24 instead of 60."""
 
 
 def mass(model: FullModel) -> csr_matrix:
     """Consistent mass (free dofs, free dofs) mm^3 of unit density."""
     elements, used = model.mesh.elements, model.slots >= 0
-    N, _ = shape(hexahedron(elements.shape[1]), gauss(MASS_POINTS, 3)[0])
+    kind = kind_of(elements)
+    N, _ = kind.shape(kind.rule(MASS_POINTS)[0])
     _, weights = volume_quadrature(model.mesh.nodes, elements, MASS_POINTS)
     blocks = np.kron(np.einsum("eq,qa,qb->eab", weights, N, N), np.eye(3))
     return model.matrix(np.bincount(model.slots[used], blocks[used]).astype(float))

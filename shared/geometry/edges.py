@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from palpate.shared.arrays import Array, Flags, Ints, Numbers
-from palpate.shared.geometry.elements import quadrilateral, shape
+from palpate.shared.geometry.elements import face_kind_of
 
 BLUNT = np.radians(15.0)
 """Angle of normals up to which faces are parts of one smooth surface."""
@@ -26,24 +26,25 @@ class Edges(NamedTuple):
 
 
 def shared_edges(nodes: Array, faces: Numbers) -> Edges:
-    """Edges of faces (f, 4 or 8) whose nodes (n, 3) are given."""
-    reference = quadrilateral(faces.shape[1])
-    _, dN = shape(reference, reference[:4])
+    """Edges of faces (f, k) whose nodes (n, 3) are given."""
+    kind = face_kind_of(faces)
+    count = kind.corners
+    _, dN = kind.shape(kind.straight.nodes)
     tangents = np.einsum("fai,qaj->fqij", nodes[faces], dN)
     normals = np.cross(tangents[..., 0], tangents[..., 1])
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)  # (f, 4, 3) at the corners
-    corners = faces[:, :4]
-    parts = [corners, np.roll(corners, -1, axis=1), *([faces[:, 4:]] if faces.shape[1] > 4 else [])]
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)  # (f, c, 3) at the corners
+    corners = faces[:, :count]
+    parts = [corners, np.roll(corners, -1, axis=1), *([faces[:, count:]] if kind.quadratic else [])]
     edges = np.stack(parts, axis=-1).reshape(-1, len(parts))
     ends = np.stack([normals, np.roll(normals, -1, axis=1)], axis=2).reshape(-1, 2, 3)
     ends[edges[:, 0] > edges[:, 1]] = ends[edges[:, 0] > edges[:, 1], ::-1]
-    _, number, count = np.unique(
+    _, number, sides = np.unique(
         np.sort(edges[:, :2], axis=1), axis=0, return_inverse=True, return_counts=True
     )
     order = np.argsort(number.ravel(), kind="stable")
-    pairs = order[count[number.ravel()[order]] == 2].reshape(-1, 2)
+    pairs = order[sides[number.ravel()[order]] == 2].reshape(-1, 2)
     cosine = np.sum(ends[pairs[:, 0]] * ends[pairs[:, 1]], axis=-1).min(axis=1)
-    return Edges(pairs // 4, edges[pairs[:, 0]], np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return Edges(pairs // count, edges[pairs[:, 0]], np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
 def sharp_points(nodes: Array, faces: Numbers, clamped: Flags) -> tuple[Array, Array]:

@@ -1,10 +1,13 @@
-"""How gradients at 2x2x2 points of hexahedra are carried to the nodes of a lattice of them.
+"""How gradients at the points of elements are carried to the nodes.
 
-Along a line through elements, a field is known at two points of each.  At a corner its value is
-that of the quadratic through the four points of the two elements nearest to it, in the
-least-squares sense: between two elements both, at the boundary the last two.  In three dimensions
-these are products, over the points of eight elements.  At midsides a cubic runs through the four
-nearest corners of the line.
+In a lattice of hexahedra, along a line through elements, a field is known at two points of each.
+At a corner its value is that of the quadratic through the four points of the two elements nearest
+to it, in the least-squares sense: between two elements both, at the boundary the last two.  In
+three dimensions these are products, over the points of eight elements.  At midsides a cubic runs
+through the four nearest corners of the line.
+
+Elsewhere a quadratic is fitted to the points of so many elements near a corner, first of those
+that meet there, and for a midside to so many corners near it, first of all the ends of its edge.
 
 So nodal values are right to third order of the size of elements, where values carried linearly in
 each element are right to second, at the boundary most of all.  The points are those of the patches
@@ -15,9 +18,30 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_matrix, diags
 
 from palpate.shared.arrays import Array, Flags, Ints, Numbers
-from palpate.shared.geometry.elements import HEX_CORNERS, HEX_EDGES
+from palpate.shared.geometry.elements import (
+    HEX_CORNERS,
+    HEX_EDGES,
+    HEX_FACES,
+    POINTS,
+    Box,
+    Kind,
+    kind_of,
+)
+
+ELEMENTS, CORNERS = 24, 20
+"""Elements round a corner, and corners round a midside, to which a quadratic is fitted."""
+
+RINGS = 2
+"""How often their neighbours are taken in, too, where those that meet there are too few."""
+
+NEARER = 4
+"""Power of nearness with which a corner counts for a midside."""
+
+STEEPEST = 10.0
+"""Sum of weights' sizes up to which a fit is trusted, else one of a lower degree is made."""
 
 NEAR, FAR = (1 - 3**-0.5) / 2, (1 + 3**-0.5) / 2
 """Of an element's points from one of its ends, over its length."""
@@ -34,19 +58,35 @@ POINT_SIDES = np.array(list(itertools.product((0, 1), repeat=3)))
 
 
 class Patches(NamedTuple):
-    """What carries values at the points of hexahedra to the nodes."""
+    """What carries values at the points of elements to the nodes."""
 
     corners: Ints  # (k,) nodes that are corners of elements
-    elements: Ints  # (k, 8) around each
-    weights: Array  # (k, 8, 8) of their points
+    elements: Ints  # (k, a) around each
+    weights: Array  # (k, a, q) of their points
     midsides: Ints  # (m,) nodes whose values are made of corners'
-    lines: Ints  # (m, 4) those
-    shares: Array  # (m, 4)
+    lines: Ints  # (m, l) those
+    shares: Array  # (m, l)
 
 
 def patches(nodes: Array, elements: Numbers) -> Patches:
-    """How values are carried in elements (e, 8 or 20) that all have the axes of one lattice."""
-    next_to = neighbours(elements[:, :8])
+    """How values are carried in elements (e, n)."""
+    kind = kind_of(elements)
+    if isinstance(kind, Box):
+        next_to = neighbours(elements[:, :8])
+        if _all_meet(elements, next_to):
+            return _in_lattice(nodes, elements, next_to)
+    return _fitted_patches(nodes, elements, kind)
+
+
+def _all_meet(elements: Numbers, next_to: Ints) -> bool:
+    """Whether all faces that hexahedra share are on opposite sides of them, as in a lattice."""
+    faces = np.sort(elements[:, np.array(HEX_FACES)].reshape(-1, 4), axis=1)
+    shared = len(faces) - len(np.unique(faces, axis=0))
+    return bool(np.count_nonzero(next_to >= 0) == 2 * shared)
+
+
+def _in_lattice(nodes: Array, elements: Numbers, next_to: Ints) -> Patches:
+    """As ``patches``, where all elements have the axes of one lattice."""
     at = nodes[elements[:, :8]]
     lengths = np.linalg.norm(at[:, OPPOSITE] - at[:, :, None], axis=3)  # (e, 8, 3)
     corners, first = np.unique(elements[:, :8].astype(int), return_index=True)
@@ -127,3 +167,95 @@ def _lagrange(at: Array, known: Flags) -> Array:
         both = known[:, i] & known[:, j]
         weights[both, i] *= at[both, j] / (at[both, j] - at[both, i])
     return weights
+
+
+def _fitted_patches(nodes: Array, elements: Numbers, kind: Kind) -> Patches:
+    """As ``patches``, however elements lie."""
+    N, _ = kind.shape(kind.rule(POINTS)[0])
+    points = N @ nodes[elements]  # (e, q, 3)
+    corners, own = np.unique(elements[:, : kind.corners].astype(int), return_inverse=True)
+    own = own.reshape(len(elements), -1)
+    ones = np.ones(own.size)
+    meeting = csr_matrix(
+        (ones, (own.ravel(), np.repeat(np.arange(len(own)), kind.corners))),
+        (len(corners), len(elements)),
+    )
+    around, known = _nearest(
+        meeting, meeting.T @ meeting, nodes[corners], points.mean(axis=1), ELEMENTS
+    )
+    at = points[around] - nodes[corners][:, None, None]
+    counts = np.broadcast_to(known[..., None], at.shape[:3]).reshape(len(corners), -1)
+    weights = fitted(at.reshape(len(corners), -1, 3), counts.astype(float))
+    weights = weights.reshape(at.shape[:3])
+    if not kind.quadratic:
+        return Patches(corners, around, weights, np.empty(0, int), *np.empty((2, 0, 1), int))
+    midsides, first = np.unique(elements[:, kind.corners :].astype(int), return_index=True)
+    element, edge = np.divmod(first, len(kind.edges))
+    ends = own[element[:, None], np.array(kind.edges)[edge]]  # (m, 2)
+    joined = csr_matrix(
+        (np.ones(ends.size), (np.repeat(np.arange(len(ends)), 2), ends.ravel())),
+        (len(ends), len(corners)),
+    )
+    lines, known = _nearest(joined, meeting @ meeting.T, nodes[midsides], nodes[corners], CORNERS)
+    at = nodes[corners[lines]] - nodes[midsides][:, None]
+    distance = np.linalg.norm(at, axis=2)
+    nearness = known * (distance.min(axis=1, keepdims=True) / distance) ** NEARER
+    return Patches(corners, around, weights, midsides, corners[lines], fitted(at, nearness))
+
+
+def _nearest(
+    meeting: csr_matrix, beside: csr_matrix, here: Array, there: Array, most: int
+) -> tuple[Ints, Flags]:
+    """Which of things ``there`` (e, 3) are near those ``here`` (k, 3), (k, most), as far as known.
+
+    First those that meet (k, e), then, where these are too few, those beside them (e, e), and once
+    more; the nearest of each.
+    """
+    most = min(most, len(there))
+    reached, rings = 1.0 * (meeting > 0), 1.0 * (meeting > 0)
+    for _ in range(RINGS):
+        few = diags((np.diff(reached.indptr) < most).astype(float))
+        reached = 1.0 * ((reached + few @ reached @ beside).tocsr() > 0)
+        rings = rings + reached
+    rings = rings.tocsr()
+    rows = np.repeat(np.arange(len(here)), np.diff(rings.indptr))
+    distance = np.linalg.norm(there[rings.indices] - here[rows], axis=1)
+    order = np.lexsort((distance, -rings.data, rows))
+    rank = np.arange(len(order)) - rings.indptr[rows]
+    kept = rank < most
+    found, known = np.zeros((len(here), most), int), np.zeros((len(here), most), bool)
+    found[rows[kept], rank[kept]] = rings.indices[order[kept]]
+    known[rows[kept], rank[kept]] = True
+    return found, known
+
+
+def fitted(at: Array, counts: Array) -> Array:
+    """Weights (k, m) of values at points (k, m, 3) in that at 0 of the field fitted to them.
+
+    By least squares, in which points count (k, m).  The field is quadratic; linear or constant
+    where the points do not tell it well.
+    """
+    share = counts / counts.sum(axis=1, keepdims=True)
+    centre = np.einsum("km,kmi->ki", share, at)[:, None]
+    away = at - centre
+    spread, axes = np.linalg.eigh(np.einsum("km,kmi,kmj->kij", share, away, away))
+    least = np.maximum(spread, 1e-12 * spread.max(axis=1, keepdims=True) + np.finfo(float).tiny)
+    axes = axes / np.sqrt(least)[:, None]
+    P, p = _powers(away @ axes), _powers(-centre @ axes)[:, 0]
+    weights, left = np.zeros(counts.shape), np.arange(len(at))
+    for terms in (10, 4, 1):
+        A = P[left, :, :terms]
+        weighted = share[left, :, None] * A
+        inverse = np.linalg.pinv(weighted.swapaxes(1, 2) @ A, rcond=1e-9, hermitian=True)
+        found = np.einsum("kmt,ktu,ku->km", weighted, inverse, p[left, :terms])
+        missed = np.abs(np.einsum("km,kmt->kt", found, A) - p[left, :terms]).max(axis=1)
+        good = (missed < 1e-6) & (np.abs(found).sum(axis=1) < STEEPEST)
+        weights[left[good]] = found[good]
+        left = left[~good]
+    return weights
+
+
+def _powers(x: Array) -> Array:
+    """1, the coordinates and their products (..., 10) of points (..., 3)."""
+    i, j = np.triu_indices(3)
+    return np.concatenate([np.ones_like(x[..., :1]), x, x[..., i] * x[..., j]], axis=-1)

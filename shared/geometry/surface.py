@@ -10,6 +10,7 @@ from numba import njit
 from scipy.spatial import cKDTree
 
 from palpate.shared.arrays import Array, Ints, Numbers
+from palpate.shared.geometry.elements import face_kind_of
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -258,10 +259,6 @@ def _clusters(centres: Array, members: Ints) -> list[Ints]:
 
 def boundary_triangles(faces: Numbers) -> tuple[Numbers, Numbers]:
     """Boundary for drawing: node ids (s,) and triangles (t, 3) as indices into them."""
-    if faces.shape[1] == 4:
-        pattern = [(0, 1, 2), (0, 2, 3)]
-    else:
-        pattern = [(0, 4, 7), (4, 1, 5), (5, 2, 6), (6, 3, 7), (4, 5, 7), (5, 6, 7)]
-    triangles = np.vstack([faces[:, p] for p in pattern])
+    triangles = np.vstack([faces[:, own] for own in face_kind_of(faces).triangles])
     nodes, compact = np.unique(triangles, return_inverse=True)
     return nodes.astype(np.int32), compact.reshape(-1, 3).astype(np.int32)

@@ -16,6 +16,7 @@ Computational Inelasticity, ch. 9.
 import math
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
 from pydantic import Field
 
 from palpate.shared.compiled import methods
@@ -40,6 +41,12 @@ class Demiray(NamedTuple):
     mu: Any  # kPa
     lam: Any  # kPa
     b: Any
+
+    def parts(self):
+        """See ``tissue.Law``."""
+        lam = np.minimum(self.lam, self.mu)
+        bulk = Demiray(0.0 * self.mu, self.lam - lam, self.b)
+        return self, Demiray(self.mu, lam, self.b), bulk
 
     def at(self, i):
         """Take the parameters at a point."""

@@ -13,6 +13,7 @@ many points that become vector code.
 import numpy as np
 from numba import njit
 
+from palpate.shared.arrays import Ints
 from palpate.shared.mechanics.demiray import DemirayTissue
 from palpate.shared.mechanics.mooney_rivlin import MooneyRivlinTissue
 from palpate.shared.mechanics.neo_hookean import NeoHookeanTissue
@@ -33,6 +34,13 @@ def law_of(tissue: AnyTissue, count: int) -> Law:
     values = *lame(tissue.young, tissue.poisson), *constants
     law: Law = kind(*(np.full(count, value) for value in values))
     return law
+
+
+def law_at_points(law: Law, parts: Ints) -> Law:
+    """Parameters (e, q) of what of a law (e,) counts at the points of elements: parts (q,)."""
+    values = (np.stack(part, axis=1)[:, parts] for part in zip(*law.parts(), strict=True))
+    found: Law = type(law)(*map(np.ascontiguousarray, values))
+    return found
 
 
 @njit(cache=True, error_model="numpy")

@@ -19,6 +19,7 @@ separation and the volumetric energy: Simo & Hughes, Computational Inelasticity,
 import math
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
+import numpy as np
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
@@ -45,6 +46,12 @@ class MooneyRivlin(NamedTuple):
     mu: Any  # kPa
     lam: Any  # kPa
     c01: Any  # kPa
+
+    def parts(self):
+        """See ``tissue.Law``."""
+        lam = np.minimum(self.lam, self.mu)
+        bulk = MooneyRivlin(0.0 * self.mu, self.lam - lam, 0.0 * self.c01)
+        return self, MooneyRivlin(self.mu, lam, self.c01), bulk
 
     def at(self, i):
         """Take the parameters at a point."""

@@ -12,6 +12,7 @@ Taylor, FEAP Theory Manual, finite elasticity.
 import math
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
 from pydantic import Field
 
 from palpate.shared.compiled import methods
@@ -37,6 +38,11 @@ class NeoHookean(NamedTuple):
 
     mu: Any  # kPa
     lam: Any  # kPa
+
+    def parts(self):
+        """See ``tissue.Law``."""
+        lam = np.minimum(self.lam, self.mu)
+        return self, NeoHookean(self.mu, lam), NeoHookean(0.0 * self.mu, self.lam - lam)
 
     def at(self, i):
         """Take the parameters at a point."""

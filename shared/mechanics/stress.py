@@ -29,19 +29,21 @@ from palpate.shared.mechanics.tissue import Law
 
 
 class StressRecovery(NamedTuple):
-    """What recovery needs of a mesh: 2x2x2 points per element, point index last.
+    """What recovery needs of a mesh: q points per element, point index last.
 
     See ``geometry.recovery.Patches`` for what carries values to the nodes.
     """
 
+    points: tuple[int, ...]  # (q,) numbers of the points: how many there are, compiled code knows
     connectivity: Numbers  # (e, n)
-    gradients: NDArray[np.floating]  # (e, n, 3, 8) 1/mm, at the points
+    gradients: NDArray[np.floating]  # (e, n, 3, q) 1/mm, at the points
     corners: Ints  # (k,)
-    around: Ints  # (k, 8) elements
-    weights: NDArray[np.floating]  # (k, 8, 8)
+    around: Ints  # (k, a) elements
+    weights: NDArray[np.floating]  # (k, a, q)
     midsides: Ints  # (m,)
-    lines: Ints  # (m, 4)
-    shares: NDArray[np.floating]  # (m, 4)
+    line: tuple[int, ...]  # (l,) numbers of a midside's corners, as ``points``
+    lines: Ints  # (m, l)
+    shares: NDArray[np.floating]  # (m, l)
     law: Law  # (nodes,)
 
 
@@ -57,15 +59,15 @@ class NearField(NamedTuple):
 def nodal_von_mises(mesh, u, B, near, out):
     """Write the von Mises stress (nodes,) kPa of the displacement ``u`` (nodes, 3) mm to ``out``.
 
-    ``B`` (e, 6, 8) is that of ``mechanics.viscosity`` at the points; None without a past.  ``near``
+    ``B`` (e, 6, q) is that of ``mechanics.viscosity`` at the points; None without a past.  ``near``
     is a part of ``u``.  Gradients are summed in the precision of ``mesh.gradients``, which ``u``
     shares.
     """
     count, own = len(out), _without(u, near)
     flat = mesh.gradients.reshape(len(mesh.connectivity), -1)
-    H = np.empty((len(flat), 72), flat.dtype)
+    H = np.empty((len(flat), 9 * len(mesh.points)), flat.dtype)
     for e in range(len(flat)):
-        _gradients(mesh.connectivity[e], flat[e], own, H[e])
+        _gradients(mesh.points, mesh.connectivity[e], flat[e], own, H[e])
     nodal = _carried(mesh, H)
     for k in range(len(near.points)):
         node = near.points[k]
@@ -83,30 +85,31 @@ def nodal_von_mises(mesh, u, B, near, out):
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
 def point_von_mises(mesh, u, B, near, exact, out):
-    """Write the von Mises stress (8 e,) kPa at the points; ``exact`` is the near field there.
+    """Write the von Mises stress (q e,) kPa at the points; ``exact`` is the near field there.
 
     The others are those of ``nodal_von_mises``.
     """
-    added, own = np.zeros((len(out) // 8, 72)), _without(u, near)
+    count = len(mesh.points)
+    added, own = np.zeros((len(mesh.connectivity), 9 * count)), _without(u, near)
     for k in range(len(exact.points)):
-        e, q = divmod(exact.points[k], 8)
+        e, q = divmod(exact.points[k], count)
         for i in range(9):
-            added[e, 8 * i + q] = exact.gradient[k, i // 3, i % 3]
+            added[e, count * i + q] = exact.gradient[k, i // 3, i % 3]
     flat = mesh.gradients.reshape(len(mesh.connectivity), -1)
-    H = np.empty(72, flat.dtype)
+    H = np.empty(9 * count, flat.dtype)
     for e in range(len(mesh.connectivity)):
-        _gradients(mesh.connectivity[e], flat[e], own, H)
-        law, found = mesh.law.at(mesh.connectivity[e, 0]), out[8 * e : 8 * e + 8]
-        for k in range(72):
+        _gradients(mesh.points, mesh.connectivity[e], flat[e], own, H)
+        law, found = mesh.law.at(mesh.connectivity[e, 0]), out[count * e : count * (e + 1)]
+        for k in range(9 * count):
             H[k] += added[e, k]
         if B is None:
-            for q in range(8):
-                found[q] = laws.von_mises(law, add_identity(load(H, q, 8), 1.0))
+            for q in range(count):
+                found[q] = laws.von_mises(law, add_identity(load(H, q, count), 1.0))
         else:
             b = B[e].reshape(-1)
-            for q in range(8):
-                past = unpacked(load_packed(b, q, 8))
-                found[q] = viscosity.von_mises(law, add_identity(load(H, q, 8), 1.0), past)
+            for q in range(count):
+                past = unpacked(load_packed(b, q, count))
+                found[q] = viscosity.von_mises(law, add_identity(load(H, q, count), 1.0), past)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -121,58 +124,61 @@ def _without(u, near):
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
 def remember(mesh, u, share, B):
-    """Add to ``B`` (e, 6, 8) what a displacement ``u`` (nodes, 3) mm of the past drives it to.
+    """Add to ``B`` (e, 6, q) what a displacement ``u`` (nodes, 3) mm of the past drives it to.
 
     See ``mechanics.viscosity``: ``share (m - I)`` at the points, or, where ``share`` is None, the
     linear part of a small displacement that stands for all shares; point index last.
     """
     flat = mesh.gradients.reshape(len(mesh.connectivity), -1)
-    H = np.empty(72)
+    count = len(mesh.points)
+    H = np.empty(9 * count)
     for e in range(len(mesh.connectivity)):
-        _gradients(mesh.connectivity[e], flat[e], u, H)
+        _gradients(mesh.points, mesh.connectivity[e], flat[e], u, H)
         b = B[e].reshape(-1)
-        for q in range(8):
-            G = load(H, q, 8)
+        for q in range(count):
+            G = load(H, q, count)
             if share is None:
-                add_to_packed(-1.0, packed(twice_deviator(G, trace(G) / 3.0)), b, q, 8)
+                add_to_packed(-1.0, packed(twice_deviator(G, trace(G) / 3.0)), b, q, count)
             else:
-                add_to_packed(share, viscosity.driven(add_identity(G, 1.0)), b, q, 8)
+                add_to_packed(share, viscosity.driven(add_identity(G, 1.0)), b, q, count)
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
-def _gradients(connectivity, flat, u, H):
-    """Displacement gradients (72,) at the points of an element."""
+def _gradients(points, connectivity, flat, u, H):
+    """Displacement gradients (9 q,) at the points of an element."""
     H[:] = 0.0
+    row = 3 * len(points)
     for a in range(len(connectivity)):
         node = connectivity[a]
         x, y, z = u[node, 0], u[node, 1], u[node, 2]
-        gradients = flat[24 * a : 24 * a + 24]
-        for k in range(24):
+        gradients = flat[row * a : row * (a + 1)]
+        for k in range(row):
             H[k] += x * gradients[k]
-            H[24 + k] += y * gradients[k]
-            H[48 + k] += z * gradients[k]
+            H[row + k] += y * gradients[k]
+            H[2 * row + k] += z * gradients[k]
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
 def _carried(mesh, values):
-    """Components (k nodes,) at the nodes of those at the points of elements (e, 8 k)."""
-    count, components = len(mesh.law.mu), values.shape[1] // 8
+    """Components (k nodes,) at the nodes of those at the points of elements (e, q k)."""
+    points = len(mesh.points)
+    count, components = len(mesh.law.mu), values.shape[1] // points
     nodal = np.zeros(components * count, values.dtype)
     for n in range(len(mesh.corners)):
         node = np.uint64(mesh.corners[n])
-        for a in range(8):
+        for a in range(mesh.around.shape[1]):
             own, weights = values[mesh.around[n, a]], mesh.weights[n, a]
             for k in range(components):
-                value = weights[0] * own[8 * k]
-                for q in range(1, 8):
-                    value += weights[q] * own[8 * k + q]
+                value = weights[0] * own[points * k]
+                for q in range(1, points):
+                    value += weights[q] * own[points * k + q]
                 nodal[k * count + node] += value
     for first in range(0, len(nodal), count):
         own = nodal[first : first + count]
         for m in range(len(mesh.midsides)):
             line, shares = mesh.lines[m], mesh.shares[m]
             value = shares[0] * own[line[0]]
-            for j in range(1, 4):
+            for j in range(1, len(mesh.line)):
                 value += shares[j] * own[line[j]]
             own[mesh.midsides[m]] = value
     return nodal

@@ -11,6 +11,10 @@ from palpate.shared.arrays import Array
 from palpate.shared.mechanics.tensors import dot, trace, transposed
 from palpate.shared.part import Fraction, Part, Positive
 
+WHOLE, COMPRESSIBLE, BULK = range(3)
+"""Parts of a law: all of it; with ``lam`` at most ``mu``, a Poisson's ratio of .25; and what that
+lacks, which depends on the volume alone."""
+
 INVERTED = math.inf
 """Energy returned where det F <= 0: a barrier every line search respects."""
 
@@ -25,6 +29,9 @@ class Law(Protocol):
     @property
     def lam(self) -> Array:
         """Lamé's first parameter at rest, kPa."""
+
+    def parts(self) -> tuple[Any, Any, Any]:
+        """The law itself and its two parts; see ``BULK``."""
 
     def at(self, i: Any) -> Any:
         """Parameters at one point, or at those of an index that NumPy understands."""

@@ -4,9 +4,12 @@ import json
 import pytest
 from click.testing import CliRunner
 
+from palpate.offline.fem.mesh import build_mesh
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.scenes import find_scene
 from palpate.shared.cli import main
+
+from .fem.bodies import in_tetrahedra
 
 
 def table(path):
@@ -70,6 +73,15 @@ def tiny(tmp_path_factory):
 def problem():
     """Return the full problem of the quick scene, on the mesh that its artifact has too."""
     return FullProblem(find_scene("quick"))
+
+
+@pytest.fixture(scope="session")
+def tetrahedra():
+    """Return the full problem of the quick scene on a mesh of tetrahedra."""
+    scene = find_scene("quick")
+    geometry = scene.geometry.model_copy(update={"element": "hex8"})
+    bricks = build_mesh(scene.model_copy(update={"geometry": geometry}))
+    return FullProblem(scene, in_tetrahedra(bricks))
 
 
 @pytest.fixture(scope="session")

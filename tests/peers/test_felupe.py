@@ -23,11 +23,14 @@ from palpate.offline.scenes import find_scene
 from palpate.shared.geometry.quadrature import surface_quadrature
 from palpate.shared.mechanics.footprint import footprint
 
+from ..offline.fem.bodies import in_tetrahedra
+
 STEPS = 5
 
 REGIONS = {
     8: ("hexahedron", fem.RegionHexahedron),
     20: ("hexahedron20", fem.RegionQuadraticHexahedron),
+    10: ("tetra10", fem.RegionQuadraticTetra),
 }
 
 
@@ -99,24 +102,36 @@ def solver(A, b):
     return splu(A.tocsc()).solve(b)
 
 
-def felupe_body(model):
+def felupe_body(model, quadrature=None, law=None):
     """The same body and its field in FElupe."""
     cell_type, region_class = REGIONS[model.mesh.elements.shape[1]]
     mesh = fem.Mesh(model.mesh.nodes, model.mesh.elements, cell_type)
-    region = region_class(mesh, quadrature=fem.GaussLegendre(order=1, dim=3))
-    umat = LAWS[model.tissue.law](*model.law.at(0))
+    region = region_class(mesh, quadrature=quadrature or fem.GaussLegendre(order=1, dim=3))
+    umat = LAWS[model.tissue.law](*(law or model.law.at(0)))
     field = fem.FieldContainer([fem.Field(region, dim=3)])
     return fem.SolidBody(umat, field), field
 
 
+def felupe_bodies(model):
+    """As ``felupe_body``; of tetrahedra two, which share what resists a change of volume."""
+    if model.mesh.elements.shape[1] != 10:
+        solid, field = felupe_body(model)
+        return [solid], field
+    mu, lam = model.law.at(0)
+    share = min(lam, mu)
+    solid, field = felupe_body(model, fem.TetrahedronQuadrature(order=2), (mu, share))
+    other, _ = felupe_body(model, fem.TetrahedronQuadrature(order=1), (0.0, lam - share))
+    return [solid, other], field
+
+
 def displacement_by_felupe(model, load):
     """Displacement (nodes, 3) mm by FElupe."""
-    solid, field = felupe_body(model)
+    solids, field = felupe_bodies(model)
     loaded = np.flatnonzero(load.any(axis=1))
     force = fem.PointLoad(field, loaded)
     clamped = fem.Boundary(field[0], mask=model.mesh.clamped)
     ramp = fem.math.linsteps([0, 1], num=STEPS)[1:, None, None] * load[loaded]
-    step = fem.Step([solid, force], ramp={force: ramp}, boundaries={"clamped": clamped})
+    step = fem.Step([*solids, force], ramp={force: ramp}, boundaries={"clamped": clamped})
     fem.Job(steps=[step]).evaluate(x0=field, tol=1e-9, solver=solver, verbose=0)
     return field[0].values
 
@@ -124,9 +139,11 @@ def displacement_by_felupe(model, load):
 def body(name, element, divisions):
     """The body of a scene, of another element and other divisions."""
     scene = find_scene(name)
-    geometry = scene.geometry.model_copy(update={"element": element, "divisions": divisions})
+    hexahedra = "hex8" if element == "tet10" else element
+    geometry = scene.geometry.model_copy(update={"element": hexahedra, "divisions": divisions})
     scene = scene.model_copy(update={"geometry": geometry})
-    return FullModel(build_mesh(scene), scene.tissue)
+    mesh = build_mesh(scene)
+    return FullModel(in_tetrahedra(mesh) if element == "tet10" else mesh, scene.tissue)
 
 
 def pressed(model, position, pressure, tilt):
@@ -144,6 +161,7 @@ def pressed(model, position, pressure, tilt):
     [
         ("turbinate-paper", "hex8", (23, 3, 20), (10.2, 20.0, 9.0), 8.0, 2.0, 1e-6),
         ("turbinate-paper", "hex20", (13, 2, 13), (10.2, 20.0, 9.0), 8.0, 2.0, 1e-6),
+        ("turbinate-paper", "tet10", (13, 2, 13), (10.2, 20.0, 9.0), 8.0, 2.0, 1e-8),
         ("quick-mooney-rivlin", "hex20", (4, 4, 3), (5.0, 5.0, 8.0), 9.0, 0.9, 1e-8),
         ("quick-demiray", "hex20", (4, 4, 3), (5.0, 5.0, 8.0), 9.0, 0.9, 1e-8),
     ],

@@ -5,9 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from palpate.offline.choose.size import LADDER, RUNG, Trial, TrialResult, choose, ladder
+from palpate.offline.choose.size import LADDER, RUNG, Trial, TrialResult, choose, ladder, try_patch
+from palpate.offline.reduce.layout import Layout
 from palpate.offline.reduce.sampling import fewer
 from palpate.offline.validate.compare import KnownAnswer
+from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH
 from palpate.shared.mechanics.neo_hookean import NeoHookeanTissue
 from palpate.shared.scene import Budget, Size, Tolerance
 
@@ -126,3 +128,24 @@ def test_the_less_compressible_the_more_points():
         assert len({size.modes for size in own}) == 1
         points = np.array([size.cubature_points for size in own])
         np.testing.assert_allclose(points[1:] / points[0], [1.76, 3.81], rtol=0.2)
+
+
+@pytest.mark.parametrize("name", ["problem", "tetrahedra"])
+def test_a_patch_that_is_tried_answers_for_loads_it_has_not_seen(name, request):
+    """Of hexahedra, and of tetrahedra whose law is integrated in two parts."""
+    problem, middle = request.getfixturevalue(name), np.array([5.0, 5.0, 8.0])
+    nodal, normal = problem.unit_load(middle)
+    pressed = problem.model.solve_linear(np.outer(-nodal, normal).ravel()[problem.model.free])
+    u = problem.model.filled(pressed).reshape(-1, 3)
+    compliance = -problem.under(middle, u) @ normal  # mm/kPa
+    fields = np.zeros(LIMIT_FIELDS)
+    fields[0], fields[1:4], fields[TIP_DEPTH] = 0.5 / compliance, compliance, 0.5
+    limits = np.tile(fields, (len(problem.surface.vertices), 1))
+    size = problem.scene.training.size
+    layout = Layout(problem.scene, problem.surface, limits, size)
+    central = int(np.linalg.norm(layout.centres - middle, axis=1).argmin())
+    found = try_patch(problem, layout.patch(central), limits)
+    errors = np.array([answer.errors for answer in found.known])
+    print(f"{name}: displacement {errors[:, 0].mean():.2%}, von Mises {errors[:, 1].mean():.2%}")
+    assert found.given_way == 0
+    assert (errors.mean(axis=0) < 0.03).all()

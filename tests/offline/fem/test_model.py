@@ -9,10 +9,17 @@ from scipy.sparse.linalg import spsolve
 
 from palpate.offline.fem.model import FullModel, NoEquilibrium
 from palpate.offline.fem.potential import Potential
-from palpate.shared.geometry.elements import HEX_EDGES, gauss, hexahedron, shape
-from palpate.shared.geometry.quadrature import surface_quadrature, volume_quadrature
+from palpate.shared.geometry.elements import kind_of
+from palpate.shared.geometry.quadrature import (
+    stress_recovery,
+    surface_quadrature,
+    volume_quadrature,
+)
 from palpate.shared.mechanics import tissue
 from palpate.shared.mechanics.footprint import footprint
+from palpate.shared.mechanics.laws import von_mises
+from palpate.shared.mechanics.stress import nodal_von_mises
+from palpate.shared.near_field import NO_CONTACT
 
 from .bodies import ELEMENTS, YOUNG, body, tissue_of
 
@@ -41,12 +48,12 @@ def bent(element, rng):
 
 def loose(model, rng, by=0.2):
     """A model with its inner corners moved, edges kept straight, and nothing clamped."""
-    mesh, nodes = model.mesh, model.mesh.nodes.copy()
-    inner = np.setdiff1d(mesh.elements[:, :8], mesh.faces)
+    mesh, nodes, kind = model.mesh, model.mesh.nodes.copy(), kind_of(model.mesh.elements)
+    inner = np.setdiff1d(mesh.elements[:, : kind.corners], mesh.faces)
     nodes[inner] += rng.uniform(-by, by, (len(inner), 3))
-    if mesh.elements.shape[1] == 20:
-        ends = mesh.elements[:, np.array(HEX_EDGES)]
-        nodes[mesh.elements[:, 8:]] = nodes[ends].mean(axis=2)
+    if kind.quadratic:
+        ends = mesh.elements[:, np.array(kind.edges)]
+        nodes[mesh.elements[:, kind.corners :]] = nodes[ends].mean(axis=2)
     mesh = replace(mesh, nodes=nodes, clamped=np.zeros_like(mesh.clamped))
     return FullModel(mesh, model.tissue)
 
@@ -271,33 +278,90 @@ def smooth(x):
     return 0.2 * z[..., None] * np.stack([np.sin(2 * y + z), np.sin(2 * z), 0 * z], axis=-1)
 
 
-def manufactured_error(element, divisions):
-    """Relative L2 error of the equilibrium under the load that goes with ``smooth``.
+def stretched(x):
+    """The same, and a change of volume."""
+    z = x[..., 2]
+    return smooth(x) + 0.05 * (z**2 * (1 + np.sin(2 * x[..., 0])))[..., None] * np.array([0, 0, 1])
+
+
+def slope_of(field, X):
+    """Deformation gradients (..., 3, 3) of a displacement at points (..., 3) mm."""
+    h = 1e-4
+    slope = [(field(X + step) - field(X - step)) / (2 * h) for step in h * np.eye(3)]
+    return np.eye(3) + np.stack(slope, axis=-1)
+
+
+def manufactured(element, divisions, field):
+    """Model and its equilibrium (n, 3) mm under the load that goes with a displacement.
 
     The load does the virtual work of the exact stress, which is integrated by 4x4x4 points.
     """
     model = body(element, (divisions,) * 3, (1.0, 1.0, 1.0))
     mesh = model.mesh
     gradients, weights = volume_quadrature(mesh.nodes, mesh.elements, 4)
-    N, _ = shape(hexahedron(mesh.elements.shape[1]), gauss(4, 3)[0])
-    X = np.einsum("qa,eai->eqi", N, mesh.nodes[mesh.elements])
-    h = 1e-4
-    slope = [(smooth(X + step) - smooth(X - step)) / (2 * h) for step in h * np.eye(3)]
-    F = np.eye(3) + np.stack(slope, axis=-1)
+    F = slope_of(field, at_points(mesh, mesh.nodes))
     J, T = np.linalg.det(F)[..., None, None], np.swapaxes(np.linalg.inv(F), 2, 3)
     mu, lam = model.law.at(0)
     P = mu * (F - T) + lam / 2 * (J**2 - 1) * T
     load = np.zeros_like(mesh.nodes)
     np.add.at(load, mesh.elements, np.einsum("eq,eqij,eqaj->eai", weights, P, gradients))
-    u = model.solve(load).displacement
-    away = np.einsum("qa,eai->eqi", N, u[mesh.elements]) - smooth(X)
-    error, size = (np.sum(weights[..., None] * field**2) for field in (away, smooth(X)))
+    return model, model.solve(load).displacement
+
+
+def at_points(mesh, values):
+    """Values (e, 64, ...) at 4x4x4 points of elements, of those at the nodes (n, ...)."""
+    kind = kind_of(mesh.elements)
+    N, _ = kind.shape(kind.rule(4)[0])
+    return np.einsum("qa,ea...->eq...", N, values[mesh.elements])
+
+
+def manufactured_error(element, divisions, field=smooth):
+    """Relative L2 error of the displacement of ``manufactured``."""
+    model, u = manufactured(element, divisions, field)
+    _, weights = volume_quadrature(model.mesh.nodes, model.mesh.elements, 4)
+    exact = field(at_points(model.mesh, model.mesh.nodes))
+    away = at_points(model.mesh, u) - exact
+    error, size = (np.sum(weights[..., None] * values**2) for values in (away, exact))
     return np.sqrt(error / size)
+
+
+def stress_error(element, divisions, field):
+    """Relative error of the von Mises stress at the nodes of ``manufactured``."""
+    model, u = manufactured(element, divisions, field)
+    nodes, found = model.mesh.nodes, np.empty(len(u))
+    nodal_von_mises(
+        stress_recovery(nodes, model.mesh.elements, model.law), u, None, NO_CONTACT, found
+    )
+    law = model.law.at(0)
+    exact = [von_mises(law, tuple(F.ravel())) for F in slope_of(field, nodes)]
+    return np.linalg.norm(found - exact) / np.linalg.norm(exact)
 
 
 def test_errors_shrink_with_the_mesh_at_the_rate_of_the_element(element):
     """In L2 with the square of the size of linear elements, with the cube of quadratic ones'."""
-    divisions, order = (3, 3.0) if element == "hex20" else (6, 2.0)
+    divisions, order = (6, 2.0) if element == "hex8" else (3, 3.0)
     coarse, fine = (manufactured_error(element, k * divisions) for k in (1, 2))
     assert np.log2(coarse / fine) == pytest.approx(order, abs=0.2)
     assert fine < 5e-3
+
+
+def test_a_pressure_that_changes_is_followed_by_tetrahedra_to_second_order():
+    """Most of it is one number per element; hexahedra follow it to third order."""
+    for element, order in (("hex20", 3.0), ("tet10", 2.0)):
+        coarse, fine = (manufactured_error(element, k, stretched) for k in (3, 6))
+        assert np.log2(coarse / fine) == pytest.approx(order, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("element", "field", "least"),
+    [
+        ("hex20", smooth, 3.0),
+        ("hex20", stretched, 3.0),
+        ("tet10", smooth, 2.0),
+        ("tet10", stretched, 1.2),  # a pressure that changes they follow to first order
+    ],
+)
+def test_stress_at_the_nodes_converges(element, field, least):
+    coarse, fine = (stress_error(element, k, field) for k in (3, 6))
+    assert np.log2(coarse / fine) > least
+    assert fine < 0.03

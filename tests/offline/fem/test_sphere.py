@@ -13,7 +13,7 @@ from palpate.offline.fem.sphere import (
     sphere_surface,
     touch,
 )
-from palpate.shared.geometry.elements import QUAD8_NODES, QUAD_CORNERS
+from palpate.shared.geometry.elements import FACES, QUAD_CORNERS
 
 from ...shared.mechanics.material_point import rotation
 
@@ -21,12 +21,16 @@ TIP = sphere_of(2.0, 15.0)
 
 
 def plate(kind=8):
-    """Four faces of the plane z = 0, 2 mm wide each, outward normal +z, and their surface."""
-    reference = QUAD8_NODES if kind == 8 else QUAD_CORNERS
-    corners = [np.add(reference, [x, y]) for x in (-1, 1) for y in (-1, 1)]
+    """Squares of the plane z = 0, 2 mm wide each, outward normal +z, and their surface.
+
+    Four, of faces of so many nodes; each of two triangles where they have six.
+    """
+    own = FACES[kind].nodes
+    pieces = [2 * own - 1, 1 - 2 * own] if kind == 6 else [own]
+    corners = [np.add(piece, [x, y]) for x in (-1, 1) for y in (-1, 1) for piece in pieces]
     nodes, faces = np.unique(np.vstack(corners).round(9), axis=0, return_inverse=True)
     nodes = np.column_stack([nodes, np.zeros(len(nodes))])
-    faces = faces.reshape(4, -1).astype(np.int32)
+    faces = faces.reshape(len(corners), -1).astype(np.int32)
     return nodes, faces, surface_of(nodes, faces)
 
 
@@ -64,7 +68,7 @@ def test_the_penalty_is_twice_continuously_differentiable():
     assert np.abs(np.diff(stiffness)).max() <= 1.01 * TIP.stiffness * (d[1] - d[0]) / TIP.onset
 
 
-@pytest.mark.parametrize("kind", [4, 8])
+@pytest.mark.parametrize("kind", [4, 8, 6])
 def test_force_and_stiffness_are_derivatives_of_the_energy(kind, rng):
     nodes, faces, surface = plate(kind)
     moved = 0.02 * rng.standard_normal(nodes.shape)
@@ -93,7 +97,7 @@ def test_force_and_stiffness_are_derivatives_of_the_energy(kind, rng):
     assert np.abs(own).max() <= 1e-6 * np.abs(touching.own @ away).max()
 
 
-@pytest.mark.parametrize("kind", [4, 8])
+@pytest.mark.parametrize("kind", [4, 8, 6])
 def test_the_blocks_that_are_not_looked_at_are_not_touched(kind, rng):
     nodes, _, surface = plate(kind)
     everywhere = surface._replace(reach=np.full_like(surface.reach, np.inf))

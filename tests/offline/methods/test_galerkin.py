@@ -29,6 +29,17 @@ def test_a_basis_that_holds_the_answer_finds_it(problem, queries, rng):
         assert np.linalg.norm(found - exact) <= CLOSE * np.linalg.norm(exact)
 
 
+def test_it_integrates_each_part_of_the_law_where_tetrahedra_do(tetrahedra, rng):
+    model, load = tetrahedra.model, Load(np.array([5.0, 4.0, 8.0]), np.array([0.0, 0.0, -1.0]), 1.5)
+    exact = tetrahedra.solve(load).displacement
+    u = exact.ravel()[model.free]
+    basis, _ = energy_pod(model, np.stack([u, *rng.random((4, len(u)))], axis=1), 5)
+    method = Galerkin(tetrahedra, basis)
+    assert len(method.points) == 5 * len(tetrahedra.elements)
+    found = method.displacement(method.solve(Case.of(tetrahedra, load)).state)
+    assert np.linalg.norm(found - exact) <= CLOSE * np.linalg.norm(exact)
+
+
 def test_it_is_the_projected_full_model_whatever_was_asked_before(problem, basis, queries):
     method, size, states = Galerkin(problem, basis), basis.shape[1], []
     for load, _ in (*queries, queries[0]):

@@ -82,13 +82,14 @@ def test_forces_of_all_points_are_the_sum_of_each_ones(rng):
     assert np.isnan(together).any(axis=1).sum() == 1
 
 
-def test_linear_forces_are_those_of_the_rest_stiffness(problem, rng):
-    model = problem.model
+@pytest.mark.parametrize("name", ["problem", "tetrahedra"])
+def test_linear_forces_are_those_of_the_rest_stiffness(name, request, rng):
+    model = request.getfixturevalue(name).model
     u = np.zeros((3 * len(model.mesh.nodes), 5))
     u[model.free] = rng.standard_normal((len(model.free), 5))
     nodal = u.reshape(-1, 3, 5)[model.connectivity]
     gradients = np.einsum("enim,eqnj->eqijm", nodal, model.gradients).reshape(-1, 9, 5)
-    law = model.law.at(np.repeat(np.arange(len(model.weights)), model.weights.shape[1]))
+    law = model.point_law.at(np.divmod(np.arange(model.weights.size), model.weights.shape[1]))
     states = rng.standard_normal((3, 5))
     points = linear_forces(gradients.astype(np.float32), model.weights.ravel(), law, states)
     exact = u[model.free].T @ (model.rest_stiffness @ u[model.free]) @ states.T

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from palpate.offline.fem.mesh import build_mesh
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.reduce.cubature import residuals_left
 from palpate.offline.reduce.join import bases_of
@@ -14,11 +15,14 @@ from palpate.shared.fields import FieldRecovery
 from palpate.shared.local_models import LocalModels
 from palpate.shared.scene import parse_scene
 
+from ..fem.bodies import in_tetrahedra
+
 STRIP = """
 name = "strip"
 geometry.kind = "block"
 geometry.size = [60.0, 8.0, 6.0]
-geometry.divisions = [24, 4, 3]
+geometry.element = "{element}"
+geometry.divisions = {divisions}
 tissue.law = "neo-hookean"
 tissue.young = 15.0
 tissue.poisson = 0.45
@@ -31,9 +35,17 @@ load.max_indentation = 0.1
 """
 
 
-@pytest.fixture(scope="module", params=["", "tissue.prony = [[0.25, 0.1]]"])
+PAST = "tissue.prony = [[0.25, 0.1]]"
+
+
+@pytest.fixture(scope="module", params=["hexahedra", "hexahedra with a past", "tetrahedra"])
 def whole(request):
-    return FullProblem(parse_scene(STRIP.format(past=request.param)))
+    past = PAST if "past" in request.param else ""
+    if request.param != "tetrahedra":
+        scene = parse_scene(STRIP.format(past=past, element="hex20", divisions=[24, 4, 3]))
+        return FullProblem(scene)
+    scene = parse_scene(STRIP.format(past=past, element="hex8", divisions=[24, 3, 3]))
+    return FullProblem(scene, in_tetrahedra(build_mesh(scene)))
 
 
 @pytest.fixture(scope="module")

@@ -7,27 +7,37 @@ from palpate.shared.geometry.edges import FAINTEST, shared_edges, sharp_points
 
 
 def roof(degrees, nodes):
-    """Two square faces, 2 mm wide, that meet along y at an angle of their normals."""
+    """Two squares, 2 mm wide, that meet along y at an angle of their normals.
+
+    They are faces of so many nodes; each two, of six.
+    """
     turn = np.radians(degrees)
     flat = [[-2, -1], [0, -1], [0, 1], [-2, 1], [2, -1], [2, 1]]
     faces = [[0, 1, 2, 3], [1, 4, 5, 2]]
     if nodes == 8:
         flat += [[-1, -1], [0, 0], [-1, 1], [-2, 0], [1, -1], [2, 0], [1, 1]]
         faces = [[*faces[0], 6, 7, 8, 9], [*faces[1], 10, 11, 12, 7]]
+    if nodes == 6:
+        flat += [[-1, -1], [0, 0], [-1, 0], [-1, 1], [-2, 0], [1, -1], [1, 0], [2, 0], [1, 1]]
+        faces = [[0, 1, 2, 6, 7, 8], [0, 2, 3, 8, 9, 10]]
+        faces += [[1, 4, 2, 11, 12, 7], [4, 5, 2, 13, 14, 12]]
     x, y = np.array(flat, float).T
     down = np.where(x > 0.0, x, 0.0)
     at = np.column_stack([np.where(x > 0.0, x * np.cos(turn), x), y, -down * np.sin(turn)])
     return at, np.array(faces, np.int32)
 
 
-@pytest.mark.parametrize("nodes", [4, 8])
+@pytest.mark.parametrize("nodes", [4, 8, 6])
 @pytest.mark.parametrize("degrees", [0.0, 10.0, 40.0, 90.0])
 def test_an_edge_turns_by_the_angle_of_its_faces(degrees, nodes):
     at, faces = roof(degrees, nodes)
     edges = shared_edges(at, faces)
-    assert edges.faces.tolist() == [[0, 1]]
-    assert sorted(edges.nodes[0, :2]) == [1, 2]
-    np.testing.assert_allclose(edges.turn, np.radians(degrees), atol=1e-6)
+    inner = {(1, 2): np.radians(degrees), **({(0, 2): 0.0, (2, 4): 0.0} if nodes == 6 else {})}
+    found = [tuple(sorted(ends[:2])) for ends in edges.nodes]
+    assert sorted(found) == sorted(inner)
+    np.testing.assert_allclose(edges.turn, [inner[ends] for ends in found], atol=1e-6)
+    for both, ends in zip(edges.faces, edges.nodes, strict=True):
+        assert (np.isin(faces[both], ends).sum(axis=1) == len(ends)).all()
     points, sharpness = sharp_points(at, faces, np.zeros(len(at), bool))
     assert len(points) == (0 if degrees < 15.0 else 9)
     if len(points):

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from palpate.offline.fem.mesh import build_mesh
-from palpate.shared.geometry.elements import gauss, hexahedron, shape
+from palpate.shared.geometry.elements import POINTS, kind_of
 from palpate.shared.geometry.recovery import neighbours, patches
 from palpate.shared.scene import parse_scene
+
+from ...offline.fem.bodies import in_tetrahedra
 
 BLOCK = """
 name = "block"
@@ -25,13 +27,25 @@ load.max_indentation = 0.2
 """
 
 
-@pytest.fixture(params=["hex8", "hex20"])
-def mesh(request):
-    """Three by two by four elements whose sizes grow along every axis."""
-    scene = parse_scene(BLOCK.format(element=request.param, divisions=[3, 2, 4]))
-    grown = tuple(np.linspace(0, 1, n + 1) ** 1.5 for n in (3, 2, 4))
-    found = build_mesh(scene, grown)
+def block(element, *divisions, ticks=None):
+    """Nodes and elements; six tet10 for a brick."""
+    hexahedra = "hex8" if element == "tet10" else element
+    scene = parse_scene(BLOCK.format(element=hexahedra, divisions=list(divisions)))
+    found = build_mesh(scene, ticks)
+    if element == "tet10":
+        found = in_tetrahedra(found)
     return found.nodes, found.elements
+
+
+@pytest.fixture(params=["hex8", "hex20", "tet10", "hex20 in disorder"])
+def mesh(request, rng):
+    """Three by two by four elements, or bricks, whose sizes grow along every axis."""
+    grown = tuple(np.linspace(0, 1, n + 1) ** 1.5 for n in (3, 2, 4))
+    nodes, elements = block(request.param.split()[0], 3, 2, 4, ticks=grown)
+    if "disorder" in request.param:  # some elements begin at another corner
+        turned = np.roll(np.arange(20).reshape(5, 4), 1, axis=1).ravel()
+        elements[::3] = elements[::3, turned]
+    return nodes, elements
 
 
 def carried(nodes, elements, values):
@@ -43,13 +57,16 @@ def carried(nodes, elements, values):
 
 
 def at_points(nodes, elements):
-    N, _ = shape(hexahedron(elements.shape[1]), gauss(2, 3)[0])
+    kind = kind_of(elements)
+    N, _ = kind.shape(kind.rule(POINTS)[0])
     return np.einsum("qa,eai->eqi", N, nodes[elements])
 
 
 def test_quadratic_fields_are_carried_exactly_even_to_the_boundary(mesh, rng):
     nodes, elements = mesh
     coefficients = rng.standard_normal((3, 3, 3))
+    if patches(nodes, elements).weights.shape[1] != 8:  # no lattice: the sum of powers counts
+        coefficients[np.indices((3, 3, 3)).sum(axis=0) > 2] = 0.0
 
     def field(x):
         powers = np.moveaxis(x, -1, 0)[:, None] ** np.arange(3).reshape(1, 3, *[1] * (x.ndim - 1))
@@ -59,27 +76,38 @@ def test_quadratic_fields_are_carried_exactly_even_to_the_boundary(mesh, rng):
     np.testing.assert_allclose(found, field(nodes), rtol=1e-10, atol=1e-9)
 
 
-def test_errors_of_smooth_fields_fall_with_the_third_power_of_the_size(rng):
+@pytest.mark.parametrize("element", ["hex20", "tet10"])
+def test_errors_of_smooth_fields_fall_with_the_third_power_of_the_size(element):
     errors = []
     for n in (4, 8):
-        scene = parse_scene(BLOCK.format(element="hex20", divisions=[n, n, n]))
-        found = build_mesh(scene)
+        nodes, elements = block(element, n, n, n)
 
         def field(x):
             return np.sin(1.1 * x[..., 0] + 0.7 * x[..., 1] - 0.5 * x[..., 2])
 
-        values = field(at_points(found.nodes, found.elements))
-        off = carried(found.nodes, found.elements, values) - field(found.nodes)
+        off = carried(nodes, elements, field(at_points(nodes, elements))) - field(nodes)
         errors.append(np.abs(off).max())
     assert errors[0] / errors[1] > 6.5
     assert errors[1] < 2e-2
 
 
-def test_a_layer_of_one_element_is_linear_across():
-    scene = parse_scene(BLOCK.format(element="hex20", divisions=[3, 3, 1]))
-    found = build_mesh(scene)
-    across = carried(found.nodes, found.elements, at_points(found.nodes, found.elements)[..., 2])
-    np.testing.assert_allclose(across, found.nodes[:, 2], atol=1e-12)
+@pytest.mark.parametrize("element", ["hex20", "tet10"])
+def test_linear_fields_are_carried_exactly_across_a_layer_of_one_element(element):
+    nodes, elements = block(element, 3, 3, 1)
+    across = carried(nodes, elements, at_points(nodes, elements)[..., 2])
+    np.testing.assert_allclose(across, nodes[:, 2], atol=1e-10)
+
+
+def test_what_does_not_meet_is_carried_by_itself():
+    """Two blocks that lie upon one another, and one element beside them, share no node."""
+    nodes, elements = block("tet10", 2, 2, 2)
+    alone = nodes[elements[0]] + [9.0, 0.0, 0.0]
+    both = np.vstack([nodes, nodes, alone])
+    n = len(nodes)
+    parts = [elements, n + elements, 2 * n + np.arange(10, dtype=np.int32)[None]]
+    values = np.concatenate([np.full((len(part), 4), k) for k, part in enumerate(parts)])
+    found = carried(both, np.concatenate(parts), values)
+    np.testing.assert_allclose(found, np.repeat([0.0, 1.0, 2.0], [n, n, 10]), atol=1e-12)
 
 
 def test_neighbours_lie_beyond_the_sides_of_an_element():

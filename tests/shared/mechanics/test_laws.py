@@ -37,6 +37,17 @@ def test_every_law_of_the_table_has_a_scene_to_test_it_by():
     assert {type(own) for own in TISSUES.values()} == set(get_args(laws.AnyTissue))
 
 
+def test_the_parts_of_a_law_add_up_and_one_knows_the_volume_alone(law, F):
+    whole, compressible, bulk = law.parts()
+    assert whole is law
+    for of_whole, one, other in zip(*(stress(part, F) for part in law.parts()), strict=True):
+        scale = np.abs(of_whole).max()
+        np.testing.assert_allclose(np.add(one, other), of_whole, atol=1e-12 * scale)
+    assert 0 < compressible.lam <= compressible.mu == law.mu
+    P = stress(bulk, F)[1] @ F.T
+    np.testing.assert_allclose(P, np.trace(P) / 3 * np.eye(3), atol=1e-10 * np.abs(P).max())
+
+
 def textbook_energy(own, law, F):
     """Energy density of a tissue, kPa."""
     squares, J = np.linalg.svd(F, compute_uv=False) ** 2, np.linalg.det(F)
