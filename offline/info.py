@@ -167,7 +167,8 @@ def _validations(
 def closing(artifact: Path) -> list[str]:
     """What to know of an artifact just trained, and what to do next."""
     report = info(artifact)
-    example, tolerance = report["loads"]["example"], parse_scene(report["text"]).tolerance
+    scene, example = parse_scene(report["text"]), report["loads"]["example"]
+    tolerance, fineness = scene.tolerance, scene.geometry.fineness
     most = tolerance.reduction
     errors = [f"{label}: {text}" for label, text in accuracy(report).items()]
     found = report["validation"]
@@ -186,7 +187,7 @@ def closing(artifact: Path) -> list[str]:
         if over:
             errors.append(
                 f"{label}: the tolerance is missed by the mesh alone: {', '.join(over)}; answers "
-                "estimate it; finer geometry.divisions lower it, and training takes longer"
+                f"estimate it; geometry.{fineness} may be finer, and training takes longer then"
             )
     ways = {"at": f"--pressure {example['pressure']:.2g}", "tip": "--tip"}
     following = [

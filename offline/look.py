@@ -11,7 +11,7 @@ import numpy as np
 
 from palpate.offline.bodies.places import boundary_of_corners
 from palpate.offline.bodies.report import report
-from palpate.offline.choose.mesh import candidates, divided
+from palpate.offline.choose.mesh import as_fine, candidates
 from palpate.offline.doubts import doubts
 from palpate.offline.fem.mesh import build_mesh, mesh_quality
 from palpate.offline.info import labelled, percent
@@ -50,8 +50,8 @@ def look(scene: str | Path, out: Path | None = None) -> tuple[Path, list[str]]:
     """
     require_pyvista()
     found = find_scene(scene)
-    if not isinstance(found.geometry, FileBody) and found.geometry.divisions is None:
-        found = divided(found, candidates(found)[0])
+    if not isinstance(found.geometry, FileBody) and found.fineness_of_mesh is None:
+        found = as_fine(found, candidates(found)[0])
     path = out or Path("artifacts") / found.name / "report" / "look.png"
     try:
         mesh = build_mesh(found)

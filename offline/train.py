@@ -29,7 +29,7 @@ from scipy.interpolate import RBFInterpolator
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
-from palpate.offline.choose.mesh import candidates, divided, with_mesh
+from palpate.offline.choose.mesh import as_fine, candidates, with_mesh
 from palpate.offline.choose.size import Trial, choose, first_place, ladder, try_patch
 from palpate.offline.doubts import doubts
 from palpate.offline.fem.mesh import mesh_quality
@@ -78,7 +78,7 @@ from palpate.shared.local_models import Estimators, LoadRange, LocalModels
 from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.model import ReducedModel
 from palpate.shared.progress import training_folder
-from palpate.shared.scene import Scene, Size, divisions_of
+from palpate.shared.scene import Scene, Size
 
 MODEL, MODEL_AND_DOF, PLACE = 0.35, 1.75e-4, 4.0
 """Core seconds that training takes for a local model, and more for each degree of freedom; for a
@@ -187,8 +187,8 @@ def check(scene: str | Path, workers: int | None = None) -> str:
     """
     with opened_scene(scene) as found:
         content_key(found)
-        coarsest = found.lattice.divisions is None
-        meshed = divided(found, candidates(found)[0]) if coarsest else found
+        coarsest = found.fineness_of_mesh is None
+        meshed = as_fine(found, candidates(found)[0]) if coarsest else found
         return outlook(FullProblem(meshed), workers, coarsest)
 
 
@@ -230,8 +230,8 @@ def forecast(problem: FullProblem, workers: int, coarsest: bool = False) -> str:
     cores = "1 free core" if workers == 1 else f"{workers} free cores"
     about = "at least" if coarsest or more else "about"
     return (
-        f"{scene.name}: {' x '.join(map(str, divisions_of(scene.lattice)))} elements "
-        f"{scene.lattice.element}{' or more' if coarsest else ''}, {dofs} DOFs; about "
+        f"{scene.name}: {len(problem.mesh.elements)} elements {scene.geometry.element}"
+        f"{' or more' if coarsest else ''}, {dofs} DOFs; about "
         f"{models}{more} local models; {about} {duration(seconds)} on {cores}, and some 3 min more "
         "the first time, while code is compiled"
     )

@@ -8,6 +8,8 @@ from palpate.shared.part import Length, Part, in_radii
 
 Unit = Annotated[Literal["mm", "cm", "m"], Field(description="of lengths in the file: mm, cm or m")]
 
+CHOSEN = "the coarsest mesh whose errors leave the reduction its share of the tolerance"
+
 MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 """Of each unit."""
 
@@ -26,6 +28,12 @@ Edge = Annotated[Length, in_radii(2.0, "longest edges of the mesh before it is r
 class _OfFile(Part):
     sides: ClassVar = ()
     element: ClassVar = "tet10"
+    fineness: ClassVar = "finest"
+    finest: Length | None = Field(
+        None,
+        description="longest edges of elements where it can be touched, mm",
+        json_schema_extra={"absent": CHOSEN},
+    )
 
 
 class SurfaceBody(_OfFile):

@@ -28,7 +28,7 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
-from palpate.shared.anatomy import FileBody, LabelBody, MeshBody, SurfaceBody
+from palpate.shared.anatomy import CHOSEN, FileBody, LabelBody, MeshBody, SurfaceBody
 from palpate.shared.errors import PalpateError
 from palpate.shared.files import open_regular
 from palpate.shared.mechanics.laws import AnyTissue
@@ -51,7 +51,6 @@ def _not_too_many(divisions: tuple[int, int, int]) -> tuple[int, int, int]:
 
 
 Divisions = Annotated[tuple[Division, Division, Division], AfterValidator(_not_too_many)]
-CHOSEN = "the coarsest mesh whose errors leave the reduction its share of the tolerance"
 Point2 = tuple[float, float]
 WITHIN = ("any", "without", *range(100))
 """What in a path leads to a table within one of its own kind."""
@@ -76,6 +75,8 @@ class Extrusion(Part):
 
     sides: ClassVar = "lip", "tip", "posterior", "anterior", "inner", "outer"
     """Low and high end of each axis of the mesh's lattice."""
+
+    fineness: ClassVar = "divisions"
 
     kind: Literal["extrusion"] = Field(
         description="section along y; sides: lip, outer, tip, inner, posterior, anterior"
@@ -113,6 +114,8 @@ class Block(Part):
 
     sides: ClassVar = "left", "right", "front", "back", "bottom", "top"
     """Low and high end of each axis of the mesh's lattice."""
+
+    fineness: ClassVar = "divisions"
 
     kind: Literal["block"] = Field(description="box; sides: left, right, front, back, bottom, top")
     size: tuple[Length, Length, Length] = Field(description="lengths along [x, y, z], mm")
@@ -291,10 +294,15 @@ class Scene(Part):
         """Geometry of a body that is meshed by a lattice; raise `SceneError` for another."""
         if isinstance(self.geometry, FileBody):
             raise SceneError(
-                f"geometry.kind = {self.geometry.kind!r}: training takes blocks and extrusions "
-                "only; palpate look draws this body"
+                f"geometry.kind = {self.geometry.kind!r}: this is for blocks and extrusions only"
             )
         return self.geometry
+
+    @property
+    def fineness_of_mesh(self) -> Divisions | float | None:
+        """What the scene says of how fine its mesh is: `divisions`, or edges of `finest` mm."""
+        said: Divisions | float | None = getattr(self.geometry, self.geometry.fineness)
+        return said
 
     @field_validator("support", "surface")
     @classmethod

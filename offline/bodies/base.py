@@ -77,7 +77,7 @@ def stored_at(scene: Scene) -> Path:
     geometry, path = body_file(scene)
     sha = hashlib.sha256(path.read_bytes())
     keys = geometry.model_dump(mode="json") | {"edition": EDITION}
-    del keys["file"]
+    del keys["file"], keys["finest"]
     sha.update(json.dumps(keys, sort_keys=True).encode())
     return path.with_name(f"{path.name}.{sha.hexdigest()[:12]}.mesh.npz")
 

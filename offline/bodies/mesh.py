@@ -2,33 +2,52 @@
 
 import numpy as np
 
-from palpate.offline.bodies.base import Base, base_mesh
+from palpate.offline.bodies.base import Base, base_mesh, body_file
 from palpate.offline.bodies.places import Boundary, boundary_of_corners, support_and_surface
-from palpate.offline.bodies.refine import EdgeLength, Refined, refined
+from palpate.offline.bodies.refine import Refined, growing, refined, spread_over
 from palpate.offline.bodies.tetrahedra import boundary
 from palpate.shared.arrays import Array, Flags
 from palpate.shared.local_models import Mesh
 from palpate.shared.scene import Scene
 
+GROWTH = 0.7
+"""Of an edge over its distance from the surface that can be touched."""
 
-def mesh_of_body(
-    scene: Scene, edge_length_at: EdgeLength | None = None, bare: bool = False
-) -> Mesh:
-    """Mesh the body of a scene, as fine as wanted; as its base mesh is if nothing is said.
 
-    Whatever is held or can be touched is made of whole faces of the base mesh, and so is the same
-    in every mesh; of a ``bare`` one nothing is.
+def refined_body(scene: Scene) -> Refined:
+    """The body of a scene, its elements as fine as ``geometry.finest`` says; else as stored."""
+    base, finest = base_mesh(scene), body_file(scene)[0].finest
+    if finest is None:
+        return refined(base, _as_it_is)
+    touched = support_and_surface(scene, boundary_of(base))[1]
+    return refined(base, growing(spread_over(base, touched, finest), finest, GROWTH, np.inf))
+
+
+def mesh_of(scene: Scene, finer: Refined) -> Mesh:
+    """The mesh of a scene's body, with what is held and can be touched.
+
+    That is made of whole faces of the base mesh, and so is the same in every mesh.
 
     Raises
     ------
     SceneError
-        If the file is no body, or support or surface hold no face, or the same.
+        If support or surface hold no face, or the same.
     """
+    return _mesh(finer, *support_and_surface(scene, boundary_of(base_mesh(scene))))
+
+
+def bare_mesh(scene: Scene) -> Mesh:
+    """The mesh of a scene's body as it is stored, neither held nor touched anywhere."""
     base = base_mesh(scene)
-    faces = boundary_of(base)
-    support, accessible = faces.nowhere() if bare else support_and_surface(scene, faces)
-    finer = refined(base, edge_length_at or _as_it_is)
-    return _mesh(finer, support, accessible)
+    return _mesh(refined(base, _as_it_is), *boundary_of(base).nowhere())
+
+
+def support_edges(scene: Scene) -> Array:
+    """Points (k, 3) mm where what is held ends: nodes of the base mesh."""
+    base = base_mesh(scene)
+    held = support_and_surface(scene, boundary_of(base))[0]
+    faces = boundary(base.elements)[0]
+    return base.nodes[np.intersect1d(faces[held], faces[~held])]
 
 
 def boundary_of(base: Base) -> Boundary:

@@ -39,8 +39,25 @@ class Refined:
     faces: Numbers  # (f, 6)
     element_of: Ints  # (e,) base element
     face_of: Ints  # (f,) base face, as ``boundary`` numbers them
-    within: Ints  # (n,) base element in which a node lies, of lowest number
-    at: Array  # (n, 4) barycentric coordinates there
+    sites: Array  # (n, 5) where nodes lie: base element of lowest number, coordinates in it
+    corners: Array  # (e, 4, 4) barycentric coordinates of an element's corners in its base element
+
+    def at(self, sites: Array, field: Array) -> Array:
+        """A nodal field (n, ...) at ``sites`` (k, 5) of this mesh or another of the same body."""
+        home, where = sites[:, 0].astype(int), sites[:, 1:]
+        inverse = np.linalg.inv(self.corners)
+        order = np.argsort(self.element_of, kind="stable")
+        ends = np.searchsorted(self.element_of[order], np.arange(self.element_of.max() + 2))
+        element, own = np.empty(len(sites), int), np.empty((len(sites), 4))
+        by_home = np.argsort(home, kind="stable")
+        for some in np.split(by_home, np.flatnonzero(np.diff(home[by_home])) + 1):
+            base = home[some[0]]
+            inside = order[ends[base] : ends[base + 1]]
+            found = np.einsum("ka,eab->keb", where[some], inverse[inside])
+            best = found.min(axis=2).argmax(axis=1)
+            element[some], own[some] = inside[best], found[np.arange(len(some)), best]
+        values: Array = np.einsum("ka,ka...->k...", shape(own), field[self.elements[element]])
+        return values
 
 
 class _Cut:
@@ -106,7 +123,7 @@ class _Cut:
 
 def placed(base: Base, element: Ints, at: Array) -> Array:
     """Points (k, 3) mm at barycentric coordinates (k, 4) of elements (k,) of a base mesh."""
-    points: Array = np.einsum("ka,kai->ki", shape(at)[0], base.nodes[base.elements[element]])
+    points: Array = np.einsum("ka,kai->ki", shape(at), base.nodes[base.elements[element]])
     return points
 
 
@@ -172,8 +189,8 @@ def _finished(mesh: _Cut) -> Refined:
     where = at.reshape(-1, 4)[order[first]]
     faces, owner, opposite = boundary(elements)
     face_of = _base_faces(mesh, owner, opposite)
-    nodes = placed(mesh.base, within, where)
-    return Refined(nodes, elements, faces, mesh.element_of, face_of, within, where)
+    nodes, sites = placed(mesh.base, within, where), np.column_stack([within, where])
+    return Refined(nodes, elements, faces, mesh.element_of, face_of, sites, mesh.at)
 
 
 def _base_faces(mesh: _Cut, owner: Ints, opposite: Ints) -> Ints:

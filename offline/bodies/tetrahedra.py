@@ -9,12 +9,13 @@ import itertools
 import numpy as np
 
 from palpate.shared.arrays import Array, Ints, Numbers
+from palpate.shared.geometry.elements import TET10, TRIANGLE6
 
-EDGES = np.array([(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)])
+EDGES = np.array(TET10.edges)
 FACES = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])
 """Corners of the face opposite to each corner."""
 
-MIDDLES = np.array([(5, 9, 8), (7, 9, 6), (4, 8, 7), (6, 5, 4)])
+MIDDLES = np.array([TET10.on_face(corners)[3:] for corners in FACES.tolist()])
 """Middles of the sides of the same faces."""
 
 
@@ -28,25 +29,14 @@ def lattice(order: int) -> Array:
     return np.array(inner) / order
 
 
-def shape(at: Array) -> tuple[Array, Array]:
-    """Quadratic shape functions (..., 10) and slopes (..., 10, 4) at barycentric points (..., 4).
-
-    Slopes are partial derivatives as if the four coordinates were independent.
-    """
-    first, second = at[..., EDGES[:, 0]], at[..., EDGES[:, 1]]
-    N = np.concatenate([at * (2.0 * at - 1.0), 4.0 * first * second], axis=-1)
-    dN = np.zeros((*at.shape[:-1], 10, 4))
-    corner, edge = np.arange(4), np.arange(6)
-    dN[..., corner, corner] = 4.0 * at - 1.0
-    dN[..., 4 + edge, EDGES[:, 0]] = 4.0 * second
-    dN[..., 4 + edge, EDGES[:, 1]] = 4.0 * first
-    return N, dN
+def shape(at: Array) -> Array:
+    """Quadratic shape functions (k, 10) at barycentric coordinates (k, 4)."""
+    return TET10.shape(at[:, 1:])[0]
 
 
 def determinants(nodes: Array, elements: Numbers, order: int = 6) -> Array:
     """Jacobian determinants (e, k) mm³ at the points of ``lattice``, nodes among them if even."""
-    _, dN = shape(lattice(order))
-    slopes = dN[..., 1:] - dN[..., :1]
+    _, slopes = TET10.shape(lattice(order)[:, 1:])
     found: Array = np.linalg.det(np.einsum("eni,qnj->eqij", nodes[elements], slopes))
     return found
 
@@ -79,13 +69,11 @@ def volumes(corners: Array) -> Array:
 
 
 def volume(nodes: Array, elements: Numbers) -> float:
-    """Volume (mm³) of curved elements: a rule of degree three is exact."""
-    a, b = 1.0 / 6.0, 0.5
-    at = np.vstack([np.full((1, 4), 0.25), np.full((4, 4), a) + (b - a) * np.eye(4)])
-    _, dN = shape(at)
-    slopes = dN[..., 1:] - dN[..., :1]
+    """Volume (mm³) of curved elements, whose determinants are cubic."""
+    at, weights = TET10.rule(3)
+    _, slopes = TET10.shape(at)
     found = np.linalg.det(np.einsum("eni,qnj->eqij", nodes[elements], slopes))
-    return float(np.sum(found @ np.array([-0.8, 0.45, 0.45, 0.45, 0.45])) / 6.0)
+    return float(np.sum(found @ weights))
 
 
 def raised(points: Array, corners: Numbers) -> tuple[Array, Numbers]:
@@ -155,25 +143,8 @@ def quality(nodes: Array, elements: Numbers) -> dict[str, float]:
 
 def curved(faces: Numbers, nodes: Array, squares: int = 4) -> tuple[Array, Numbers]:
     """Points (p, 3) mm and triangles (t, 3) of six-node faces, each side cut into ``squares``."""
-    steps = [(i, j) for i in range(squares + 1) for j in range(squares + 1 - i)]
-    number = {step: k for k, step in enumerate(steps)}
-    own = [
-        (number[i, j], number[i + 1, j], number[i, j + 1])
-        for i, j in steps
-        if i + j < squares
-    ] + [
-        (number[i + 1, j], number[i + 1, j + 1], number[i, j + 1])
-        for i, j in steps
-        if i + j < squares - 1
-    ]  # fmt: skip
-    x, y = np.array(steps).T / squares
-    z = 1.0 - x - y
-    N = np.stack(
-        [z * (2 * z - 1), x * (2 * x - 1), y * (2 * y - 1), 4 * z * x, 4 * x * y, 4 * y * z], axis=1
-    )
-    points = N @ nodes[faces]
-    triangles = np.array(own) + len(steps) * np.arange(len(faces))[:, None, None]
-    _, first, weld = np.unique(
-        points.reshape(-1, 3).round(9), axis=0, return_index=True, return_inverse=True
-    )
-    return points.reshape(-1, 3)[first], weld.ravel()[triangles.reshape(-1, 3)].astype(np.int32)
+    at, cells = TRIANGLE6.cells(squares)
+    points = (TRIANGLE6.shape(at)[0] @ nodes[faces]).reshape(-1, 3)
+    triangles = cells + len(at) * np.arange(len(faces))[:, None, None]
+    _, first, weld = np.unique(points.round(9), axis=0, return_index=True, return_inverse=True)
+    return points[first], weld.ravel()[triangles.reshape(-1, 3)].astype(np.int32)

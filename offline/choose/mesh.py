@@ -8,20 +8,23 @@ elasticity costs one factorisation a mesh, and the errors of larger loads are mu
 
 import re
 import sys
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
-from palpate.offline.fem.graded import Graded, interpolated
-from palpate.offline.fem.mesh import Ticks, in_order, parameters_of, ticks_of
+from palpate.offline.fem.body_mesh import own_mesh
+from palpate.offline.fem.graded import Graded
+from palpate.offline.fem.mesh import in_order
 from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.fem.shapes import shape_of
 from palpate.offline.reduce.sampling import spread_points
 from palpate.offline.run.streams import Stage, stream
 from palpate.offline.validate import mesh_part
-from palpate.shared.arrays import Array, Numbers
+from palpate.shared.anatomy import FileBody
+from palpate.shared.arrays import Array
 from palpate.shared.scene import Divisions, Errors, Scene, SceneError, parse_scene
 
 COARSEST, FINER, SIZES = 1.0, 0.8, 7
@@ -54,30 +57,29 @@ class Reference(NamedTuple):
     """What a mesh graded towards a place says there."""
 
     place: Array  # (3,) mm
-    ticks: Ticks
-    elements: Numbers
+    mesh: Graded
     response: Response
 
 
 def with_mesh(scene: Scene) -> tuple[Scene, dict[str, Any] | None]:
-    """The scene with divisions in its text, chosen if it has none, and what was tried.
+    """The scene with the fineness of its mesh in its text, chosen if not given; what was tried.
 
     Raises
     ------
     SceneError
-        If the text has its geometry as an inline table, which they cannot be written to.
+        If the text has its geometry as an inline table, which it cannot be written to.
     """
-    if scene.lattice.divisions is not None:
+    if scene.fineness_of_mesh is not None:
         return scene, None
     allowed, tried = scene.tolerance.mesh, list[dict[str, Any]]()
     coarsest, *_ = meshes = candidates(scene)
-    references = _references(scene, FullProblem(divided(scene, coarsest)))
-    for divisions in tqdm(meshes, "choosing the mesh"):
-        chosen = divided(scene, divisions)
+    references = _references(scene, FullProblem(as_fine(scene, coarsest)))
+    for fineness in tqdm(meshes, "choosing the mesh"):
+        chosen = as_fine(scene, fineness)
         problem = FullProblem(chosen)
         errors = _errors(problem, references)
         dofs = problem.mesh.nodes.size
-        tried.append({"divisions": divisions, "dofs": dofs, "errors": errors._asdict()})
+        tried.append({chosen.geometry.fineness: fineness, "dofs": dofs, "errors": errors._asdict()})
         beyond = [
             name for name, e, most in zip(Errors._fields, errors, allowed, strict=True) if e > most
         ]
@@ -90,32 +92,35 @@ def with_mesh(scene: Scene) -> tuple[Scene, dict[str, Any] | None]:
         f": it errs by {errors.displacement:.1%} of displacement, {errors.von_mises:.1%} of stress"
     )
     why += f", {errors.force:.1%} of the tip's force" if scene.endoscope.tip else ""
-    tqdm.write(f"mesh: {divisions}, {dofs} DOFs; {why}", file=sys.stderr)
+    tqdm.write(f"mesh: {chosen.geometry.fineness} {fineness}, {dofs} DOFs; {why}", file=sys.stderr)
     return chosen, {"why": why, "tried": tried}
 
 
-def divided(scene: Scene, divisions: Divisions) -> Scene:
-    """The same scene with divisions, in its text as well."""
-    table = re.search(r"^\[geometry\].*\n", scene.text, flags=re.M)
-    start, key = (table.end(), "divisions") if table else (0, "geometry.divisions")
-    line = f"{key} = {list(divisions)}   # chosen by training\n"
+def as_fine(scene: Scene, fineness: Divisions | float) -> Scene:
+    """The same scene with divisions of its mesh or the finest edge (mm), in its text as well."""
+    table, key = re.search(r"^\[geometry\].*\n", scene.text, re.M), scene.geometry.fineness
+    start = table.end() if table else 0
+    value = fineness if isinstance(fineness, float) else list(fineness)
+    line = f"{'' if table else 'geometry.'}{key} = {value}   # chosen by training\n"
     try:
         return parse_scene(scene.text[:start] + line + scene.text[start:], scene.folder)
     except SceneError as error:
         if table:
             raise
-        raise SceneError("geometry.divisions: needed where geometry is an inline table") from error
+        raise SceneError(f"geometry.{key}: needed where geometry is an inline table") from error
 
 
-def candidates(scene: Scene) -> list[Divisions]:
-    """Divisions whose elements are about as long as wide, from coarse to fine."""
+def candidates(scene: Scene) -> Sequence[Divisions | float]:
+    """From coarse to fine: divisions whose elements are about as long as wide, or finest edges."""
+    edges = [COARSEST * FINER**k * scene.endoscope.radius for k in range(SIZES)]
+    if isinstance(scene.geometry, FileBody):
+        return [round(edge, 4) for edge in edges]
     even = np.linspace(0, 1, PROBE + 1)
     grid = shape_of(scene).grid(even, even, even)
     steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).mean() for axis in range(3)]
     lengths = PROBE * np.array(in_order(scene.lattice, steps))
     found: list[Divisions] = []
-    for k in range(SIZES):
-        edge = COARSEST * FINER**k * scene.endoscope.radius
+    for edge in edges:
         along, second, third = (max(1, round(length / edge)) for length in lengths)
         if (along, second, third) not in found:
             found.append((along, second, third))
@@ -129,18 +134,16 @@ def _references(scene: Scene, problem: FullProblem) -> list[Reference]:
     found = []
     for x in tqdm(places, "fine meshes to choose by"):
         fine = Graded(scene, x, REFERENCE)
-        mesh = fine.problem.mesh
-        found.append(Reference(x, fine.ticks, mesh.elements, _pressed(fine.problem, x)))
+        found.append(Reference(x, fine, _pressed(fine.problem, x)))
     return found
 
 
 def _errors(problem: FullProblem, references: list[Reference]) -> Errors:
     """95th percentiles of a mesh's errors; without a tip none of force."""
-    at = parameters_of(problem.scene, ticks_of(problem.scene.lattice))
-    found = []
-    for place, ticks, elements, exact in references:
+    at, found = own_mesh(problem.scene).sites, []
+    for place, fine, exact in references:
         own = _pressed(problem, place)
-        u, stress = (interpolated(ticks, elements, at, field) for field in exact[:2])
+        u, stress = (fine.at(at, field) for field in exact[:2])
         force = abs(own.depth / exact.depth - 1) if problem.scene.endoscope.tip else 0.0
         moved = relative(own.displacement, u, problem.nodal_volumes)
         off = moved, relative(own.von_mises, stress, problem.counted_volumes), force

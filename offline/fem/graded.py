@@ -1,22 +1,26 @@
-"""Meshes of a body graded towards one contact: what a scene's own mesh is measured by.
-
-Like every mesh of a body they are grids of one map (``fem.shapes``), so a node of one mesh is found
-in another by its parameters.
-"""
+"""Meshes of a body graded towards one contact: what a scene's own mesh is measured by."""
 
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from palpate.offline.fem.mesh import Ticks, build_mesh, cells_of
+from palpate.offline.bodies.base import base_mesh
+from palpate.offline.bodies.mesh import support_edges
+from palpate.offline.bodies.refine import refined
+from palpate.offline.fem.body_mesh import BodyMesh, LatticeMesh, NestedMesh
+from palpate.offline.fem.mesh import Ticks
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.shapes import shape_of
-from palpate.shared.arrays import Array, Ints, Numbers
-from palpate.shared.geometry.elements import kind_of
+from palpate.shared.anatomy import FileBody
+from palpate.shared.arrays import Array
 from palpate.shared.scene import Extrusion, Scene
 
 STEPS = 400
 """Of a line through the contact, along which lengths are measured."""
+
+HELD = 0.5
+"""Radii: least edges of tetrahedra where what is held ends, which is a long line."""
 
 CLOSER, GRID = 6, 24
 """Rounds in which a point's parameters are sought, and steps of the grid of each."""
@@ -46,38 +50,33 @@ fields at the nodes of a scene's own mesh differ by .4 (displacement) and 8 % (v
 class Graded:
     """The full model of a scene on a mesh fine at a contact (3,) mm of its surface.
 
-    Displacement goes as the root of the distance from both edges of a clamped lip, so the mesh is
-    fine there too.
+    At the edges of a clamped lip, or of what else is held, it is fine too: displacement goes as the
+    root of the distance from there.
     """
 
     def __init__(self, scene: Scene, contact: Array, how: Grading) -> None:
-        self.ticks = _ticks(scene, contact, how)
-        self.problem = FullProblem(scene, build_mesh(scene, self.ticks))
+        self._mesh = _graded(scene, contact, how)
+        self.problem, self.sites = FullProblem(scene, self._mesh.mesh), self._mesh.sites
 
-    def at(self, parameters: Array, field: Array) -> Array:
-        """A nodal field (n, ...) of this mesh at parameters (k, 3) of points of the body."""
-        return interpolated(self.ticks, self.problem.mesh.elements, parameters, field)
-
-
-def interpolated(grid: Ticks, elements: Numbers, parameters: Array, field: Array) -> Array:
-    """A nodal field (n, ...) of a mesh of elements at parameters (k, 3) of points of the body."""
-    first, second, third = grid
-    t, u, v = parameters.T
-    i, along = _cell(np.broadcast_to(first, (len(t), len(first))), t)
-    j, across = _cell(np.broadcast_to(second, (len(t), len(second))), u)
-    rows = np.broadcast_to(third, (len(first), third.shape[-1]))
-    share = (along[:, None] + 1.0) / 2.0
-    k, through = _cell((1.0 - share) * rows[i] + share * rows[i + 1], v)
-    nodes = elements[np.ravel_multi_index((i, j, k), cells_of(grid))]
-    N, _ = kind_of(elements).shape(np.column_stack([along, across, through]))
-    return np.einsum("ka,ka...->k...", N, field[nodes])
+    def at(self, sites: Array, field: Array) -> Array:
+        """A nodal field (n, ...) of this mesh at sites (k, ...) of another, see ``BodyMesh``."""
+        return self._mesh.at(sites, field)
 
 
-def _cell(ticks: Array, at: Array) -> tuple[Ints, Array]:
-    """Between which of its ticks (k, n) each of values (k,) lies, and where: -1 to 1."""
-    cell = np.clip(np.sum(ticks <= at[:, None], axis=1) - 1, 0, ticks.shape[1] - 2)
-    low, high = (np.take_along_axis(ticks, cell[:, None] + n, axis=1)[:, 0] for n in (0, 1))
-    return cell, 2.0 * (at - low) / (high - low) - 1.0
+def _graded(scene: Scene, contact: Array, how: Grading) -> BodyMesh:
+    if not isinstance(scene.geometry, FileBody):
+        return LatticeMesh(scene, _ticks(scene, contact, how))
+    radius = scene.endoscope.radius
+    edges, held = how._replace(support=max(how.support, HELD)), support_edges(scene)
+
+    def wanted(points: Array) -> Array:
+        away = np.linalg.norm(points - contact, axis=1) / radius
+        edge = edges.finest + edges.growth * np.maximum(away - edges.even, 0.0)
+        from_held = np.asarray(cKDTree(held).query(points)[0]) / radius
+        edge = np.minimum(edge, edges.support + edges.growth * from_held)
+        return radius * np.minimum(edge, edges.coarsest)
+
+    return NestedMesh(scene, refined(base_mesh(scene), wanted))
 
 
 def _ticks(scene: Scene, contact: Array, how: Grading) -> Ticks:

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from palpate.offline.bodies.mesh import mesh_of_body
+from palpate.offline.bodies.mesh import bare_mesh, mesh_of, refined_body
 from palpate.offline.bodies.places import Boundary, boundary_of_corners, support_and_surface
 from palpate.offline.bodies.report import thickness
 from palpate.offline.fem.shapes import shape_of
@@ -52,7 +52,7 @@ def build_mesh(scene: Scene, ticks: Ticks | None = None, bare: bool = False) -> 
         surface hold no face, or the same.
     """
     if ticks is None and isinstance(scene.geometry, FileBody):
-        return mesh_of_body(scene, bare=bare)
+        return bare_mesh(scene) if bare else mesh_of(scene, refined_body(scene))
     geometry = scene.lattice
     if ticks is None:
         ticks = ticks_of(geometry)
@@ -264,7 +264,7 @@ def accessible_surface(mesh: Mesh, scene: Scene | None = None) -> Surface:
     kind = face_kind_of(faces)
     grid, cells = kind.cells(*_counts(kind, mesh.nodes[faces]))
     N, dN = kind.shape(grid)
-    if scene is None:
+    if scene is None or isinstance(scene.geometry, FileBody):  # whose meshes all follow it
         points, normals = N @ mesh.nodes[faces], N @ _nodal_normals(mesh, faces)[faces]
     else:
         points, normals = _on_body(scene, N, dN, faces)

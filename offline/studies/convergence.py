@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from palpate.offline.fem.body_mesh import own_mesh
 from palpate.offline.fem.graded import Graded, Grading
-from palpate.offline.fem.mesh import accessible_surface, build_mesh, parameters_of, ticks_of
+from palpate.offline.fem.mesh import accessible_surface, build_mesh
 from palpate.offline.fem.model import FullModel
 from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import FullProblem, Load
@@ -61,7 +62,7 @@ def convergence(scene: Scene, places: int, report: Path, how: Grading = GRADING)
 
 def at_place(scene: Scene, x: Array, how: Grading) -> Iterator[dict[str, Any]]:
     """Rows of all meshes graded towards a point (3,) mm, those of the middle one with orders."""
-    at = parameters_of(scene, ticks_of(scene.lattice))
+    at = own_mesh(scene).sites
     seen: dict[int, list[tuple[float, Array, int]]] = {2: [], 3: []}
     kept = FullProblem(scene).beyond_clamped_layer
     for factor in EDGES:

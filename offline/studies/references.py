@@ -10,8 +10,8 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.offline.fem.body_mesh import own_mesh
 from palpate.offline.fem.graded import FIT_FOR_FOOTPRINTS, Graded
-from palpate.offline.fem.mesh import parameters_of, ticks_of
 from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import FullProblem, Load, TipPosition
@@ -149,5 +149,5 @@ def graded(problem: FullProblem, scene: Scene, load: Load) -> tuple[Array, Array
     except NoEquilibrium:
         return None
     stress = fine.problem.von_mises(u, contact=fine.problem.footprint(load))
-    at = parameters_of(scene, ticks_of(scene.lattice))
+    at = own_mesh(scene).sites
     return fine.at(at, u), fine.at(at, stress)

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from palpate.offline.fem.graded import Graded, Grading, interpolated
-from palpate.offline.fem.mesh import parameters_of, ticks_of
+from palpate.offline.fem.body_mesh import own_mesh
+from palpate.offline.fem.graded import Graded, Grading
 from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.norms import relative, statistics
 from palpate.offline.fem.problem import FullProblem, Load, TipPosition
@@ -110,19 +110,17 @@ def compared(
     The tip presses the latter as a sphere integrated over its faces.  Levels without equilibrium
     are left out.
     """
-    fine, ticks = Graded(scene, levels[0][1].position, how), ticks_of(scene.lattice)
-    at, near = parameters_of(scene, ticks), None
-    fine_at = parameters_of(scene, fine.ticks)
+    fine, here, near = Graded(scene, levels[0][1].position, how), own_mesh(scene), None
     own, exact = Pressed(problem), Pressed(fine.problem, integrated=True)
     for level, step, answer in levels:
         try:
             found = own.harder(level, step, answer)
             if isinstance(step, TipPosition):  # whose contact takes half as many iterations so
-                near = interpolated(ticks, problem.mesh.elements, fine_at, own.displacement)
+                near = here.at(fine.sites, own.displacement)
             there = exact.harder(level, step, near)
         except NoEquilibrium:
             continue
-        u, stress = (fine.at(at, field) for field in (there.displacement, there.von_mises))
+        u, stress = (fine.at(here.sites, field) for field in (there.displacement, there.von_mises))
         yield level, step, found, there._replace(displacement=u, von_mises=stress)
 
 

@@ -88,7 +88,7 @@ def test_the_log_says_beforehand_what_will_be_made_and_the_artifact_how_long_it_
     path, _, log = resumed
     info = ReducedModel.load(path).info
     made = info["training"]["layout"]
-    said = rf"tiny: 3 x 3 x 2 elements hex20, {made['dofs']} DOFs; about {made['patches']} local"
+    said = rf"tiny: 18 elements hex20, {made['dofs']} DOFs; about {made['patches']} local"
     assert re.search(said, log)
     assert info["provenance"]["wall_seconds"] > sum(info["training"]["seconds"].values())
 

@@ -103,14 +103,15 @@ def area(nodes, faces):
 
 def test_fields_of_the_base_mesh_are_found_at_the_nodes_of_a_finer_one(base):
     mesh = refined(base, everywhere(2.0))
-    np.testing.assert_array_equal(placed(base, mesh.within, mesh.at), mesh.nodes)
+    within, at = mesh.sites[:, 0].astype(int), mesh.sites[:, 1:]
+    np.testing.assert_array_equal(placed(base, within, at), mesh.nodes)
     field = np.random.default_rng(1).standard_normal(len(base.nodes))
-    fine = np.einsum("ka,ka->k", shape(mesh.at)[0], field[base.elements[mesh.within]])
+    fine = np.einsum("ka,ka->k", shape(at), field[base.elements[within]])
     # at centres of fine elements the fine mesh says what the base mesh does
-    N = shape(np.full((1, 4), 0.25))[0][0]
-    inside = np.flatnonzero((mesh.within[mesh.elements] == mesh.element_of[:, None]).all(axis=1))
-    where = mesh.at[mesh.elements[inside, :4]].mean(axis=1)
-    own = np.einsum("ka,ka->k", shape(where)[0], field[base.elements[mesh.element_of[inside]]])
+    N = shape(np.full((1, 4), 0.25))[0]
+    inside = np.flatnonzero((within[mesh.elements] == mesh.element_of[:, None]).all(axis=1))
+    where = at[mesh.elements[inside, :4]].mean(axis=1)
+    own = np.einsum("ka,ka->k", shape(where), field[base.elements[mesh.element_of[inside]]])
     np.testing.assert_allclose(fine[mesh.elements[inside]] @ N, own, atol=1e-12)
 
 
@@ -121,3 +122,15 @@ def test_points_are_spread_over_chosen_faces(base):
     assert points[:, 2].min() > 3.5  # a face of a side reaches down to the next row
     gap = cKDTree(points).query(points, k=2)[0][:, 1]
     assert 0 < gap.max() < 0.6
+
+
+def test_a_field_of_one_mesh_is_found_at_the_nodes_of_another_one(base):
+    one = refined(base, growing(np.array([[0.0, 0.0, 9.0]]), 0.8, 0.6, 9.0))
+    two = refined(base, growing(np.array([[0.0, 9.0, 0.0]]), 1.0, 0.6, 9.0))
+    for mesh, other in ((one, two), (two, one), (one, one)):
+        np.testing.assert_allclose(mesh.at(other.sites, mesh.nodes), other.nodes, atol=1e-12)
+    # a field of the base mesh is one of all that divide it
+    field = np.random.default_rng(2).standard_normal(len(base.nodes))
+    as_stored = refined(base, everywhere(1e9))
+    whole = as_stored.at(one.sites, as_stored.at(as_stored.sites, field))
+    np.testing.assert_allclose(two.at(one.sites, as_stored.at(two.sites, field)), whole, atol=1e-12)

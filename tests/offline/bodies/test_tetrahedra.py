@@ -27,12 +27,9 @@ def bent(seed, by):
     return nodes, elements
 
 
-def test_shape_functions_are_one_at_their_node_and_slopes_are_theirs():
+def test_shape_functions_are_one_at_their_node():
     at = np.vstack([np.eye(4), np.eye(4)[EDGES].mean(axis=1)])
-    np.testing.assert_allclose(shape(at)[0], np.eye(10), atol=1e-15)
-    point, step = np.array([0.1, 0.2, 0.3, 0.4]), 1e-6 * np.eye(4)
-    slopes = [(shape(point + s)[0] - shape(point - s)[0]) / 2e-6 for s in step]
-    np.testing.assert_allclose(shape(point)[1], np.transpose(slopes), atol=1e-9)
+    np.testing.assert_allclose(shape(at), np.eye(10), atol=1e-15)
 
 
 def test_a_regular_tetrahedron_is_perfect_and_a_flat_one_is_nothing():

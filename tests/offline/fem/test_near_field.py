@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from palpate.offline.fem.body_mesh import own_mesh
 from palpate.offline.fem.graded import Graded, Grading
-from palpate.offline.fem.mesh import parameters_of, ticks_of
 from palpate.offline.fem.problem import FullProblem, Load, TipPosition
 from palpate.offline.scenes import find_scene
 from palpate.offline.validate.mesh_part import Pressed
@@ -85,7 +85,7 @@ def test_under_a_tip_most_of_what_fields_lack_of_the_sphere_comes_back(depth):
     problem, step = block(8, 8, 6), TipPosition(PLACE + (2.0 - depth) * UP)
     graded = Graded(problem.scene, PLACE, Grading(finest=0.15, even=0.3, growth=0.9))
     sphere = Pressed(graded.problem, integrated=True).harder(depth, step)
-    at = parameters_of(problem.scene, ticks_of(problem.scene.geometry))
+    at = own_mesh(problem.scene).sites
     found = problem.solve(step)
     contact = problem.footprint(step, found)
     u, plain = problem.displaced(found, contact), found.displacement

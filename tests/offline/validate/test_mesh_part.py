@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from palpate.offline.fem.graded import Graded, Grading, interpolated
-from palpate.offline.fem.mesh import build_mesh, parameters_of, ticks_of
+from palpate.offline.fem.body_mesh import own_mesh
+from palpate.offline.fem.graded import Graded, Grading
+from palpate.offline.fem.mesh import ticks_of
 from palpate.offline.fem.problem import FullProblem, Load, TipPosition
 from palpate.offline.fem.shapes import shape_of
 from palpate.offline.scenes import find_scene
@@ -25,7 +26,7 @@ def block(*divisions):
 def test_nodes_are_where_their_parameters_say(name):
     scene = find_scene(name)
     nodes = FullProblem(scene).mesh.nodes
-    at = parameters_of(scene, ticks_of(scene.geometry))
+    at = own_mesh(scene).sites
     some = np.arange(0, len(nodes), 97)
     points = [shape_of(scene).grid(*at[i][:, None])[0, 0, 0] for i in some]
     np.testing.assert_allclose(nodes[some], points, atol=1e-9)
@@ -38,7 +39,7 @@ def test_a_field_of_a_graded_mesh_is_found_at_the_nodes_of_another(name, place):
     scene = find_scene(name)
     fine = Graded(scene, np.array(place), COARSE)
     own = FullProblem(scene).mesh.nodes
-    found = fine.at(parameters_of(scene, ticks_of(scene.geometry)), fine.problem.mesh.nodes)
+    found = fine.at(own_mesh(scene).sites, fine.problem.mesh.nodes)
     away = np.linalg.norm(found - own, axis=1)
     # faces of 4 mm cut the round edges of a curved body
     assert away.max() < (1e-9 if name == "quick" else 0.1)
@@ -47,11 +48,9 @@ def test_a_field_of_a_graded_mesh_is_found_at_the_nodes_of_another(name, place):
 
 def test_a_field_of_a_mesh_with_a_refined_lip_is_found_at_the_nodes_of_a_graded_one():
     scene = find_scene("turbinate")
-    ticks = ticks_of(scene.geometry)
-    assert ticks[2].ndim == 2
-    at = parameters_of(scene, ticks)
-    wanted = parameters_of(scene, Graded(scene, np.array([10.1, 22.0, 8.0]), COARSE).ticks)
-    found = interpolated(ticks, build_mesh(scene).elements, wanted, at)
+    assert ticks_of(scene.geometry)[2].ndim == 2
+    own, wanted = own_mesh(scene), Graded(scene, np.array([10.1, 22.0, 8.0]), COARSE).sites
+    found = own.at(wanted, own.sites)
     np.testing.assert_allclose(found, wanted, atol=1e-12)
 
 

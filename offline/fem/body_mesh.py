@@ -1,0 +1,81 @@
+"""Meshes of one body: where the nodes of one lie in every other.
+
+Those of a block or an extrusion are grids of one map (``fem.shapes``), so a node is found by its
+parameters.  Those of a body from a file divide one base mesh (``bodies.refine``), in whose elements
+a node is found.
+"""
+
+from typing import Protocol
+
+import numpy as np
+
+from palpate.offline.bodies.mesh import mesh_of, refined_body
+from palpate.offline.bodies.refine import Refined
+from palpate.offline.fem.mesh import Ticks, build_mesh, cells_of, parameters_of, ticks_of
+from palpate.shared.anatomy import FileBody
+from palpate.shared.arrays import Array, Ints, Numbers
+from palpate.shared.geometry.elements import kind_of
+from palpate.shared.local_models import Mesh
+from palpate.shared.scene import Scene
+
+
+class BodyMesh(Protocol):
+    """A mesh of a body; ``sites`` (n, ...) say where in the body its nodes lie."""
+
+    mesh: Mesh
+    sites: Array
+
+    def at(self, sites: Array, field: Array) -> Array:
+        """A nodal field (n, ...) of this mesh at sites (k, ...) of another one."""
+
+
+class LatticeMesh:
+    """A lattice of hexahedra."""
+
+    def __init__(self, scene: Scene, ticks: Ticks) -> None:
+        self.mesh, self.sites = build_mesh(scene, ticks), parameters_of(scene, ticks)
+        self._ticks = ticks
+
+    def at(self, sites: Array, field: Array) -> Array:
+        """See ``BodyMesh``; sites are parameters (k, 3)."""
+        return interpolated(self._ticks, self.mesh.elements, sites, field)
+
+
+class NestedMesh:
+    """Tetrahedra that divide those of the base mesh."""
+
+    def __init__(self, scene: Scene, refined: Refined) -> None:
+        self.mesh, self.sites = mesh_of(scene, refined), refined.sites
+        self._refined = refined
+
+    def at(self, sites: Array, field: Array) -> Array:
+        """See ``BodyMesh``; sites are those of ``Refined``."""
+        return self._refined.at(sites, field)
+
+
+def own_mesh(scene: Scene) -> BodyMesh:
+    """The mesh that a scene is trained on."""
+    if isinstance(scene.geometry, FileBody):
+        return NestedMesh(scene, refined_body(scene))
+    return LatticeMesh(scene, ticks_of(scene.lattice))
+
+
+def interpolated(grid: Ticks, elements: Numbers, parameters: Array, field: Array) -> Array:
+    """A nodal field (n, ...) of a lattice of elements at parameters (k, 3) of the body."""
+    first, second, third = grid
+    t, u, v = parameters.T
+    i, along = _cell(np.broadcast_to(first, (len(t), len(first))), t)
+    j, across = _cell(np.broadcast_to(second, (len(t), len(second))), u)
+    rows = np.broadcast_to(third, (len(first), third.shape[-1]))
+    share = (along[:, None] + 1.0) / 2.0
+    k, through = _cell((1.0 - share) * rows[i] + share * rows[i + 1], v)
+    nodes = elements[np.ravel_multi_index((i, j, k), cells_of(grid))]
+    N, _ = kind_of(elements).shape(np.column_stack([along, across, through]))
+    return np.einsum("ka,ka...->k...", N, field[nodes])
+
+
+def _cell(ticks: Array, at: Array) -> tuple[Ints, Array]:
+    """Between which of its ticks (k, n) each of values (k,) lies, and where: -1 to 1."""
+    cell = np.clip(np.sum(ticks <= at[:, None], axis=1) - 1, 0, ticks.shape[1] - 2)
+    low, high = (np.take_along_axis(ticks, cell[:, None] + n, axis=1)[:, 0] for n in (0, 1))
+    return cell, 2.0 * (at - low) / (high - low) - 1.0
