@@ -23,6 +23,11 @@ def refined_body(scene: Scene) -> Refined:
     return refined(base, growing(spread_over(base, touched, finest), finest, GROWTH, np.inf))
 
 
+def stored_mesh(scene: Scene) -> Mesh:
+    """The mesh of a scene's body as it is stored; see ``mesh_of``."""
+    return mesh_of(scene, refined(base_mesh(scene), _as_it_is))
+
+
 def mesh_of(scene: Scene, finer: Refined) -> Mesh:
     """The mesh of a scene's body, with what is held and can be touched.
 

@@ -11,10 +11,18 @@ import numpy as np
 
 from palpate.offline.bodies.mesh import mesh_of, refined_body
 from palpate.offline.bodies.refine import Refined
-from palpate.offline.fem.mesh import Ticks, build_mesh, cells_of, parameters_of, ticks_of
+from palpate.offline.fem.mesh import (
+    Ticks,
+    accessible_surface,
+    build_mesh,
+    cells_of,
+    parameters_of,
+    ticks_of,
+)
 from palpate.shared.anatomy import FileBody
 from palpate.shared.arrays import Array, Ints, Numbers
 from palpate.shared.geometry.elements import kind_of
+from palpate.shared.geometry.surface import Surface
 from palpate.shared.local_models import Mesh
 from palpate.shared.scene import Scene
 
@@ -24,6 +32,7 @@ class BodyMesh(Protocol):
 
     mesh: Mesh
     sites: Array
+    surface: Surface | None  # that can be touched, if it is not that of the mesh's own faces
 
     def at(self, sites: Array, field: Array) -> Array:
         """A nodal field (n, ...) of this mesh at sites (k, ...) of another one."""
@@ -31,6 +40,8 @@ class BodyMesh(Protocol):
 
 class LatticeMesh:
     """A lattice of hexahedra."""
+
+    surface: Surface | None = None
 
     def __init__(self, scene: Scene, ticks: Ticks) -> None:
         self.mesh, self.sites = build_mesh(scene, ticks), parameters_of(scene, ticks)
@@ -46,6 +57,7 @@ class NestedMesh:
 
     def __init__(self, scene: Scene, refined: Refined) -> None:
         self.mesh, self.sites = mesh_of(scene, refined), refined.sites
+        self.surface: Surface | None = accessible_surface(self.mesh, scene)
         self._refined = refined
 
     def at(self, sites: Array, field: Array) -> Array:

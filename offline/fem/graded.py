@@ -55,8 +55,8 @@ class Graded:
     """
 
     def __init__(self, scene: Scene, contact: Array, how: Grading) -> None:
-        self._mesh = _graded(scene, contact, how)
-        self.problem, self.sites = FullProblem(scene, self._mesh.mesh), self._mesh.sites
+        self._mesh = own = _graded(scene, contact, how)
+        self.problem, self.sites = FullProblem(scene, own.mesh, own.surface), own.sites
 
     def at(self, sites: Array, field: Array) -> Array:
         """A nodal field (n, ...) of this mesh at sites (k, ...) of another, see ``BodyMesh``."""

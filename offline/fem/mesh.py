@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from palpate.offline.bodies.mesh import bare_mesh, mesh_of, refined_body
+from palpate.offline.bodies.mesh import bare_mesh, mesh_of, refined_body, stored_mesh
 from palpate.offline.bodies.places import Boundary, boundary_of_corners, support_and_surface
 from palpate.offline.bodies.report import thickness
 from palpate.offline.fem.shapes import shape_of
@@ -34,9 +34,9 @@ and last layer over the whole, and how far along the section its layers go over 
 SLIGHTLY = 1e-5
 """Step in parameters, over that of a face, by which its tangents are found."""
 
-SAG, STRAIGHT, LEAST, MOST = 0.002, 2, {4: 4, 3: 2}, 16
+SAG, STRAIGHT, LEAST, MOST = 0.002, 2, {4: 4, 3: 2}, {4: 16, 3: 8}
 """Millimetres between a curved face and its cells, and how many lie along an edge: that many where
-edges have no middles, else at least so many on faces of so many corners, and at most so many."""
+edges have no middles, else at least and at most so many on faces of so many corners."""
 
 
 def build_mesh(scene: Scene, ticks: Ticks | None = None, bare: bool = False) -> Mesh:
@@ -258,13 +258,16 @@ def accessible_surface(mesh: Mesh, scene: Scene | None = None) -> Surface:
 
     That of the body of a scene on whose own mesh it lies, if given: faces of 2 mm differ from it by
     7 um and .7 degrees, which a tip that is .1 mm deep feels as a tenth of its force, and what
-    hangs from a lip as a push aside.
+    hangs from a lip as a push aside.  That of a body from a file is of its stored mesh's faces.
     """
+    from_file = scene is not None and isinstance(scene.geometry, FileBody)
+    if scene is not None and from_file:
+        mesh = stored_mesh(scene)
     faces = mesh.faces[mesh.accessible]
     kind = face_kind_of(faces)
     grid, cells = kind.cells(*_counts(kind, mesh.nodes[faces]))
     N, dN = kind.shape(grid)
-    if scene is None or isinstance(scene.geometry, FileBody):  # whose meshes all follow it
+    if scene is None or from_file:
         points, normals = N @ mesh.nodes[faces], N @ _nodal_normals(mesh, faces)[faces]
     else:
         points, normals = _on_body(scene, N, dN, faces)
@@ -283,7 +286,7 @@ def _counts(kind: Face, X: Array) -> Sequence[int]:
     if not kind.quadratic:
         return [STRAIGHT] * kind.axes
     wanted = np.ceil(np.sqrt(kind.bent(X).max(axis=0) / SAG))
-    return [int(count) for count in np.clip(wanted, LEAST[kind.corners], MOST)]
+    return [int(count) for count in np.clip(wanted, LEAST[kind.corners], MOST[kind.corners])]
 
 
 def _nodal_normals(mesh: Mesh, faces: Numbers) -> Array:

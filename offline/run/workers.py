@@ -22,6 +22,7 @@ import threading
 import weakref
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib import metadata
@@ -272,6 +273,11 @@ class Checkpoint:
                 self.store(missing[future], future.result())
                 done += 1
                 self._told(title, done, len(tasks))
+        except BrokenProcessPool as error:
+            raise PalpateError(
+                f"{title}: a worker was killed, most likely since memory ran out; what is done is "
+                "kept: start again, with fewer --workers"
+            ) from error
         finally:
             for future in missing:
                 future.cancel()

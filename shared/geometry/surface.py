@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -61,6 +61,9 @@ rim, rather than above or below."""
 
 FACING = 0.7
 """Cosine between the normals of two points of one smooth side of a body."""
+
+BLOCK = 4096
+"""Vertices whose neighbours are held in memory at once."""
 
 
 class SurfaceIndex(NamedTuple):
@@ -196,20 +199,27 @@ class Surface:
         radius (mm): vertices, and points ``beyond`` the rim with normals (k, 6).
         """
         known = np.vstack([np.hstack([self.vertices, self.normals]), beyond])
-        pairs = cKDTree(self.vertices).sparse_distance_matrix(
-            cKDTree(known[:, :3]), radius, output_type="ndarray"
+        tree = cKDTree(known[:, :3])
+        blocks = range(0, len(self.vertices), BLOCK)
+        return np.vstack(
+            [self._curvature(slice(i, i + BLOCK), known, tree, radius) for i in blocks]
         )
+
+    def _curvature(self, own: slice, known: Array, tree: Any, radius: float) -> Array:
+        """The same at some of the vertices, by points with normals (p, 6) in a tree."""
+        vertices, normals = self.vertices[own], self.normals[own]
+        pairs = cKDTree(vertices).sparse_distance_matrix(tree, radius, output_type="ndarray")
         one, two = pairs["i"], pairs["j"]
-        facing = np.sum(self.normals[one] * known[two, 3:], axis=1) > FACING
+        facing = np.sum(normals[one] * known[two, 3:], axis=1) > FACING
         one, two = one[facing], two[facing]
-        away, turned = known[two, :3] - self.vertices[one], known[two, 3:] - self.normals[one]
-        frames = tangent_frames(self.normals)
+        away, turned = known[two, :3] - vertices[one], known[two, 3:] - normals[one]
+        frames = tangent_frames(normals)
         s = np.einsum("nai,ni->na", frames[one], away)
         t = np.einsum("nai,ni->na", frames[one], turned)
         # least squares of t = [[a, b], [b, c]] s
         A = np.zeros((len(s), 2, 3))
         A[:, 0, :2] = A[:, 1, 1:] = s
-        left, right = np.zeros((len(self.vertices), 3, 3)), np.zeros((len(self.vertices), 3))
+        left, right = np.zeros((len(vertices), 3, 3)), np.zeros((len(vertices), 3))
         np.add.at(left, one, np.einsum("nab,nac->nbc", A, A))
         np.add.at(right, one, np.einsum("nab,na->nb", A, t))
         fitted = np.einsum("vab,vb->va", np.linalg.pinv(left, rcond=1e-6), right)

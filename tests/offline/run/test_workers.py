@@ -1,9 +1,12 @@
 """Results on disk: whole ones only, of one process at a time."""
 
+import multiprocessing
+import os
 import signal
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
+import time
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 
 import pytest
 
@@ -40,6 +43,24 @@ def test_a_damaged_result_is_made_anew(tmp_path, capsys, damage):
         again = Checkpoint(tmp_path / "folder", "key").resume("tasks", executor, TASKS)
     assert again == expected == {f"task-{i}": 2 * i for i in range(4)}
     assert f"{path} is damaged; it is made anew" in capsys.readouterr().err
+
+
+def killed(_problem, number):
+    if number == 3:
+        time.sleep(1.0)  # while the others' results are stored
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_worker_that_is_killed_is_told_and_what_is_done_is_kept(tmp_path):
+    tasks = {f"task-{i}": (killed, i) for i in range(4)}
+    checkpoint = Checkpoint(tmp_path / "folder", "key")
+    with (
+        ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as executor,
+        pytest.raises(PalpateError, match="squares: a worker was killed"),
+    ):
+        checkpoint.resume("squares", executor, tasks)
+    assert "task-0" in checkpoint
+    assert "task-3" not in checkpoint
 
 
 HOLD = """
