@@ -27,7 +27,6 @@ from palpate.online.client.session import Session
 
 from .conftest import Server, process_memory
 
-RATE = 1000.0  # frames per second
 MANY = 900  # connections at once
 PIECE = 65536  # bytes that are sent at once
 HEAD = b"GET /health HTTP/1.1\r\nhost: localhost\r\n"
@@ -109,21 +108,21 @@ class Found(NamedTuple):
     statuses: str  # of /health, with their numbers
 
 
-def timed(session, seconds):
+def timed(session, rate, seconds):
     """Latencies (n,) µs of the frames of a circle in the tissue."""
     centre = np.array(session.greeting["example"]["position"])
     latencies, start = [], time.perf_counter()
-    for number in range(int(RATE * seconds)):
-        due = start + number / RATE
+    for number in range(int(rate * seconds)):
+        due = start + number / rate
         while (wait := due - time.perf_counter()) > 0.0:
             time.sleep(wait)
-        angle = 2.0 * np.pi * number / RATE
+        angle = 2.0 * np.pi * number / rate
         session.step(centre + 0.1 * np.array([np.cos(angle), np.sin(angle), 0.0]))
         latencies.append(1e6 * (time.perf_counter() - due))
     return np.array(latencies)
 
 
-def observed(session, server, seconds):
+def observed(session, server, rate, seconds):
     """Time a session and the service's health, and read its memory."""
     over, memory, health, statuses = threading.Event(), [], [], Counter()
 
@@ -141,7 +140,7 @@ def observed(session, server, seconds):
 
     watching = threading.Thread(target=watch)
     watching.start()
-    latencies = timed(session, seconds)
+    latencies = timed(session, rate, seconds)
     over.set()
     watching.join()
     told = ", ".join(f"{number} x {status}" for status, number in statuses.items())
@@ -152,8 +151,9 @@ def observed(session, server, seconds):
 @click.command()
 @click.argument("artifact", type=click.Path(exists=True, path_type=Path))
 @click.option("--seconds", default=20.0)
+@click.option("--rate", default=1000.0, help="Frames per second; fewer where alone it is behind.")
 @click.option("--only", default="", help="Attacks whose names contain this.")
-def main(artifact, seconds, only):
+def main(artifact, seconds, rate, only):
     """Print what was found alone and beside each attack."""
     print(f"{'':29}" + "".join(f"{name:>11}" for name in Found._fields))
     with tempfile.TemporaryDirectory() as folder:
@@ -170,11 +170,11 @@ def main(artifact, seconds, only):
             with Session(server.url, scene) as session:
                 with suppress(PermissionError):
                     os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), -5)
-                timed(session, 1.0)
-                show("alone", observed(session, server, seconds))
+                timed(session, rate, 1.0)
+                show("alone", observed(session, server, rate, seconds))
                 first = first.replace(b"%b", scene.encode())
                 with attacked(how, server.url, first, more):
-                    show(f"beside {name}", observed(session, server, seconds))
+                    show(f"beside {name}", observed(session, server, rate, seconds))
             server.stop()
             assert "Traceback" not in server.log
 
