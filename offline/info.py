@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from palpate.offline.bodies.report import in_words
 from palpate.shared.artifact import ArtifactError, read_artifact
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.local_models import LoadRange, Mesh
@@ -79,6 +80,7 @@ def lines(report: Mapping[str, Any]) -> list[str]:
         "body": ", ".join(f"{axis} {low:z.1f} to {high:.1f}" for axis, low, high in box)
         + f" mm; {report['body']['elements']} elements {scene.geometry.element}, "
         f"{report['body']['dofs']} DOFs",
+        **(in_words(report["training"]["file"]) if "file" in report["training"] else {}),
         "tissue": _tissue(scene),
         "held": scene.support.in_words(),
         "touchable": scene.surface.in_words(),

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from palpate.offline.bodies.places import boundary_of_corners
-from palpate.offline.bodies.report import report
+from palpate.offline.bodies.report import in_words, report
 from palpate.offline.choose.mesh import as_fine, candidates
 from palpate.offline.doubts import doubts
 from palpate.offline.fem.mesh import build_mesh, mesh_quality
-from palpate.offline.info import labelled, percent
+from palpate.offline.info import labelled
 from palpate.offline.pictures import INK, SHINE, STEEL, new_plotter, require_pyvista, save
 from palpate.offline.scenes import find_scene
 from palpate.shared.anatomy import FileBody
@@ -91,24 +91,7 @@ def _said(scene: Scene, mesh: Mesh) -> Mapping[str, str]:
     }
     if not isinstance(scene.geometry, FileBody):
         return said | {"volume": f"{mesh_quality(mesh)['volume_mm3']:.4g} mm³"}
-    told = report(scene)
-    quality, thick = told["quality"], told["thickness_mm"]
-    volume = f"{quality['volume_mm3']:.4g} mm³"
-    if "volume_change" in told:
-        gaps = told["deviation_mm"]
-        volume += f", {percent(abs(told['volume_change']))} from that of the file"
-        said["surface"] = (
-            f"the mesh is within {gaps['mesh_p95']:.2g} mm of the file's (95 of 100), the file's "
-            f"within {gaps['surface_p95']:.2g} of the mesh; at most {gaps['max']:.2g}"
-        )
-    return said | {
-        "volume": volume,
-        "elements": f"angles of {quality['dihedral_min']:.1f} degrees or more (99 of 100 "
-        f"{quality['dihedral_1_percent']:.1f}), scaled Jacobians of "
-        f"{quality['scaled_jacobian_min']:.2f} or more",
-        "thickness": f"{thick['median']:.2g} mm in the middle, {thick['p5']:.2g} or more at 95 of "
-        f"100 places; {told['thickness_over_edge']['p5']:.1f} elements or more through it there",
-    }
+    return said | in_words(report(scene))
 
 
 def _area(mesh: Mesh, chosen: Flags) -> float:

@@ -29,6 +29,7 @@ from scipy.interpolate import RBFInterpolator
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
+from palpate.offline.bodies.report import report
 from palpate.offline.choose.mesh import as_fine, candidates, with_mesh
 from palpate.offline.choose.size import Trial, choose, first_place, ladder, try_patch
 from palpate.offline.doubts import doubts
@@ -73,6 +74,7 @@ from palpate.offline.validate.compare import (
 )
 from palpate.offline.validate.queries import KINDS, Kind
 from palpate.shared import artifact
+from palpate.shared.anatomy import FileBody
 from palpate.shared.arrays import Array, Numbers
 from palpate.shared.local_models import Estimators, LoadRange, LocalModels
 from palpate.shared.mechanics.footprint import TIP_DEPTH
@@ -261,6 +263,8 @@ class Pipeline:
         compiled.result()
         size = self.scene.training.size
         training: dict[str, Any] = {"mesh": mesh_quality(self.problem.mesh)}
+        if isinstance(self.scene.geometry, FileBody):
+            training["file"] = report(self.scene)
         if size is None:
             scene, attempt = self.scene, partial(self._trial, limits)
             sizes = ladder(scene)

@@ -1,5 +1,6 @@
 """What is known of the body that comes from a file, and of its mesh."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,27 @@ def report(scene: Scene) -> dict[str, Any]:
         "volume_of_surface_mm3": float(mesh.volume),
         "volume_change": volume / float(mesh.volume) - 1.0,
         "deviation_mm": {name: gap for name, gap in gaps.items() if name != "place"},
+    }
+
+
+def in_words(told: Mapping[str, Any]) -> dict[str, str]:
+    """What a ``report`` says, for people, by what it is about."""
+    quality, thick = told["quality"], told["thickness_mm"]
+    volume, said = f"{quality['volume_mm3']:.4g} mm³", dict[str, str]()
+    if "volume_change" in told:
+        gaps = told["deviation_mm"]
+        volume += f", {abs(told['volume_change']):.2%} from that of the file"
+        said["surface"] = (
+            f"the mesh is within {gaps['mesh_p95']:.2g} mm of the file's (95 of 100), the file's "
+            f"within {gaps['surface_p95']:.2g} of the mesh; at most {gaps['max']:.2g}"
+        )
+    return said | {
+        "volume": volume,
+        "elements": f"as stored, angles of {quality['dihedral_min']:.1f} degrees or more (99 of "
+        f"100 {quality['dihedral_1_percent']:.1f}), scaled Jacobians of "
+        f"{quality['scaled_jacobian_min']:.2f} or more",
+        "thickness": f"{thick['median']:.2g} mm in the middle, {thick['p5']:.2g} or more at 95 of "
+        f"100 places; {told['thickness_over_edge']['p5']:.1f} elements or more through it there",
     }
 
 
