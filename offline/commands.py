@@ -96,7 +96,9 @@ def reporting(command: Callable[..., Report]) -> Callable[..., None]:
         width = max(len(name) for name, _ in leaves)
         for name, value in leaves:
             unit = UNITS.get(".".join(name.split(".")[-2:]), "")
-            click.echo(f"{name:<{width}}  {_text(value)} {unit}".rstrip())
+            click.echo(
+                f"{name:<{width}}  {_text(value)} {unit if value is not None else ''}".rstrip()
+            )
 
     return show
 
@@ -105,7 +107,9 @@ def _text(value: object) -> str:
     """A value in four digits, those of a list one after the other."""
     if isinstance(value, list | tuple):
         return ", ".join(f"({_text(v)})" if isinstance(v, list) else _text(v) for v in value) or "-"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    if value is None:
+        return "-"
+    return f"{value:z.4g}" if isinstance(value, float) else str(value)
 
 
 def _json(report: Report) -> str:
@@ -225,7 +229,7 @@ def train(
     from palpate.offline.train import check, train
 
     if scheduler is not None:
-        _need({}, {"workers": workers, "check": only_check})
+        _need({}, {"workers": workers, "check": only_check}, "beside --scheduler")
     if only_check:
         click.echo(f"{check(scene, workers)}\nnothing is wrong; next: palpate train {scene}")
         return
@@ -308,11 +312,12 @@ def solve(table: Path | None, out: Path | None, tip: bool, **request: Any) -> Re
         from palpate.offline.table import solve_table
 
         artifact, young = request.pop("artifact"), request.pop("young")
-        _need({"--out": out}, request)
+        _need({"--out": out}, request, "beside --csv")
         return solve_table(artifact, table, out or table, tip, young)
-    _need({"--at": request["position"]}, {"out": out})
+    _need({"--at": request["position"]}, {"out": out}, "without --csv")
     if tip:
-        _need({}, {key: request[key] for key in ("pressure", "direction", "radius")})
+        loads = {key: request[key] for key in ("pressure", "direction", "radius")}
+        _need({}, loads, "beside --tip")
     else:
         _need({"--pressure": request["pressure"]}, {})
     from palpate.offline.solve import solve
@@ -337,15 +342,15 @@ def identify(artifact: Path, recording: Path) -> Report:
     return identify(artifact, recording)
 
 
-def _need(needed: Mapping[str, object], without: Mapping[str, object]) -> None:
-    """Refuse options that are missing, and those that make no sense beside the others."""
+def _need(needed: Mapping[str, object], without: Mapping[str, object], why: str = "") -> None:
+    """Refuse options that are missing, and those that make no sense, and say beside what."""
     for option, value in needed.items():
         if value is None:
             raise click.UsageError(f"Missing option '{option}'.")
     for name, value in without.items():
         if value is not None and value is not False:
             option = "at" if name == "position" else name.replace("_", "-")
-            raise click.UsageError(f"'--{option}' makes no sense here.")
+            raise click.UsageError(f"'--{option}' makes no sense {why}.")
 
 
 @click.command()

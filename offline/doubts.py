@@ -1,11 +1,13 @@
 """What a scene may say and most likely does not mean: other units, sizes that do not fit."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
+from palpate.offline.fem.section import bulge, read_outline
 from palpate.shared.arrays import Array
-from palpate.shared.scene import Scene
+from palpate.shared.scene import Extrusion, Scene
 
 SMALLEST, LARGEST = 2.0, 1000.0
 """Sizes of a body, mm."""
@@ -15,6 +17,9 @@ SOFTEST, STIFFEST = 0.1, 1000.0
 
 SLENDEREST = 0.01
 """Radius of a tip over the size of the body; a liver's is a thirtieth."""
+
+BULGE = 0.02
+"""How far a smooth outline strays from the lines between its points, over its extent."""
 
 SLIGHT = 2.0
 """Largest tilt, degrees, that may be one in radians."""
@@ -35,3 +40,17 @@ def doubts(scene: Scene, nodes: Array) -> Iterator[str]:
         yield f"endoscope.radius = {radius:g}: its tip is tiny beside the body of {body}"
     if 0.0 < tilt < SLIGHT:
         yield f"endoscope.max_tilt = {tilt:g}: angles are in degrees"
+    if isinstance(scene.geometry, Extrusion) and scene.folder is not None:
+        yield from _bulges(scene.folder / scene.geometry.section)
+
+
+def _bulges(file: Path) -> Iterator[str]:
+    """Say where the smooth outline of a section is another one than its points may mean."""
+    points = read_outline(file)
+    gap, (x, z) = bulge(points)
+    if gap > BULGE * np.ptp(points, axis=0).max():
+        yield (
+            f"geometry.section: the smooth curve through its {len(points)} points strays {gap:.2g} "
+            f"mm from the straight lines between them, near ({x:.3g}, {z:.3g}); give more points "
+            "there"
+        )

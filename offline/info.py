@@ -123,7 +123,7 @@ def trust(report: Mapping[str, Any]) -> dict[str, str]:
         said[label.replace("errors", "trust")] = (
             f"covers 95 % of errors, confidence {percent(found['confidence'])}; doubts "
             + (f"{percent(flagged['share'])} of right ones" if flagged["right"] else "all")
-            + (f", most for {flagged['mostly']}" if flagged["mostly"] else "")
+            + (f", most for {flagged['mostly']}" if flagged["mostly"] and flagged["share"] else "")
         )
     return said
 
@@ -180,11 +180,11 @@ def closing(artifact: Path) -> list[str]:
             f"this is more than the {asked} that the scene leaves the reduction; most errors are "
             "near the limits: a smaller load.max_indentation lowers them"
         )
-    for label, _, mesh in _validations(report):
+    for label, found, mesh in _validations(report):
         over = [
             f"{COLUMNS[name]} {percent(mesh[name]['p95'])} (tolerance {percent(allowed)})"
             for name, allowed in tolerance.total._asdict().items()
-            if name in mesh and mesh[name]["p95"] > allowed
+            if name in found and name in mesh and mesh[name]["p95"] > allowed
         ]
         if over:
             errors.append(

@@ -16,7 +16,7 @@ from palpate.offline.doubts import doubts
 from palpate.offline.fem.mesh import build_mesh, mesh_quality
 from palpate.offline.info import labelled
 from palpate.offline.pictures import INK, SHINE, STEEL, new_plotter, require_pyvista, save
-from palpate.offline.scenes import find_scene
+from palpate.offline.scenes import opened_scene
 from palpate.shared.anatomy import FileBody
 from palpate.shared.arrays import Array, Flags
 from palpate.shared.local_models import Mesh
@@ -49,7 +49,12 @@ def look(scene: str | Path, out: Path | None = None) -> tuple[Path, list[str]]:
         surface are wrong the body is drawn all the same, without them.
     """
     require_pyvista()
-    found = find_scene(scene)
+    with opened_scene(scene) as found:
+        return _look(found, out)
+
+
+def _look(found: Scene, out: Path | None) -> tuple[Path, list[str]]:
+    """Draw a scene that is read; see ``look``."""
     if not isinstance(found.geometry, FileBody) and found.fineness_of_mesh is None:
         found = as_fine(found, candidates(found)[0])
     path = out or Path("artifacts") / found.name / "report" / "look.png"
@@ -129,7 +134,7 @@ def _draw(scene: Scene, mesh: Mesh, out: Path) -> None:
             color=INK,
         )  # fmt: skip
         plotter.show_bounds(
-            xtitle="x, mm", ytitle="y, mm", ztitle="z, mm", color=INK, font_size=10, fmt="%.0f",
+            xtitle="x, mm", ytitle="y, mm", ztitle="z, mm", color=INK, font_size=10, fmt="%.3g",
             bounds=np.column_stack([low, high]).ravel(), location="outer",
         )  # fmt: skip
         _turn(plotter, way, mesh.nodes)

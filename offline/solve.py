@@ -143,6 +143,7 @@ def cautions(atlas: ReducedModel, answer: Answer) -> Iterator[str]:
         )
     for name in answer.out_of_range:
         limit = f" of {answer.pressure_limit:.3g} kPa" if name == "pressure" else ""
+        limit = f" of {answer.depth_limit:.3g} mm" if name == "depth" else limit
         yield f"{name} is outside the trained range{limit}: the error is unknown"
     beyond = [
         f"{name} {percent(getattr(answer, f'error_{name}'))} "

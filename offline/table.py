@@ -25,6 +25,8 @@ FOUND = (
 )  # fmt: skip
 """Of ``Answers``; vectors have three columns, such as ``force_x``."""
 
+NOT_OF_TIP = ("contact_displacement",)
+
 
 def solve_table(
     artifact: Path, table: Path, out: Path, tip: bool, young: float | None = None
@@ -64,6 +66,8 @@ def solve_table(
     for said in _cautions(answers, atlas.scene.tolerance, tip):
         print(f"Warning: {said}", file=sys.stderr)
     for name in FOUND:
+        if tip and name in NOT_OF_TIP:
+            continue
         values = getattr(answers, name)
         parts = values.T if values.ndim == 2 else [values]
         ends = ("_x", "_y", "_z") if values.ndim == 2 else ("",)

@@ -83,11 +83,12 @@ class Extrusion(Part):
     )
     section: str = Field(
         min_length=1,
-        description="CSV file beside the scene file: a line x,z, then 8 or more points around, mm",
+        description="CSV file beside the scene file: a line x,z, then 8 or more points around, mm, "
+        "the first not repeated; a smooth curve runs through them, so sharp corners need many",
     )
     corners: tuple[Point2, Point2, Point2, Point2] = Field(
-        description="points (x, z) of the outline, mm, clockwise (x right, z up); between them lie "
-        "outer, tip, inner and lip"
+        description="points (x, z) of the outline, mm, clockwise (x right, z up); the side outer "
+        "runs from the first to the second, then tip, inner, and lip back to the first"
     )
     length: Length = Field(description="length along y, mm")
     element: Element = "hex20"
@@ -238,7 +239,10 @@ class Training(Part):
     region_spacing: Length = in_radii(3.75, "distance of the regions that share a basis, mm")
     blend: Positive = in_radii(0.1, "width over which neighbouring local models blend, mm")
     samples: int = Field(
-        300, ge=60, description="full solutions to validate by; fewer for a looser tolerance"
+        300,
+        ge=60,
+        description="full solutions to validate by, 60 or more; fewer are made for a looser "
+        "tolerance",
     )
     size: Size | None = _chosen(
         "the smallest that meets the tolerance", "how large the reduced model is"
@@ -439,7 +443,10 @@ def _explain(detail: dict[str, Any]) -> str:
     table = tables.get(tuple(step for step in loc[:-1] if step not in WITHIN))
     if table and kind == "extra_forbidden":
         near = difflib.get_close_matches(loc[-1], table.model_fields, n=1, cutoff=0.5)
-        return f"{path}: unknown key" + (f"; did you mean {near[0]!r}?" if near else "")
+        known = (
+            f"did you mean {near[0]!r}?" if near else f"known are {', '.join(table.model_fields)}"
+        )
+        return f"{path}: unknown key; {known}"
     if table and kind == "missing":
         return f"{path}: missing ({table.model_fields[loc[-1]].description})"
     if kind in ("union_tag_not_found", "union_tag_invalid"):

@@ -218,7 +218,8 @@ def _reason(
         )
     allowed = 1e6 * budget.query
     if chosen.solve_us > allowed:
-        why += f"; it takes {chosen.solve_us:.0f} µs to solve, over the budget of {allowed:.0f} µs"
+        why += f"; it takes {chosen.solve_us:.0f} µs to solve, over the budget of "
+        why += f"{allowed:.0f} µs (budget.query), which a looser tolerance keeps"
         within = [trial for trial in tried if trial.solve_us <= allowed]
         if within:
             why += f"; the best within it: {within[-1]} in {within[-1].solve_us:.0f} µs"

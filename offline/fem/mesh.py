@@ -135,7 +135,8 @@ def _refuse_inverted(nodes: Array, elements: Numbers) -> None:
         x, y, z = nodes[elements[np.argmin(least)]].mean(axis=0)
         raise SceneError(
             f"geometry: {np.sum(~(least > 0))} of {len(elements)} elements are inverted, the worst "
-            f"near ({x:.2f}, {y:.2f}, {z:.2f}) mm; change divisions, grading or corners"
+            f"near ({x:.2f}, {y:.2f}, {z:.2f}) mm; change divisions, grading or corners, or "
+            "give the outline more points"
         )
 
 

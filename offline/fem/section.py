@@ -30,6 +30,12 @@ TURN, TURNING = 0.2, 2.0
 which it does, at most a third of the side: elements in the corner of a smooth outline would have
 no volume.  The outline moves by .15 of their product at most, .06 mm."""
 
+BETWEEN = 9
+"""Places on the line between two points at which the outline is compared with it."""
+
+ON_OUTLINE = 0.02
+"""How far a corner may lie from the outline, over its length."""
+
 Section = Callable[[ArrayLike, ArrayLike], Array]
 """Points (..., 2) mm for parameters u, v (...): u runs from the lip (0) to the tip (1), v from the
 inner (0) to the outer side (1)."""
@@ -58,12 +64,17 @@ def read_outline(path: Path) -> Array:
         If the file cannot be read, has fewer than 8 points, repeats one or crosses itself.
     """
     content = read_section(path)
+    if not re.match(rb".*[A-Za-z]", content):
+        raise SceneError(
+            f"geometry.section: {path} cannot be read: its first line must name the columns, x,z"
+        )
     try:
-        if not re.match(rb".*[A-Za-z]", content):
-            raise ValueError("its first line must name the columns, x,z")
         points = np.loadtxt(io.BytesIO(content), delimiter=",", skiprows=1, ndmin=2)
     except ValueError as error:
-        raise SceneError(f"geometry.section: {path} cannot be read: {error}") from error
+        raise SceneError(
+            f"geometry.section: {path} cannot be read: below its first line must be two numbers "
+            f"a line with a comma between; {error}"
+        ) from error
     if points.ndim != 2 or points.shape[1] != 2 or len(points) < 8 or not np.isfinite(points).all():
         raise SceneError(f"geometry.section: {path} must hold at least 8 rows of finite x, z")
     if (np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1) == 0).any():
@@ -75,6 +86,23 @@ def read_outline(path: Path) -> Array:
             f"geometry.section: {path} crosses itself between points {one} and {other}"
         )
     return points if polygon_area(points) < 0 else points[::-1]
+
+
+def bulge(points: Array) -> tuple[float, Array]:
+    """How far (mm) the smooth outline strays from straight lines between its points, and where."""
+    curve, arc = smooth(points)
+    ends = np.linspace(arc[:-1], arc[1:], BETWEEN, axis=1)  # (n, BETWEEN) along each line
+    share = np.linspace(0.0, 1.0, BETWEEN)[:, None]
+    lines = (1.0 - share) * points[:, None] + share * np.roll(points, -1, axis=0)[:, None]
+    away = np.linalg.norm(curve(ends) - lines, axis=2)
+    return float(away.max()), curve(ends.ravel()[away.argmax()])
+
+
+def smooth(points: Array) -> tuple[CubicSpline, Array]:
+    """The smooth outline by its arc length (mm) along the polygon, and that of its points."""
+    closed = np.vstack([points, points[:1]])
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+    return CubicSpline(arc, closed, bc_type="periodic"), arc
 
 
 def polygon_area(points: Array) -> float:
@@ -152,13 +180,18 @@ class _Boundary:
     """A smooth outline cut into four sides, of arc lengths ``outer, tip, inner, lip`` (mm)."""
 
     def __init__(self, points: Array, corners: ArrayLike) -> None:
-        closed = np.vstack([points, points[:1]])
-        arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
-        self._curve = CubicSpline(arc, closed, bc_type="periodic")
+        self._curve, arc = smooth(points)
         dense = np.linspace(0.0, arc[-1], 40 * len(points), endpoint=False)
-        gaps = np.linalg.norm(np.asarray(corners)[:, None] - self._curve(dense)[None], axis=2)
-        if (gaps.min(axis=1) > 0.02 * arc[-1]).any():
-            raise SceneError("geometry.corners: must lie on the outline of the section")
+        curve, most = self._curve(dense), ON_OUTLINE * arc[-1]
+        gaps = np.linalg.norm(np.asarray(corners)[:, None] - curve[None], axis=2)
+        for number, (x, z) in enumerate(np.asarray(corners).tolist()):
+            gap = gaps[number].min()
+            if gap > most:
+                near = ", ".join(f"{c:.3g}" for c in curve[gaps[number].argmin()])
+                raise SceneError(
+                    f"geometry.corners.{number} = [{x:g}, {z:g}]: lies {gap:.2g} mm from the "
+                    f"outline of the section, and may lie {most:.2g}; nearest is [{near}]"
+                )
         self._starts = dense[gaps.argmin(axis=1)]
         sides = np.diff(self._starts, append=self._starts[0]) % arc[-1]
         if not np.isclose(sides.sum(), arc[-1]) or sides.min() < 0.01 * arc[-1]:

@@ -194,7 +194,7 @@ REFUSED = {
     "train same.toml": "same.toml: surface: the support holds all of it",
     "train headless.toml": "headless.toml: geometry.section: headless.csv cannot be read: its",
     "train --check same.toml": "same.toml: surface: the support holds all of it",
-    "train --check corners.toml": "corners.toml: geometry.corners: must lie on the outline",
+    "train --check corners.toml": "corners.toml: geometry.corners.",
     "study convergence same.toml": "same.toml: surface: the support holds all of it",
     "info nested.toml": "'nested.toml' is a scene; palpate train nested.toml makes its artifact",
     "train nested.toml": "nested.toml: not TOML: maximum recursion depth",

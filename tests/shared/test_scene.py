@@ -100,7 +100,11 @@ def test_mesh_and_reduction_together_have_the_tolerance() -> None:
         ("seed = 1", "seed = = 1", r"not TOML.*line 4"),
         ("young", "yuong", r"tissue.yuong: unknown key; did you mean 'young'\?"),
         ("[budget]", "[bugdet]", r"bugdet: unknown key; did you mean 'budget'\?"),
-        ("radius", "xyzzy", r"endoscope.xyzzy: unknown key$"),
+        (
+            "radius",
+            "xyzzy",
+            r"endoscope.xyzzy: unknown key; known are radius, max_tilt, reach, tip$",
+        ),
         ("size", "sise", r"geometry.sise: unknown key; did you mean 'size'\?"),
         ("young = 15.0\n", "", r"tissue.young: missing \(Young's modulus at rest, kPa\)"),
         (

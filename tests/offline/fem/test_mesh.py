@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from palpate.offline.doubts import doubts
 from palpate.offline.fem.mesh import (
     accessible_surface,
     build_mesh,
@@ -16,7 +17,7 @@ from palpate.offline.fem.mesh import (
     ticks_of,
 )
 from palpate.offline.fem.problem import FullProblem
-from palpate.offline.fem.section import TURN, map_section, polygon_area, read_outline
+from palpate.offline.fem.section import TURN, bulge, map_section, polygon_area, read_outline
 from palpate.offline.fem.shapes import shape_of
 from palpate.offline.scenes import FOLDER, filled, find_scene, shipped_scenes
 from palpate.shared.geometry.elements import HEX_EDGES
@@ -269,7 +270,12 @@ def test_local_thickness():
         ("quick", '"top"', '"top"\ny = [-2, -1]', "surface: no face"),
         ("quick", '"bottom"', '"top"', "surface: the support holds all of it"),
         ("turbinate-paper", "turbinate_section", "nothing", "section: .* cannot be read"),
-        ("turbinate-paper", "[1.2, 2.9]", "[3.2, 7.0]", "corners: must lie on the outline"),
+        (
+            "turbinate-paper",
+            "[1.2, 2.9]",
+            "[3.2, 7.0]",
+            r"corners.1 = \[3.2, 7\]: lies 1.* mm from the",
+        ),
         (
             "turbinate-paper",
             "[[4.3, 17.7], [1.2, 2.9]",
@@ -329,3 +335,21 @@ def test_a_round_section_keeps_its_area_whichever_way_its_outline_runs(tmp_path)
 def test_bad_outlines_are_refused(tmp_path, points, message):
     with pytest.raises(SceneError, match=message):
         read_back(tmp_path, points)
+
+
+def test_an_outline_of_few_points_is_doubted_and_a_drawn_one_is_not():
+    points = [(0, 0), (0, 2), (0, 4), (4, 4), (8, 4), (12, 4), (12, 2), (12, 0), (8, 0), (4, 0)]
+    gap, place = bulge(np.array(points, float))
+    assert gap == pytest.approx(0.64, abs=0.01)
+    assert np.linalg.norm(place - [1.05, 4.45]) < 0.1
+    scene = find_scene("turbinate")
+    assert bulge(read_outline(FOLDER / scene.geometry.section))[0] < 0.03
+    assert not any("smooth curve" in doubt for doubt in doubts(scene, np.eye(3) * 20))
+
+
+def test_a_sparse_outline_is_told(tmp_path):
+    text = "x,z\n0,0\n0,2\n0,4\n4,4\n8,4\n12,4\n12,2\n12,0\n8,0\n4,0\n"
+    (tmp_path / "inferior_turbinate_section.csv").write_text(text)
+    scene = parse_scene(find_scene("turbinate").text, tmp_path)
+    (doubt,) = (doubt for doubt in doubts(scene, 20 * np.eye(3)) if "smooth curve" in doubt)
+    assert "through its 10 points strays 0.64 mm from the straight lines" in doubt

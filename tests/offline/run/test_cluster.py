@@ -239,7 +239,7 @@ def test_where_no_scheduler_is_that_is_told(scheduler, tmp_path, monkeypatch):
 def test_workers_and_a_scheduler_exclude_each_other(run):
     result = run("train", "quick", "--scheduler", "scheduler.json", "--workers", 2)
     assert result.exit_code == 2
-    assert "'--workers' makes no sense here" in result.output
+    assert "'--workers' makes no sense beside --scheduler" in result.output
 
 
 def named(section):
