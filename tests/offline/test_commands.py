@@ -38,7 +38,7 @@ def test_info(answer, artifact):
 def test_info_for_people_is_ten_lines_in_units_and_for_who_asks_a_table_of_errors(run, artifact):
     lines = run("info", artifact).stdout.splitlines()
     assert len(lines) == 10
-    assert lines[0].startswith("scene          quick: A thin slab")
+    assert lines[0].startswith("scene          quick: A coarse slab")
     assert "Young's modulus at rest 15 kPa" in lines[2]
     share = r"[\d.]+ %"
     own = f"displacement {share}, von Mises {share}"
@@ -182,7 +182,7 @@ REFUSED = {
     "validate text.h5": "text.h5: not an artifact of this software",
     "bench text.h5": "text.h5: not an artifact of this software",
     f"solve cube {AT} 1": "neither a file 'cube' nor artifacts/cube.h5, which palpate train",
-    "train septum": "neither a .toml file nor one of cube, cube-visco, layer, liver, quick",
+    "train septum": "neither a .toml file nor one of cube, cube-visco, layer, liver, pad, quick",
     "study stability cube": "cube.h5: cannot be read: No such file",
     "study relaxation A": "is elastic",
     "study chart-in-time A": "is elastic",
