@@ -30,6 +30,9 @@ from palpate.shared.scene import Divisions, Errors, Scene, SceneError, parse_sce
 COARSEST, FINER, SIZES = 1.0, 0.8, 7
 """Edge of the largest elements over the endoscope's radius, ratio of the next, and their number."""
 
+AS_STORED = 2.0
+"""The same of a body from a file, over that: its stored mesh is about so coarse."""
+
 MOST_DOFS = 40_000
 """Of a mesh that is tried."""
 
@@ -114,7 +117,7 @@ def candidates(scene: Scene) -> Sequence[Divisions | float]:
     """From coarse to fine: divisions whose elements are about as long as wide, or finest edges."""
     edges = [COARSEST * FINER**k * scene.endoscope.radius for k in range(SIZES)]
     if isinstance(scene.geometry, FileBody):
-        return [round(edge, 4) for edge in edges]
+        return [round(AS_STORED * edge, 4) for edge in edges]
     even = np.linspace(0, 1, PROBE + 1)
     grid = shape_of(scene).grid(even, even, even)
     steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).mean() for axis in range(3)]
