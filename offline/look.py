@@ -19,6 +19,7 @@ from palpate.offline.pictures import INK, SHINE, STEEL, new_plotter, require_pyv
 from palpate.offline.scenes import opened_scene
 from palpate.shared.anatomy import FileBody
 from palpate.shared.arrays import Array, Flags
+from palpate.shared.geometry.elements import face_kind_of
 from palpate.shared.local_models import Mesh
 from palpate.shared.scene import Scene, SceneError
 
@@ -75,12 +76,7 @@ def _held(mesh: Mesh) -> Flags:
 
 def _corners(mesh: Mesh) -> Array:
     """Corners (f, 3 or 4, 3) mm of the boundary's faces."""
-    return mesh.nodes[mesh.faces[:, : _sides(mesh)]]
-
-
-def _sides(mesh: Mesh) -> int:
-    """How many sides the boundary's faces have."""
-    return 3 if mesh.faces.shape[1] == 6 else 4
+    return mesh.nodes[mesh.faces[:, : face_kind_of(mesh.faces).corners]]
 
 
 def _said(scene: Scene, mesh: Mesh) -> Mapping[str, str]:
@@ -152,7 +148,7 @@ def _faces(mesh: Mesh, chosen: Flags) -> Any:
 def _edges(mesh: Mesh) -> Any:
     """The sides of all faces as lines, a little above the body."""
     pv = require_pyvista()
-    corners = _sides(mesh)
+    corners = face_kind_of(mesh.faces).corners
     ways = [mesh.faces[:, :corners], np.roll(mesh.faces[:, :corners], -1, axis=1)]
     if mesh.faces.shape[1] > corners:
         ways.insert(1, mesh.faces[:, corners:])

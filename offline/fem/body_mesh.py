@@ -5,6 +5,7 @@ parameters.  Those of a body from a file divide one base mesh (``bodies.refine``
 a node is found.
 """
 
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -28,40 +29,66 @@ from palpate.shared.scene import Scene
 
 
 class BodyMesh(Protocol):
-    """A mesh of a body; ``sites`` (n, ...) say where in the body its nodes lie."""
+    """A mesh of a body, whose parts are made when they are first asked for."""
 
-    mesh: Mesh
-    sites: Array
-    surface: Surface | None  # that can be touched, if it is not that of the mesh's own faces
+    @property
+    def mesh(self) -> Mesh:
+        """The mesh itself."""
+
+    @property
+    def sites(self) -> Array:
+        """Where in the body its nodes lie, (n, ...)."""
+
+    @property
+    def surface(self) -> Surface | None:
+        """The surface that can be touched, if it is not that of the mesh's own faces."""
 
     def at(self, sites: Array, field: Array) -> Array:
         """A nodal field (n, ...) of this mesh at sites (k, ...) of another one."""
 
 
 class LatticeMesh:
-    """A lattice of hexahedra."""
+    """A lattice of hexahedra; sites are parameters (n, 3)."""
 
     surface: Surface | None = None
 
     def __init__(self, scene: Scene, ticks: Ticks) -> None:
-        self.mesh, self.sites = build_mesh(scene, ticks), parameters_of(scene, ticks)
-        self._ticks = ticks
+        self._scene, self._ticks = scene, ticks
+
+    @cached_property
+    def mesh(self) -> Mesh:
+        """See ``BodyMesh``."""
+        return build_mesh(self._scene, self._ticks)
+
+    @cached_property
+    def sites(self) -> Array:
+        """See ``BodyMesh``."""
+        return parameters_of(self._scene, self._ticks)
 
     def at(self, sites: Array, field: Array) -> Array:
-        """See ``BodyMesh``; sites are parameters (k, 3)."""
+        """See ``BodyMesh``."""
         return interpolated(self._ticks, self.mesh.elements, sites, field)
 
 
 class NestedMesh:
-    """Tetrahedra that divide those of the base mesh."""
+    """Tetrahedra that divide those of the base mesh; sites are those of ``Refined``."""
 
     def __init__(self, scene: Scene, refined: Refined) -> None:
-        self.mesh, self.sites = mesh_of(scene, refined), refined.sites
-        self.surface: Surface | None = accessible_surface(self.mesh, scene)
-        self._refined = refined
+        self._scene, self._refined = scene, refined
+        self.sites = refined.sites
+
+    @cached_property
+    def mesh(self) -> Mesh:
+        """See ``BodyMesh``."""
+        return mesh_of(self._scene, self._refined)
+
+    @cached_property
+    def surface(self) -> Surface | None:
+        """See ``BodyMesh``."""
+        return accessible_surface(self.mesh, self._scene)
 
     def at(self, sites: Array, field: Array) -> Array:
-        """See ``BodyMesh``; sites are those of ``Refined``."""
+        """See ``BodyMesh``."""
         return self._refined.at(sites, field)
 
 

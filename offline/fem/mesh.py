@@ -261,14 +261,13 @@ def accessible_surface(mesh: Mesh, scene: Scene | None = None) -> Surface:
     7 um and .7 degrees, which a tip that is .1 mm deep feels as a tenth of its force, and what
     hangs from a lip as a push aside.  That of a body from a file is of its stored mesh's faces.
     """
-    from_file = scene is not None and isinstance(scene.geometry, FileBody)
-    if scene is not None and from_file:
-        mesh = stored_mesh(scene)
+    if scene is not None and isinstance(scene.geometry, FileBody):
+        mesh, scene = stored_mesh(scene), None
     faces = mesh.faces[mesh.accessible]
     kind = face_kind_of(faces)
     grid, cells = kind.cells(*_counts(kind, mesh.nodes[faces]))
     N, dN = kind.shape(grid)
-    if scene is None or from_file:
+    if scene is None:
         points, normals = N @ mesh.nodes[faces], N @ _nodal_normals(mesh, faces)[faces]
     else:
         points, normals = _on_body(scene, N, dN, faces)

@@ -10,17 +10,10 @@ from palpate.offline.scenes import find_scene
 from palpate.offline.train import train
 from palpate.shared.model import ReducedModel
 
-from .conftest import bricks
+from .conftest import SCENE, bricks
 from .test_mesh_file import tetrahedra, written
 
-SCENE = """
-name = "box"
-tissue.law = "neo-hookean"
-tissue.young = 15.0
-tissue.poisson = 0.45
-endoscope.radius = 4.0
-endoscope.max_tilt = 30.0
-load.max_indentation = 0.12
+BOX = """
 tolerance.displacement = 0.2
 tolerance.von_mises = 0.5
 support.z = [-0.1, 0.1]
@@ -43,7 +36,8 @@ def file(tmp_path_factory):
     folder = tmp_path_factory.mktemp("box")
     points, cells = bricks((3, 3, 2), (12.0, 12.0, 8.0))
     written(folder / "box.vtu", points, [("tetra", tetrahedra(points, cells))])
-    (folder / "box.toml").write_text(SCENE)
+    body = SCENE.replace('"body"', '"box"')
+    (folder / "box.toml").write_text(body.replace("0.15", "0.12") + BOX)
     return folder / "box.toml"
 
 
