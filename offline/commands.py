@@ -3,6 +3,7 @@
 Each imports what it runs when it runs, so that ``--help`` is instant.
 """
 
+import signal
 from collections.abc import Callable, Iterator, Mapping
 from functools import wraps
 from pathlib import Path
@@ -233,6 +234,7 @@ def train(
     if only_check:
         click.echo(f"{check(scene, workers)}\nnothing is wrong; next: palpate train {scene}")
         return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as an interrupt does
     try:
         artifact = train(scene, out, workers, force, scheduler)
     except KeyboardInterrupt:

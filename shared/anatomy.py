@@ -4,7 +4,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from palpate.shared.part import Length, Part, in_radii
+from palpate.shared.part import Length, Part, in_radii, optional
 
 Unit = Annotated[Literal["mm", "cm", "m"], Field(description="of lengths in the file: mm, cm or m")]
 
@@ -29,10 +29,8 @@ class _OfFile(Part):
     sides: ClassVar = ()
     element: ClassVar = "tet10"
     fineness: ClassVar = "finest"
-    finest: Length | None = Field(
-        None,
-        description="longest edges of elements where it can be touched, mm",
-        json_schema_extra={"absent": CHOSEN},
+    finest: Length | None = optional(
+        CHOSEN, "longest edges of elements where it can be touched and where what is held ends, mm"
     )
 
 
@@ -62,12 +60,9 @@ class LabelBody(_OfFile):
         min_length=1, description="NIfTI (.nii, .nii.gz) or NRRD file beside the scene file"
     )
     labels: tuple[Label, ...] = Field(min_length=1, description="numbers of the body's labels")
-    smoothing: float | None = Field(
-        None,
-        ge=0,
-        le=100,
-        description="standard deviation of the Gauss filter that rounds the steps of voxels, mm",
-        json_schema_extra={"absent": "half the longest edge of a voxel"},
+    smoothing: Annotated[float, Field(ge=0, le=100)] | None = optional(
+        "half the longest edge of a voxel",
+        "standard deviation of the Gauss filter that rounds the steps of voxels, mm",
     )
     deviation: Deviation
     edge: Edge

@@ -15,6 +15,11 @@ class Part(BaseModel):
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
 
+def optional(absent: str, description: str) -> Any:
+    """Field that may be absent; what stands for it then is no value, but said in words."""
+    return Field(None, description=description, json_schema_extra={"absent": absent})
+
+
 def in_radii(multiple: float, description: str) -> Any:
     """Field of a length (mm) that is a multiple of the endoscope's radius unless it is given."""
     extra: Any = {"absent": f"{multiple:g} radii of the endoscope", "radii": multiple}

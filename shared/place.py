@@ -7,21 +7,16 @@ not.
 
 import math
 from collections.abc import Iterator
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, ClassVar, Self
 
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from palpate.shared.part import Length, Part
+from palpate.shared.part import Length, Part, optional
 
 Range = tuple[float, float]
 Point = tuple[float, float, float]
 Angle = Annotated[float, Field(gt=0, lt=180)]
-
-
-def _unless(absent: str, description: str) -> Any:
-    """Field that may be absent, and what then holds in words."""
-    return Field(None, description=description, json_schema_extra={"absent": absent})
 
 
 class Patch(Part):
@@ -30,29 +25,31 @@ class Patch(Part):
     together: ClassVar = (("normal", "within"), ("near", "radius"), ("close_to", "distance"))
     """Keys that say nothing without each other."""
 
-    side: str | None = _unless("all sides", "side of a block or an extrusion, such as top or outer")
-    x: Range | None = _unless("all of it", "[from, to] mm")
-    y: Range | None = _unless("all of it", "[from, to] mm")
-    z: Range | None = _unless("all of it", "[from, to] mm")
-    normal: Point | None = _unless("all of it", "direction [x, y, z] of outward normals")
-    within: Angle | None = _unless(
+    side: str | None = optional(
+        "all sides", "side of a block or an extrusion, such as top or outer"
+    )
+    x: Range | None = optional("all of it", "[from, to] mm")
+    y: Range | None = optional("all of it", "[from, to] mm")
+    z: Range | None = optional("all of it", "[from, to] mm")
+    normal: Point | None = optional("all of it", "direction [x, y, z] of outward normals")
+    within: Angle | None = optional(
         "needed with normal", "largest angle of outward normals to it, degrees"
     )
-    near: Point | None = _unless("all of it", "point [x, y, z] mm")
-    radius: Length | None = _unless("needed with near", "largest distance from that point, mm")
-    close_to: str | None = _unless(
+    near: Point | None = optional("all of it", "point [x, y, z] mm")
+    radius: Length | None = optional("needed with near", "largest distance from that point, mm")
+    close_to: str | None = optional(
         "all of it", "file of another surface (STL, OBJ, PLY), in the unit of the body's own"
     )
-    distance: Length | None = _unless(
+    distance: Length | None = optional(
         "needed with close_to", "largest distance from that surface, mm"
     )
-    set: str | None = _unless(
+    set: str | None = optional(
         "all of it", "named set of the body's file; of labels, one that the body borders on"
     )
-    any: tuple["Patch", ...] | None = _unless(
+    any: tuple["Patch", ...] | None = optional(
         "all of it", "list of such tables, one of which holds"
     )
-    without: "Patch | None" = _unless("nothing", "such a table, which does not hold")
+    without: "Patch | None" = optional("nothing", "such a table, which does not hold")
 
     @model_validator(mode="after")
     def _says_a_place(self) -> Self:

@@ -32,7 +32,7 @@ from palpate.shared.anatomy import CHOSEN, FileBody, LabelBody, MeshBody, Surfac
 from palpate.shared.errors import PalpateError
 from palpate.shared.files import open_regular
 from palpate.shared.mechanics.laws import AnyTissue
-from palpate.shared.part import Fraction, Length, Part, Positive, in_radii
+from palpate.shared.part import Fraction, Length, Part, Positive, in_radii, optional
 from palpate.shared.place import Patch
 
 ElementName = Literal["hex8", "hex20"]
@@ -58,11 +58,6 @@ WITHIN = ("any", "without", *range(100))
 
 class SceneError(PalpateError):
     """A scene that cannot be used; the message names the file, the field and what is allowed."""
-
-
-def _chosen(absent: str, description: str) -> Any:
-    """Field that may be absent; what stands for it then is no value, but said in words."""
-    return Field(None, description=description, json_schema_extra={"absent": absent})
 
 
 class Extrusion(Part):
@@ -92,7 +87,7 @@ class Extrusion(Part):
     )
     length: Length = Field(description="length along y, mm")
     element: Element = "hex20"
-    divisions: Divisions | None = _chosen(
+    divisions: Divisions | None = optional(
         CHOSEN, "elements [along the section, through it, along y]"
     )
     grading: float = Field(
@@ -121,7 +116,7 @@ class Block(Part):
     kind: Literal["block"] = Field(description="box; sides: left, right, front, back, bottom, top")
     size: tuple[Length, Length, Length] = Field(description="lengths along [x, y, z], mm")
     element: Element = "hex20"
-    divisions: Divisions | None = _chosen(CHOSEN, "elements along [x, y, z]")
+    divisions: Divisions | None = optional(CHOSEN, "elements along [x, y, z]")
 
 
 def divisions_of(geometry: Extrusion | Block) -> Divisions:
@@ -244,7 +239,7 @@ class Training(Part):
         description="full solutions to validate by, 60 or more; fewer are made for a looser "
         "tolerance",
     )
-    size: Size | None = _chosen(
+    size: Size | None = optional(
         "the smallest that meets the tolerance", "how large the reduced model is"
     )
 

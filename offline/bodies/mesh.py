@@ -11,7 +11,7 @@ from palpate.shared.local_models import Mesh
 from palpate.shared.scene import Scene
 
 GROWTH = 0.7
-"""Of an edge over its distance from the surface that can be touched."""
+"""Of an edge over its distance from the surface that can be touched and the ends of the support."""
 
 
 def refined_body(scene: Scene) -> Refined:
@@ -20,7 +20,8 @@ def refined_body(scene: Scene) -> Refined:
     if finest is None:
         return refined(base, _as_it_is)
     touched = support_and_surface(scene, boundary_of(base))[1]
-    return refined(base, growing(spread_over(base, touched, finest), finest, GROWTH, np.inf))
+    fine = np.concatenate([spread_over(base, touched, finest), support_edges(scene)])
+    return refined(base, growing(fine, finest, GROWTH, np.inf))
 
 
 def stored_mesh(scene: Scene) -> Mesh:

@@ -50,6 +50,8 @@ def test_a_slab_is_served_and_what_trains_beside_it_is_told_and_ends_with_it(art
                 time.sleep(0.2)
         else:
             raise AssertionError("the training goes on")
+    assert trainings(tmp_path) == []  # it says that it has ended
+    assert "the same command continues from here" in (tmp_path / "quick-visco.log").read_text()
 
 
 def test_a_scene_that_cannot_be_trained_is_told(tmp_path):
