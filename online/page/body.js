@@ -76,6 +76,7 @@ export class Body {
     let sum = [0, 0, 0];
     for (let i = 0; i < this.limits.normals.length / 3; i++) sum = add(sum, row(this.limits.normals, i));
     this.outward = unit(sum);
+    this.leastDepth = (this.limits.depth_limit ?? []).reduce((a, b) => (b > 0 ? Math.min(a, b) : a), Infinity);
   }
 
   /** For every node the normal of the accessible surface there, if it lies on it. */
@@ -167,15 +168,30 @@ export class Body {
     };
   }
 
-  /** The same of the point of the accessible surface that is nearest to one. */
-  touchNear(point) {
-    const { vertices, normals } = this.limits;
+  /** Number of the vertex of the accessible surface that is nearest to a point. */
+  vertexNear(point) {
+    const { vertices } = this.limits, away = (i) => norm(add(row(vertices, i), point, -1));
     let best = 0;
-    for (let i = 1; i < vertices.length / 3; i++) {
-      const closer = norm(add(row(vertices, i), point, -1)) < norm(add(row(vertices, best), point, -1));
-      if (closer) best = i;
-    }
-    const normal = row(normals, best);
+    for (let i = 1; i < vertices.length / 3; i++) if (away(i) < away(best)) best = i;
+    return best;
+  }
+
+  /** Distance (mm) of a point from what can be touched, about. */
+  gap(point) {
+    return norm(add(row(this.limits.vertices, this.vertexNear(point)), point, -1));
+  }
+
+  /** Place in the middle of what can be touched. */
+  middle() {
+    const { vertices } = this.limits, count = vertices.length / 3;
+    let sum = [0, 0, 0];
+    for (let i = 0; i < count; i++) sum = add(sum, row(vertices, i));
+    return this.touchNear(row(vertices, this.vertexNear(scale(sum, 1 / count))));
+  }
+
+  /** As `touch`, of the point of the accessible surface that is nearest to one. */
+  touchNear(point) {
+    const normal = row(this.limits.normals, this.vertexNear(point));
     const ray = { from: add(point, normal, 0.2 * this.radius), along: scale(normal, -1) };
     return this.touch(ray);
   }

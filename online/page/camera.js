@@ -68,6 +68,13 @@ export class Camera {
     return { from: this.eye(), along: unit(add(sideways, back, -1)) };
   }
 
+  /** Where a point (mm) is in the picture, x and y from -1 to 1. */
+  project(point) {
+    const { right, up, back } = this.axes(), away = add(point, this.eye(), -1);
+    const half = -dot(away, back) * Math.tan(FIELD / 2);
+    return [dot(away, right) / (half * this.aspect), dot(away, up) / half];
+  }
+
   toText() {
     return [this.yaw, this.pitch, this.distance, ...this.target].map((x) => x.toFixed(2)).join(",");
   }

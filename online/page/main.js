@@ -22,8 +22,11 @@ const STILL = 15; // s after which a position is sent again, so that the session
 const CHECKED = 0.25; // s between comparisons of the two fields
 const NEAR = 3; // local models whose modes are fetched as the tip comes near
 const LISTED = 5; // s between looks for scenes that have been added or removed
+const FAR = 1; // of the body's radius, from its surface: positions beyond are not its own
 const LOGGED = 2000; // answers that are remembered for tests and for people who look
-const TRAINED = 0.5; // share of the range that the level begins with
+const TRAINED = 0.5; // share of the range that the level begins with, at most
+const SAFE = 0.9; // of the least depth limit, the same
+const BUSY = [429, 503]; // statuses after which modes are asked for again
 
 const element = (id) => document.getElementById(id);
 const seconds = () => performance.now() / 1000;
@@ -73,6 +76,7 @@ class Page {
     element("play").onchange = ({ target }) => this.play(target.files[0]);
     element("task").onchange = ({ target }) => this.set(target.files[0]);
     element("again").onclick = () => { this.task.again(); this.showTask(); };
+    element("stop").onclick = () => this.stop();
     document.addEventListener("dragover", (event) => event.preventDefault());
     document.addEventListener("drop", (event) => {
       event.preventDefault();
@@ -119,7 +123,7 @@ class Page {
       if (this.name) select.value = this.name;
     }
     element("training").textContent = found.training.map(({ scene, stage, share, seconds_left }) => (
-      `${scene} is being trained: ${Math.round(100 * share)} %, ${stage}${
+      `${found.scenes.some(({ name }) => name === scene) ? "A newer model of " : ""}${scene} is being trained: ${Math.round(100 * share)} %, ${stage}${
         seconds_left === null ? "" : `, about ${Math.ceil(seconds_left / 60)} min left`}`
     )).join("; ");
     return found;
@@ -155,6 +159,7 @@ class Page {
       this.show(new Body(mesh, accessible), said);
     } catch (error) {
       if (this.opening !== name) return;
+      element("scene").value = name; // blank where it is not served
       this.linked("refused", "");
       this.say(error instanceof Refused ? `Scene ${name}: ${error.message}` : String(error));
       if (!error.status) setTimeout(() => this.opening === name && this.open(name, said), 1000);
@@ -164,6 +169,7 @@ class Page {
   show(body, said) {
     const { scene } = this, sessions = scene.serves.sessions;
     this.say("");
+    this.changed = true;
     element("scene").value = this.name;
     document.body.classList.toggle("with-tip", sessions);
     document.body.classList.toggle("with-load", !sessions);
@@ -176,12 +182,15 @@ class Page {
     this.readings.clear();
     this.log.length = 0;
     this.player = null;
+    element("stop").hidden = true;
     if (this.recording) this.record(); // of another scene
+    this.task = null;
+    this.showTask();
     Object.assign(this, { answer: null, sentAt: null, placed: null, checkedAt: 0, stress: null, colouredAt: 0, measuredAt: 0 });
     this.readings.answer = null;
     const most = sessions
       ? Math.min(1.25 * scene.ranges.depth[1], 0.95 * scene.ranges.radius) : 1.25 * scene.ranges.pressure[1];
-    this.tool.reset(body, (TRAINED * most) / 1.25, most);
+    this.tool.reset(body, Math.min((TRAINED * most) / 1.25, sessions ? SAFE * body.leastDepth : Infinity), most);
     this.tool.keeps = element("keep").checked;
     element("level").max = most;
     this.ratio = 1;
@@ -315,7 +324,7 @@ class Page {
       this.readings.countFrame(now);
     }
     if (!this.session || this.session.reader) this.opened ??= now; // s since the address was given
-    this.readings.show(now, this.scene.tolerance, this.level());
+    this.readings.show(now, this.scene.tolerance, this.level(), this.tool.beyond);
   }
 
   /** Draw fewer pixels where it takes too long to follow the hand. */
@@ -390,7 +399,7 @@ class Page {
     this.answered(answer, now, this.asked);
     if (this.recording) {
       this.recording.take(now, this.asked, reply, frames);
-      element("record").textContent = `End after ${this.recording.rows.length} answers`;
+      element("record").textContent = `Stop after ${this.recording.rows.length} answers`;
     }
     this.shape(reply, now);
   }
@@ -404,7 +413,7 @@ class Page {
       this.recording = new Recording(this.name, seconds());
       this.connect();
     }
-    element("record").textContent = this.recording ? "Recording …" : "Record";
+    element("record").textContent = this.recording ? "Stop recording" : "Record";
     element("save").hidden = !this.recorded;
   }
 
@@ -435,7 +444,7 @@ class Page {
   /** Set a task, which is a JSON file. */
   set(file) {
     return this.take(file, "task", (text) => {
-      this.task = new Task(text);
+      this.task = new Task(text, (point) => this.body.gap(point));
       this.showTask();
     });
   }
@@ -444,10 +453,18 @@ class Page {
   play(file) {
     return this.take(file, "play", (text) => {
       if (!this.scene?.serves.sessions) throw new Error("Only scenes with a tip play recordings.");
-      this.player = new Player(text);
+      this.player = new Player(text, (point) => this.body.gap(point) < FAR * this.body.radius);
       this.playedSince = seconds();
       this.tool.held = false;
+      element("stop").hidden = false;
     });
+  }
+
+  /** Play no more. */
+  stop() {
+    this.player = this.tool.place = null;
+    this.tool.now = -1;
+    element("stop").hidden = true;
   }
 
   /** Let the task know where the tool touches (null if it does not) and its force. */
@@ -461,6 +478,7 @@ class Page {
   showTask() {
     element("again").hidden = !this.task;
     element("score").textContent = this.task?.words() ?? "";
+    element("score").dataset.state = this.task?.state ?? "";
     this.changed = true;
   }
 
@@ -469,10 +487,10 @@ class Page {
     const { tool, body, scene } = this, position = this.player.at(now - this.playedSince);
     this.played = position;
     if (!position) {
-      this.player = tool.place = null;
-      tool.now = -1;
+      this.stop();
       return;
     }
+    element("stop").textContent = `Stop, ${(now - this.playedSince).toFixed(1)} of ${this.player.length.toFixed(1)} s`;
     tool.place = body.touchNear(position);
     if (!tool.place) return;
     const { point, normal } = tool.place;
@@ -508,7 +526,7 @@ class Page {
       apart = Math.max(apart, Math.hypot(own[i] - server[i], own[i + 1] - server[i + 1], own[i + 2] - server[i + 2]));
     }
     this.compared = most > 0 ? apart / most : 0;
-    element("difference").textContent = `The picture's own field differs by at most ${this.compared.toExponential(1)} of the largest displacement.`;
+    element("difference").textContent = `The picture's own differs from it by ${(100 * this.compared).toPrecision(2)} % of the largest at most.`;
   }
 
   /** Fetch the modes of the local models nearest to a point. */
@@ -529,7 +547,8 @@ class Page {
       const { arrays } = await getArrays(path);
       if (this.scene === scene) view.addModes(number, arrays);
     } catch (error) {
-      if (this.scene === scene) this.fail(error);
+      if (BUSY.includes(error.status)) await new Promise((done) => { setTimeout(done, 1000); });
+      else if (this.scene === scene) this.fail(error);
     } finally {
       this.fetching.delete(key);
     }
@@ -537,7 +556,7 @@ class Page {
 
   /** Modes make no sense: go on with the server's field, and say so. */
   fail(error) {
-    this.broken = `Modes cannot be used (${error.message}): the server's field is shown.`;
+    this.broken = `The modes cannot be used (${error.message}); the displacement shown is the service's.`;
     element("difference").textContent = this.broken;
   }
 
@@ -624,8 +643,9 @@ class Page {
       most = Math.max(answer.depth ?? norm(answer.contact_displacement ?? [1, 0, 0]), 0.1);
     }
     const typed = Number(element("range").value);
-    const range = element("lock").checked && typed > 0 ? typed : roundUp(most);
-    if (!element("lock").checked) element("range").value = range;
+    if (!(typed > 0)) element("lock").checked = false; // there is no such range
+    const range = element("lock").checked ? typed : roundUp(most);
+    if (!element("lock").checked && document.activeElement !== element("range")) element("range").value = range;
     element("range-unit").textContent = unitOf;
     return { name, unit: unitOf, range, mark };
   }

@@ -19,8 +19,8 @@ export function trust(answer, tolerance) {
   if (!answer) return { state: "none", words: "No answer yet" };
   if (answer.FALLBACK) {
     const why = ["", "no equilibrium was found there", "the tip's centre is below the surface"];
-    const words = `No answer here: ${why[answer.reason] || "unknown"}. The last good one is shown.`;
-    return { state: "bad", words };
+    const last = Math.hypot(...answer.force) > 0 ? " The last good one is shown." : "";
+    return { state: "bad", words: `No answer here: ${why[answer.reason] || "unknown"}.${last}` };
   }
   const words = [];
   if (answer.CLAMPED) words.push("Clamped: the step was too long; the answer is short of the tool.");
@@ -30,13 +30,13 @@ export function trust(answer, tolerance) {
   if (answer.BESIDE) words.push("Out of range: position. The tip presses beyond the rim.");
   for (const field of answer.out_of_range ?? []) words.push(`Out of range: ${field}.`);
   if (answer.STALLED) words.push("Stalled: more time passed than the tissue follows at once.");
-  const doubted = Object.entries(answer.errors)
-    .filter(([name, error]) => Number.isFinite(error) && error > tolerance[name])
-    .map(([name]) => `${NAMES[name]} (${Number((100 * tolerance[name]).toFixed(1))} %)`);
+  const wanted = ([name]) => `${NAMES[name]} ${Number((100 * tolerance[name]).toFixed(1))} %`;
+  const known = Object.entries(answer.errors).filter(([, error]) => Number.isFinite(error));
+  const doubted = known.filter(([name, error]) => error > tolerance[name]).map(wanted);
   if (doubted.length) words.push(`Errors may exceed what is wanted: ${doubted.join(", ")}.`);
   if (words.length) return { state: "doubt", words: words.join(" ") };
   if (!answer.CONTACT) return { state: "none", words: "The tool does not touch the tissue." };
-  return { state: "good", words: "In range, converged, errors within what is wanted." };
+  return { state: "good", words: `In range, converged, errors within what is wanted (${known.map(wanted).join(", ")}).` };
 }
 
 /** Median and 99th percentile of the numbers of the last seconds. */
@@ -108,7 +108,7 @@ function sheet(canvas) {
 export class Readings {
   constructor() {
     const ids = [
-      "lamp", "trust", "force", "force-bar", "depth", "depth-bar", "depth-name", "stress",
+      "lamp", "trust", "force", "force-bar", "depth", "depth-bar", "depth-name", "moved", "stress",
       "stress-bar", "trace", "solve", "trip", "frames", "legend", "legend-name",
     ];
     for (const id of ids) this[id] = document.getElementById(id);
@@ -141,11 +141,11 @@ export class Readings {
   }
 
   /** Write everything; `level` says what the tool is set to: `{name, unit, value, limit, most}`. */
-  show(now, tolerance, level) {
+  show(now, tolerance, level, atRim) {
     const { answer } = this, { state, words } = trust(answer, tolerance);
     this.lamp.dataset.state = state;
     this.lamp.textContent = { good: "✓", doubt: "!", bad: "✕", none: "–" }[state];
-    this.trust.textContent = words;
+    this.trust.textContent = atRim ? `The tool is held at the rim of what can be touched. ${words}` : words;
     const errors = answer?.errors ?? {}, size = answer ? Math.hypot(...answer.force) : 0;
     const told = (value, unit, error) => {
       const doubt = Number.isFinite(error) ? `± ${digits(value * error)}` : "± unknown";
@@ -153,8 +153,9 @@ export class Readings {
     };
     this.force.textContent = told(size, "mN", errors.force);
     drawGauge(this["force-bar"], { value: size, error: errors.force ?? 0, most: this.most.force });
+    this["depth-name"].textContent = level.name;
     const apart = Number.isFinite(level.error) ? `± ${digits(100 * level.error)} %` : "± unknown";
-    this["depth-name"].textContent = level.error === null ? level.name : `${level.name}, displacement ${apart}`;
+    this.moved.textContent = level.error === null ? "–" : apart;
     const most = level.limit > 0 ? ` of ${digits(level.limit)}` : "";
     this.depth.textContent = `${digits(level.value)}${most} ${level.unit}`;
     drawGauge(this["depth-bar"], { ...level, error: level.error ?? 0 });
@@ -171,7 +172,7 @@ export class Readings {
   /** Draw the force over the last seconds with the band of its estimated error. */
   drawTrace(now) {
     const { context: c, width, height, ink } = sheet(this.trace);
-    const most = this.most.force, left = 34, bottom = height - 14;
+    const most = this.most.force, left = 40, bottom = height - 14;
     const x = (t) => left + (1 - (now - t) / TRACE) * (width - left);
     const y = (f) => bottom - (Math.min(f, 1.05 * most) / most) * (bottom - 6);
     c.fillStyle = c.strokeStyle = ink;
@@ -222,7 +223,7 @@ export class Readings {
       const y = top + tall * (1 - Math.min(mark / range, 1));
       c.fillRect(0, y - 1, bar + 4, 2);
       c.textAlign = "right";
-      c.fillText("99 %", width, y - 3);
+      c.fillText("99 % below", width, y - 3);
     }
   }
 }

@@ -55,9 +55,15 @@ function joined(frames) {
   return bytes;
 }
 
-/** Positions (mm) of the tip over time, of a recording's text; throws what is wrong with it. */
+/**
+ * Positions (mm) of the tip over time, of a recording's text; throws what is wrong with it. `near`
+ * says of a position whether it is of this scene.
+ */
 export class Player {
-  constructor(text) {
+  constructor(text, near) {
+    if (text.slice(1, 4) === "HDF") {
+      throw new Error("An HDF5 file is for palpate replay; what plays here is the CSV file.");
+    }
     const [names, ...rows] = text.trim().split(/\r?\n/).map((line) => line.split(","));
     const place = names.includes("asked_x") ? ["asked_x", "asked_y", "asked_z"] : ["x", "y", "z"];
     const wanted = ["time", ...place], missing = wanted.filter((name) => !names.includes(name));
@@ -69,7 +75,15 @@ export class Player {
     ));
     if (wrong >= 0) throw new Error(`Line ${wrong + 2} of the recording makes no sense.`);
     if (!rows.length) throw new Error("The recording has no positions.");
+    if (!this.rows.some((row) => near(row.slice(1)))) {
+      throw new Error("All its positions are far from this body: is it of another scene, or not in mm?");
+    }
     this.next = 0;
+  }
+
+  /** How long it plays, s. */
+  get length() {
+    return this.rows.at(-1)[0] - this.rows[0][0];
   }
 
   /** Position so many seconds after the first one; null when all have been played. */

@@ -4,6 +4,7 @@ import { add, norm } from "./vectors.js";
 
 const REACH = 1; // mm from a point of the path within which it is passed, unless the task says
 const MOST = 500; // points of a path
+const FAR = 2; // reaches from what can be touched, about, within which a point can be passed
 
 /** What is wrong with a task that a person wrote; nothing if it can be done. */
 function faults({ path, force_limit: limit, reach = REACH }) {
@@ -16,9 +17,12 @@ function faults({ path, force_limit: limit, reach = REACH }) {
   return "";
 }
 
-/** Of the text of a JSON file `{"name", "path", "force_limit", "reach"}`; throws what is wrong. */
+/**
+ * Of the text of a JSON file `{"name", "path", "force_limit", "reach"}`; throws what is wrong. `gap`
+ * is the distance of a point from what can be touched, mm.
+ */
 export class Task {
-  constructor(text) {
+  constructor(text, gap) {
     let said;
     try {
       said = JSON.parse(text);
@@ -28,6 +32,11 @@ export class Task {
     const wrong = faults(said ?? {});
     if (wrong) throw new Error(wrong);
     const { name = "Task", path, force_limit: limit, reach = REACH } = said;
+    const far = path.findIndex((point) => gap(point) > FAR * reach);
+    if (far >= 0) {
+      const away = gap(path[far]).toFixed(1);
+      throw new Error(`Point ${far + 1} of the path is ${away} mm from what can be touched here.`);
+    }
     Object.assign(this, { name: String(name), path, limit, reach });
     this.again();
   }
@@ -52,6 +61,12 @@ export class Task {
     this.last = { now, point, force };
     while (point && !this.done && apart(point, this.path[this.passed]) <= this.reach) this.passed += 1;
     if (this.passed > 0) this.peak = Math.max(this.peak, force);
+  }
+
+  /** Whether it is "good" or "bad" so far, or "" before it has begun. */
+  get state() {
+    if (this.over > 0) return "bad";
+    return this.done ? "good" : "";
   }
 
   /** How it stands, in words. */

@@ -26,13 +26,15 @@ export class Tool {
 
   /** Begin anew on a body; `most` is the largest level (mm or kPa), `level` the one to begin with. */
   reset(body, level, most) {
-    Object.assign(this, { body, level, most, place: null, pressing: false, now: AWAY, held: false });
+    Object.assign(this, { body, level, most, place: null, pressing: false, now: AWAY, held: false, beyond: false });
   }
 
   /** Put the tool on the surface where a ray through the cursor meets it; say whether it does. */
   aim() {
     const place = this.body?.touch(this.camera.ray(...this.cursor)) ?? null;
     if (place || !this.active) this.place = place;
+    this.beyond = !place && this.active; // held at the rim
+    this.canvas.style.cursor = place ? "crosshair" : "grab";
     return place !== null;
   }
 
@@ -128,11 +130,18 @@ export class Tool {
   up(event) {
     this.pointers.delete(event.pointerId);
     if (this.drag === "press" && this.pressing) {
-      this.pressing = false;
+      this.pressing = this.beyond = false;
       this.held = this.keeps;
       this.on.level();
     }
     if (!this.pointers.size) this.drag = null;
+  }
+
+  /** Put a cursor that is not on the accessible surface in its middle, for the keyboard. */
+  show() {
+    if (!this.body || this.place || this.aim()) return;
+    this.place = this.body.middle();
+    if (this.place) this.cursor = this.camera.project(this.place.point);
   }
 
   penPressure(event) {
@@ -162,10 +171,13 @@ export class Tool {
       this.on.view();
     } else if (key in slide) {
       this.cursor = this.cursor.map((c, axis) => c + STEP * 0.5 * slide[key][axis]);
+      this.show();
       this.aim();
+      this.on.level();
     } else if (key === " " || key === "Enter") {
-      if (!this.place) this.aim();
+      this.show();
       if (this.place) this.held = !this.held;
+      this.beyond = false;
       this.on.level();
     } else if (key === "[" || key === "PageDown") {
       this.setLevel(this.level - NOTCH * this.most);

@@ -444,7 +444,7 @@ def test_modes_that_make_no_sense_are_told_and_the_servers_field_is_shown(page):
     })()""")
     press(page, *MIDDLE)
     page.wait(
-        "document.getElementById('difference').textContent.startsWith('Modes cannot be used')"
+        "document.getElementById('difference').textContent.startsWith('The modes cannot be used')"
     )
     page.wait("palpate.answer?.CONTACT && palpate.tool.now === palpate.tool.level")
     page.wait("Math.max(...palpate.view.readBack()) > 0.01")
