@@ -229,4 +229,6 @@ def _tissue(scene: Scene) -> str:
             name, _, unit = (field.description or key).partition(", ")
             said.append(f"{name} {value:g} {unit}".rstrip())
     lost = sum(share for share, _ in tissue.prony)
-    return ", ".join([*said, f"{percent(lost)} relaxes with time" if lost else "elastic"])
+    said.append(f"{percent(lost)} relaxes with time" if lost else "elastic")
+    stiff = [f"{r.name} {r.young / tissue.young:.3g} times as stiff" for r in tissue.region]
+    return ", ".join(said + stiff)

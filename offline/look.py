@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.offline.bodies.places import boundary_of_corners
+from palpate.offline.bodies.places import boundary_of_corners, box_of
 from palpate.offline.bodies.report import in_words, report
 from palpate.offline.choose.mesh import as_fine, candidates
 from palpate.offline.doubts import doubts
@@ -81,11 +81,9 @@ def _corners(mesh: Mesh) -> Array:
 
 def _said(scene: Scene, mesh: Mesh) -> Mapping[str, str]:
     """What there is to know of a body, by what it is about."""
-    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
-    box = ", ".join(f"{a} {x:z.1f} to {y:.1f}" for a, x, y in zip("xyz", low, high, strict=True))
     said = {
         "scene": f"{scene.name}: {scene.description}",
-        "body": f"{box} mm; {len(mesh.elements)} elements {scene.geometry.element}, "
+        "body": f"{box_of(mesh.nodes)}; {len(mesh.elements)} elements {scene.geometry.element}, "
         f"{mesh.nodes.size} DOFs",
         "held": f"{scene.support.in_words()}; {_area(mesh, _held(mesh)):.3g} mm²",
         "touchable": f"{scene.surface.in_words()}; {_area(mesh, mesh.accessible):.3g} mm²",

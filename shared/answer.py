@@ -1,6 +1,7 @@
 """An answer: what a pressed or touched tissue does, and how far to trust it."""
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -131,10 +132,18 @@ def describe(answer: Answer) -> dict[str, Any]:
     } | ({} if answer.past is None else {"time": answer.time})
 
 
-def peak(displacement: Field | Array, stress: tuple[float, float]) -> dict[str, float]:
-    """Largest displacement (mm) of nodes (n, 3), and stress (kPa) as in ``StressField.peaks``."""
+def peak(
+    displacement: Field | Array, stresses: Sequence[tuple[float, float]], regions: Sequence[str]
+) -> dict[str, Any]:
+    """Largest displacement (mm) of nodes (n, 3), and stresses (kPa) as in ``StressField.peaks``.
+
+    Those of the tissue that is in no region, and of ``regions``, if there are any.
+    """
+    names = "von_mises", "von_mises_p99"
+    rest, *others = (dict(zip(names, own, strict=True)) for own in stresses)
     moved = float(np.linalg.norm(displacement, axis=1).max())
-    return {"displacement": moved, "von_mises": stress[0], "von_mises_p99": stress[1]}
+    found: dict[str, Any] = {"displacement": moved} | rest
+    return found | ({"regions": dict(zip(regions, others, strict=True))} if regions else {})
 
 
 def finite(value: float) -> float | None:

@@ -121,9 +121,10 @@ class FieldRecovery:
         with np.errstate(over="ignore"):
             return (answer.stiffness * stress).astype(np.float32)
 
-    def peaks(self, answer: Answer, displacement: Field) -> tuple[float, float]:
+    def peaks(self, answer: Answer, displacement: Field, region: int = 0) -> tuple[float, float]:
         """Largest stress and 99th percentile (kPa) of an answer; see ``StressField.peaks``."""
-        found = self._stress.peaks(displacement, self._remembered(answer), answer.footprint)
+        past, contact = self._remembered(answer), answer.footprint
+        found = self._stress.peaks(displacement, past, contact, region)
         return answer.stiffness * found[0], answer.stiffness * found[1]
 
     def _remembered(self, answer: Answer) -> Array | None:

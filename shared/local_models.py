@@ -24,7 +24,7 @@ from palpate.shared.geometry.surface import Surface
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, SurfaceQuadrature
 from palpate.shared.mechanics.laws import law_at_points, law_of
 from palpate.shared.mechanics.tip import CURVED_WITHIN, Tip, tip_of
-from palpate.shared.mechanics.tissue import Law
+from palpate.shared.mechanics.tissue import Law, lame
 from palpate.shared.reduced.features import (
     CHANGES,
     CHANGING,
@@ -52,21 +52,33 @@ class Mesh:
     faces: Annotated[Numbers, "faces", "1", "f, h", "nodes of boundary faces, VTK order", "< n"]
     clamped: Annotated[Flags, "clamped", "1", "n", "nodes held fixed"]
     accessible: Annotated[Flags, "accessible", "1", "f", "faces an endoscope can touch"]
+    regions: Annotated[
+        Numbers | None, "regions", "1", "e", "regions of elements, from 1 on; 0 is none", "< 21"
+    ] = None
+
+    @property
+    def region(self) -> Numbers:
+        """Regions (e,) of the elements, 0 where they are in none."""
+        return np.zeros(len(self.elements), np.int32) if self.regions is None else self.regions
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Body(Mesh):
     """Mesh and tissue of a scene, as both sides see them."""
 
     law: Law  # parameters of the elements (e,)
+    touched: tuple[float, float]  # kPa, mu and lam at rest of the tissue that can be touched
     tip: Tip
 
     @classmethod
-    def of(cls, arrays: Mapping[str, NDArray[Any]], scene: Scene) -> Self:
-        """Body of an artifact of this scene."""
-        law = law_of(scene.tissue, len(arrays["elements"]))
+    def of(cls, mesh: Mesh, scene: Scene) -> Self:
+        """Body of a scene on a mesh."""
+        tissue = scene.tissue
         return cls(
-            **values_of(cls, arrays), law=law, tip=tip_of(scene.endoscope.radius, scene.tissue)
+            **vars(mesh),
+            law=law_of(tissue, mesh.region),
+            touched=lame(tissue.young, tissue.poisson),
+            tip=tip_of(scene.endoscope.radius, tissue),
         )
 
     @cached_property

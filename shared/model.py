@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from palpate.shared import many
-from palpate.shared.answer import Answer, Answers
+from palpate.shared.answer import Answer, Answers, peak
 from palpate.shared.arrays import Array, Field, Flags
 from palpate.shared.artifact import Artifact, ArtifactError, read_artifact, values_of
 from palpate.shared.errors import PalpateError, QueryError
@@ -143,13 +143,16 @@ class ReducedModel:
         """Build from the contents of an artifact."""
         arrays, scene = artifact.arrays, parse_scene(artifact.scene)
         estimators = Estimators(**values_of(Estimators, arrays))
+        mesh = Mesh(**values_of(Mesh, arrays))
+        if scene.tissue.region and mesh.regions is None:
+            raise PalpateError("it does not say which elements are of which region")
         if estimators.loads is None or (scene.endoscope.tip and estimators.touches is None):
             raise PalpateError("it has no error estimates")
         return cls(
             name=scene.name,
             scene=scene,
             info=artifact.documents,
-            body=Body.of(arrays, scene),
+            body=Body.of(mesh, scene),
             surface=Surface(**values_of(Surface, arrays)),
             limits=values_of(LoadRange, arrays)["limits"],
             models=LocalModels.of(arrays, scene),
@@ -522,12 +525,21 @@ class ReducedModel:
         """What the displacement of the surface is made of."""
         return self.fields.composition(answer, self.surface_nodes)
 
-    def peaks(self, answer: Answer, displacement: Field) -> tuple[float, float]:
+    def peaks(self, answer: Answer, displacement: Field, region: int = 0) -> tuple[float, float]:
         """Largest von Mises stress and its 99th percentile (kPa) outside the clamped layer.
 
         ``displacement`` is that of all nodes.  See ``StressField.peaks``.
         """
-        return self.fields.peaks(answer, displacement)
+        return self.fields.peaks(answer, displacement, region)
+
+    def peak(self, answer: Answer, displacement: Field) -> dict[str, Any]:
+        """Largest displacement (mm) and stresses (kPa) of an answer by name, JSON-able.
+
+        ``displacement`` is that of all nodes; see ``answer.peak``.
+        """
+        regions = [region.name for region in self.scene.tissue.region]
+        found = [self.peaks(answer, displacement, number) for number in range(len(regions) + 1)]
+        return peak(displacement, found, regions)
 
 
 def _total(

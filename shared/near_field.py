@@ -58,10 +58,10 @@ NO_CONTACT = NearField(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 
 
 
 class NearFields:
-    """Near fields of a body, whose tissue is the same everywhere."""
+    """Near fields of a body, whose tissue is the same wherever it can be touched."""
 
     def __init__(self, body: Body) -> None:
-        mu, lam = float(body.law.mu[0]), float(body.law.lam[0])
+        mu, lam = body.touched
         poisson = 0.5 * lam / (lam + mu)
         self._tissue = HalfSpace(local_field(poisson), whole_field(poisson), poisson, 0.5 / mu)
 

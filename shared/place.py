@@ -1,8 +1,8 @@
-"""Places on the boundary of a body, as a scene names them: what is held, what can be touched.
+"""Places of a body, as a scene names them: what is held, what can be touched, what is of its own.
 
-A place is made of the faces of the body for which every key of its table holds.  `any` holds where
-one of its tables does, `without` where its table does not, so that places are joined by and, or and
-not.
+A place is made of the faces or elements for which every key of its table holds.  On the boundary
+`any` holds where one of its tables does, `without` where its table does not, so that places are
+joined by and, or and not.
 """
 
 import math
@@ -19,24 +19,67 @@ Point = tuple[float, float, float]
 Angle = Annotated[float, Field(gt=0, lt=180)]
 
 
-class Patch(Part):
-    """Part of a body's boundary: the faces for which all keys hold, judged at their centres."""
+class Place(Part):
+    """Where something is: all keys hold, judged at the centres of faces or elements."""
 
-    together: ClassVar = (("normal", "within"), ("near", "radius"), ("close_to", "distance"))
+    together: ClassVar[tuple[tuple[str, str], ...]] = (("near", "radius"),)
     """Keys that say nothing without each other."""
+
+    x: Range | None = optional("all of it", "[from, to] mm")
+    y: Range | None = optional("all of it", "[from, to] mm")
+    z: Range | None = optional("all of it", "[from, to] mm")
+    near: Point | None = optional("all of it", "point [x, y, z] mm")
+    radius: Length | None = optional("needed with near", "largest distance from that point, mm")
+    set: str | None = optional("all of it", "named set of the body's file, or a label")
+
+    @classmethod
+    def places(cls) -> tuple[str, ...]:
+        """Keys that say where."""
+        return tuple(cls.model_fields)
+
+    @model_validator(mode="after")
+    def _says_a_place(self) -> Self:
+        if not self.model_fields_set.intersection(self.places()):
+            keys = ", ".join(self.places())
+            raise PydanticCustomError("place", "must name a place: one of {keys}", {"keys": keys})
+        for axis in "xyz":
+            bounds = getattr(self, axis)
+            if bounds is not None and not bounds[0] <= bounds[1]:
+                raise PydanticCustomError(
+                    "range", "{axis} must be [from, to] with from <= to", {"axis": axis}
+                )
+        for pair in self.together:
+            given = [key for key in pair if getattr(self, key) is not None]
+            if len(given) == 1:
+                (missing,) = {*pair} - {*given}
+                raise PydanticCustomError(
+                    "pair", "{given} needs {missing}", {"given": given[0], "missing": missing}
+                )
+        return self
+
+    def said(self) -> list[str]:
+        """What the table says, in parts for people."""
+        ranges = [(axis, getattr(self, axis)) for axis in "xyz"]
+        said = [f"{axis} {r[0]:g} to {r[1]:g} mm" for axis, r in ranges if r]
+        if self.near is not None:
+            said.append(f"within {self.radius:g} mm of {_point(self.near)}")
+        if self.set is not None:
+            said.append(f"set {self.set}")
+        return said
+
+
+class Patch(Place):
+    """Part of a body's boundary."""
+
+    together: ClassVar = (("normal", "within"), *Place.together, ("close_to", "distance"))
 
     side: str | None = optional(
         "all sides", "side of a block or an extrusion, such as top or outer"
     )
-    x: Range | None = optional("all of it", "[from, to] mm")
-    y: Range | None = optional("all of it", "[from, to] mm")
-    z: Range | None = optional("all of it", "[from, to] mm")
     normal: Point | None = optional("all of it", "direction [x, y, z] of outward normals")
     within: Angle | None = optional(
         "needed with normal", "largest angle of outward normals to it, degrees"
     )
-    near: Point | None = optional("all of it", "point [x, y, z] mm")
-    radius: Length | None = optional("needed with near", "largest distance from that point, mm")
     close_to: str | None = optional(
         "all of it", "file of another surface (STL, OBJ, PLY), in the unit of the body's own"
     )
@@ -52,23 +95,7 @@ class Patch(Part):
     without: "Patch | None" = optional("nothing", "such a table, which does not hold")
 
     @model_validator(mode="after")
-    def _says_a_place(self) -> Self:
-        if not self.model_fields_set:
-            keys = ", ".join(type(self).model_fields)
-            raise PydanticCustomError("place", "must name a place: one of {keys}", {"keys": keys})
-        for axis in "xyz":
-            bounds = getattr(self, axis)
-            if bounds is not None and not bounds[0] <= bounds[1]:
-                raise PydanticCustomError(
-                    "range", "{axis} must be [from, to] with from <= to", {"axis": axis}
-                )
-        for pair in self.together:
-            given = [key for key in pair if getattr(self, key) is not None]
-            if len(given) == 1:
-                (missing,) = set(pair) - set(given)
-                raise PydanticCustomError(
-                    "pair", "{given} needs {missing}", {"given": given[0], "missing": missing}
-                )
+    def _can_be_found(self) -> Self:
         if self.normal is not None and not math.hypot(*self.normal) > 0:
             raise PydanticCustomError("normal", "normal must have a length")
         if self.any is not None and not self.any:
@@ -83,17 +110,11 @@ class Patch(Part):
 
     def in_words(self) -> str:
         """What the table says, in a line for people."""
-        said = [] if self.side is None else [f"side {self.side}"]
-        ranges = [(axis, getattr(self, axis)) for axis in "xyz"]
-        said += [f"{axis} {r[0]:g} to {r[1]:g} mm" for axis, r in ranges if r]
+        said = self.said() if self.side is None else [f"side {self.side}", *self.said()]
         if self.normal is not None:
             said.append(f"normals within {self.within:g} degrees of {_point(self.normal)}")
-        if self.near is not None:
-            said.append(f"within {self.radius:g} mm of {_point(self.near)}")
         if self.close_to is not None:
             said.append(f"within {self.distance:g} mm of {self.close_to}")
-        if self.set is not None:
-            said.append(f"set {self.set}")
         if self.any is not None:
             said.append(f"({' or '.join(other.in_words() for other in self.any)})")
         if self.without is not None:

@@ -285,8 +285,11 @@ class Scene(Part):
         return self._folder
 
     def of_tissue(self, **changes: Any) -> Self:
-        """The same scene of tissue that differs in what is given."""
-        return self.model_copy(update={"tissue": self.tissue.model_copy(update=changes)})
+        """The same scene of tissue that differs in what is given; with ``young`` regions scale."""
+        tissue = self.tissue
+        if (young := changes.pop("young", None)) is not None:
+            tissue = tissue.scaled(young / tissue.young)
+        return self.model_copy(update={"tissue": tissue.model_copy(update=changes)})
 
     @property
     def lattice(self) -> Extrusion | Block:

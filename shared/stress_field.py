@@ -27,7 +27,9 @@ class StressField:
 
     def __init__(self, body: Body, precision: type = np.float64) -> None:
         self._body = body
-        self._recovery = stress_recovery(body.nodes, body.elements, body.law, precision)
+        self._recovery = stress_recovery(
+            body.nodes, body.elements, body.law, body.region, precision
+        )
         self._near = NearFields(body)
 
     def dent(self, points: Array, contact: Contact | None) -> NearField:
@@ -46,18 +48,21 @@ class StressField:
         return out
 
     def peaks(
-        self, u: Displacement, B: Array | None, contact: Contact | None
+        self, u: Displacement, B: Array | None, contact: Contact | None, region: int = 0
     ) -> tuple[float, float]:
         """Largest stress and 99th percentile by volume (kPa), outside the clamped layer.
 
+        Of the elements of a region, 0 is what is in none; of all where all are in the layer.
         Both are of the integration points: under a contact there are more of them than of nodes,
         and stress at the nodes is carried there.
         """
-        points, volumes, counts = self._points
+        points, volumes, counted = self._points
+        own = np.repeat(self._body.region == region, len(points) // len(volumes))
+        counts = own & counted if (own & counted).any() else own
         near, exact = (self._near.at(at, contact) for at in (self._body.nodes, points))
         out = np.empty(len(points))
         point_von_mises(self._recovery, u, B, near, exact, out)
-        out = out[counts]
+        out, volumes = out[counts], volumes.reshape(-1)[counts]
         order = np.argsort(-out)
         above = np.searchsorted(np.cumsum(volumes[order]), HIGHEST * volumes.sum())
         return float(out[order[0]]), float(out[order[above]])
@@ -68,11 +73,11 @@ class StressField:
 
     @cached_property
     def _points(self) -> tuple[Array, Array, Flags]:
-        """Integration points (q e, 3) mm, volumes (k,) mm^3 of those that count, and which do."""
+        """Integration points (q e, 3) mm, their volumes (e, q) mm^3, and which count."""
         body = self._body
         kind = kind_of(body.elements)
         N, _ = kind.shape(kind.rule(POINTS)[0])
         points = np.ascontiguousarray((N @ body.nodes[body.elements]).reshape(-1, 3))
         counts = body.beyond_clamped_layer(points)
         _, volumes = volume_quadrature(body.nodes, body.elements, POINTS)
-        return points, volumes.reshape(-1)[counts], counts
+        return points, volumes, counts

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from palpate.offline.bodies import labels, mesh_file, surface, tetwild
+from palpate.offline.bodies import labels, mesh_file, regions, surface, tetwild
 from palpate.offline.bodies.files import checked
 from palpate.offline.bodies.places import boundary_of_corners
 from palpate.offline.bodies.tetrahedra import (
@@ -78,7 +78,11 @@ def stored_at(scene: Scene) -> Path:
     sha = hashlib.sha256(path.read_bytes())
     keys = geometry.model_dump(mode="json") | {"edition": EDITION}
     del keys["file"], keys["finest"]
+    if scene.tissue.region:
+        keys["regions"] = regions.places_of(scene)
     sha.update(json.dumps(keys, sort_keys=True).encode())
+    for own in regions.files_of(scene):
+        sha.update(own.read_bytes())
     return path.with_name(f"{path.name}.{sha.hexdigest()[:12]}.mesh.npz")
 
 
@@ -93,7 +97,7 @@ def base_mesh(scene: Scene) -> Base:
     path = stored_at(scene)
     if path.exists():
         return _load(path)
-    base = _made(*body_file(scene))
+    base = _made(scene)
     if not path.exists():  # or another process has been faster
         try:
             write_whole(path, _bytes(base))
@@ -135,15 +139,18 @@ def _load(path: Path) -> Base:
         raise SceneError(f"{path}: damaged; delete it, and the body is meshed anew") from error
 
 
-def _made(geometry: FileBody, path: Path) -> Base:
+def _made(scene: Scene) -> Base:
+    geometry, path = body_file(scene)
     if isinstance(geometry, MeshBody):
         nodes, elements, sets = mesh_file.read_mesh(path, geometry.unit)
         _refuse_parts(path, elements)
         return Base(nodes, elements, sets.faces, sets.cells)
     repaired, image, volume = _surface(geometry, path)
-    points, corners = tetwild.filled(
-        path, repaired.points, repaired.triangles, geometry.edge, geometry.deviation
-    )
+    own = repaired.points, repaired.triangles
+    within = [
+        closed for closed in regions.surfaces_of(scene) if regions.inside(closed[0], own).all()
+    ]
+    points, corners = tetwild.filled(path, [own, *within], geometry.edge, geometry.deviation)
     _refuse_parts(path, corners)
     nodes, elements = raised(points, corners.astype(np.int32))
     faces, owner, _ = boundary(elements)
@@ -162,8 +169,8 @@ def _made(geometry: FileBody, path: Path) -> Base:
     told["volume_of_labels_mm3"] = volume
     centres, normals = boundary_of_corners(nodes[faces[:, :3]])
     beside = labels.neighbours(image, geometry, centres, normals)
-    own = labels.regions(image, geometry, nodes[elements[:, :4]].mean(axis=1))
-    cells = {str(label): own == label for label in geometry.labels}
+    label_of = labels.regions(image, geometry, nodes[elements[:, :4]].mean(axis=1))
+    cells = {str(label): label_of == label for label in geometry.labels}
     named = {str(label): beside == label for label in np.unique(beside) if label}
     return Base(nodes, elements, named | {k: v[owner] for k, v in cells.items()}, cells, told)
 

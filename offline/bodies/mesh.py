@@ -5,8 +5,9 @@ import numpy as np
 from palpate.offline.bodies.base import Base, base_mesh, body_file
 from palpate.offline.bodies.places import Boundary, boundary_of_corners, support_and_surface
 from palpate.offline.bodies.refine import Refined, growing, refined, spread_over
+from palpate.offline.bodies.regions import refuse_touched, regions_at
 from palpate.offline.bodies.tetrahedra import boundary
-from palpate.shared.arrays import Array, Flags
+from palpate.shared.arrays import Array, Flags, Numbers
 from palpate.shared.local_models import Mesh
 from palpate.shared.scene import Scene
 
@@ -32,14 +33,22 @@ def stored_mesh(scene: Scene) -> Mesh:
 def mesh_of(scene: Scene, finer: Refined) -> Mesh:
     """The mesh of a scene's body, with what is held and can be touched.
 
-    That is made of whole faces of the base mesh, and so is the same in every mesh.
+    That is made of whole faces of the base mesh, regions of its elements, and so the same in every
+    mesh.
 
     Raises
     ------
     SceneError
-        If support or surface hold no face, or the same.
+        If support or surface hold no face, or the same, or a region no element, or what can be
+        touched.
     """
-    return _mesh(finer, *support_and_surface(scene, boundary_of(base_mesh(scene))))
+    base = base_mesh(scene)
+    centres = base.nodes[base.elements[:, :4]].mean(axis=1)
+    regions = regions_at(scene, centres, base.cells)
+    mesh = _mesh(finer, *support_and_surface(scene, boundary_of(base)), regions)
+    touched = mesh.faces[mesh.accessible]
+    refuse_touched(scene, mesh.nodes, mesh.elements, mesh.regions, touched)
+    return mesh
 
 
 def bare_mesh(scene: Scene) -> Mesh:
@@ -66,7 +75,16 @@ def _as_it_is(points: Array) -> Array:
     return np.full(len(points), np.inf)
 
 
-def _mesh(finer: Refined, support: Flags, accessible: Flags) -> Mesh:
+def _mesh(
+    finer: Refined, support: Flags, accessible: Flags, regions: Numbers | None = None
+) -> Mesh:
     clamped = np.zeros(len(finer.nodes), dtype=bool)
     clamped[finer.faces[support[finer.face_of]]] = True
-    return Mesh(finer.nodes, finer.elements, finer.faces, clamped, accessible[finer.face_of])
+    return Mesh(
+        finer.nodes,
+        finer.elements,
+        finer.faces,
+        clamped,
+        accessible[finer.face_of],
+        None if regions is None else regions[finer.element_of],
+    )

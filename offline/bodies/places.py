@@ -58,15 +58,17 @@ def _found(scene: Scene, name: str, patch: Patch, faces: Boundary) -> Flags:
     if not chosen.any():
         parts = dict(_keys(scene, name, patch, faces))
         each = ", ".join(f"{np.sum(own)} by {key}" for key, own in parts.items())
-        low, high = faces.centres.min(axis=0), faces.centres.max(axis=0)
-        box = ", ".join(
-            f"{a} {x:z.1f} to {y:.1f}" for a, x, y in zip("xyz", low, high, strict=True)
-        )
         raise SceneError(
             f"{name}: no face of the body is there; of {len(faces.centres)} faces {each}; their "
-            f"centres have {box} mm{_where(patch, faces)}"
+            f"centres have {box_of(faces.centres)}{_where(patch, faces)}"
         )
     return chosen
+
+
+def box_of(points: Array) -> str:
+    """Box round points (n, 3) mm in words."""
+    ends = zip("xyz", points.min(axis=0), points.max(axis=0), strict=True)
+    return ", ".join(f"{axis} {low:z.1f} to {high:.1f}" for axis, low, high in ends) + " mm"
 
 
 def _where(patch: Patch, faces: Boundary) -> str:

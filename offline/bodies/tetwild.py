@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,13 +23,17 @@ LONGEST = 1800.0
 
 
 def filled(
-    path: Path, points: Array, triangles: Numbers, edge: float, deviation: float
+    path: Path, closed: Sequence[tuple[Array, Numbers]], edge: float, deviation: float
 ) -> tuple[Array, Numbers]:
-    """Points (n, 3) mm and tetrahedra (e, 4) inside the closed surface of a file.
+    """Points (n, 3) mm and tetrahedra (e, 4) inside the first of closed surfaces, of a file.
 
+    Others, within it, are followed as well.  Surfaces are points (p, 3) mm and triangles (t, 3);
     ``edge`` (mm) is how long edges should be, ``deviation`` (mm) the width of the envelope.
     """
     require("pytetwild")
+    points = np.concatenate([own for own, _ in closed])
+    starts = np.cumsum([0] + [len(own) for own, _ in closed])
+    triangles = np.concatenate([own + at for (_, own), at in zip(closed, starts, strict=False)])
     with tempfile.TemporaryDirectory() as folder:
         given, found = Path(folder, "surface.npz"), Path(folder, "tetrahedra.npz")
         share = deviation / np.linalg.norm(np.ptp(points, axis=0))

@@ -11,6 +11,7 @@ import numpy as np
 
 from palpate.offline.bodies.mesh import bare_mesh, mesh_of, refined_body, stored_mesh
 from palpate.offline.bodies.places import Boundary, boundary_of_corners, support_and_surface
+from palpate.offline.bodies.regions import refuse_touched, regions_at
 from palpate.offline.bodies.report import thickness
 from palpate.offline.fem.shapes import shape_of
 from palpate.shared.anatomy import FileBody
@@ -66,7 +67,9 @@ def build_mesh(scene: Scene, ticks: Ticks | None = None, bare: bool = False) -> 
     support, accessible = on_sides.nowhere() if bare else support_and_surface(scene, on_sides)
     clamped = np.zeros(len(nodes), dtype=bool)
     clamped[faces[support]] = True
-    return Mesh(nodes, elements, faces, clamped, accessible)
+    regions = regions_at(scene, nodes[elements[:, :8]].mean(axis=1), {})
+    refuse_touched(scene, nodes, elements, regions, faces[accessible])
+    return Mesh(nodes, elements, faces, clamped, accessible, regions)
 
 
 def ticks_of(geometry: Extrusion | Block) -> Ticks:

@@ -87,7 +87,7 @@ class FullModel:
         self.free = np.flatnonzero(np.repeat(~mesh.clamped, 3))
         self.gradients, self.weights = volume_quadrature(mesh.nodes, mesh.elements, self.quadrature)
         self.connectivity = np.ascontiguousarray(mesh.elements, dtype=np.int32)
-        self.law = law_of(self.tissue, len(mesh.elements))
+        self.law = law_of(self.tissue, mesh.region)
         kind, count = kind_of(mesh.elements), self.weights.shape[1]
         parts = np.full(count, WHOLE) if self.quadrature else kind.integration[2]
         self.point_law = law_at_points(self.law, parts)

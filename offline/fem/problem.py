@@ -32,7 +32,6 @@ from palpate.shared.mechanics.tip import (
     history,
     meet_wall,
     tangents_of,
-    tip_of,
 )
 from palpate.shared.mechanics.viscosity import step_weights
 from palpate.shared.near_field import Contact
@@ -115,8 +114,7 @@ class FullProblem:
     @cached_property
     def body(self) -> Body:
         """Mesh and tissue as the reduced model sees them."""
-        tip = tip_of(self.scene.endoscope.radius, self.scene.tissue)
-        return Body(**vars(self.mesh), law=self.model.law, tip=tip)
+        return Body.of(self.mesh, self.scene)
 
     @cached_property
     def beyond_clamped_layer(self) -> Flags:

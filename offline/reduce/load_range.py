@@ -237,7 +237,7 @@ def load_range(problem: FullProblem, position: Array) -> Array:
         ).displacement
 
     limit, power, moved = pressure_that_moves(path.solve, wanted, pressure)
-    if not _far(moved, wanted) or limit > SURFACE * problem.model.law.mu[0]:
+    if not _far(moved, wanted) or limit > SURFACE * problem.body.touched[0]:
         near = limit or pressure, power, moved
         limit, _, moved = pressure_that_moves(full, wanted, *near, stride=1.5)
         limit /= 1.0 if _far(moved, wanted) else MARGIN
@@ -343,7 +343,7 @@ def firm_share(model: ReducedModel, x: Array, direction: Array, limit: float) ->
 
     At the reduced model's answers.
     """
-    if limit < FIRM * model.body.law.mu[0]:
+    if limit < FIRM * model.body.touched[0]:
         return 1.0
     full = _full(model)
     tissue = Potential(full, [])

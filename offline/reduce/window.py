@@ -181,6 +181,7 @@ def part_of(mesh: Mesh, elements: Numbers) -> tuple[Mesh, Numbers, Flags]:
         faces=number[mesh.faces[faces]].astype(np.int32),
         clamped=mesh.clamped[inside],
         accessible=mesh.accessible[faces],
+        regions=None if mesh.regions is None else mesh.regions[elements],
     )
     return part, np.flatnonzero(inside).astype(np.int32), border[inside]
 

@@ -31,7 +31,7 @@ from typing import Any, NamedTuple, Self
 
 from tqdm import tqdm
 
-from palpate.offline.bodies import base, places
+from palpate.offline.bodies import base, places, regions
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.section import read_section
 from palpate.shared.anatomy import FileBody
@@ -202,6 +202,7 @@ def files_of(scene: Scene) -> dict[str, bytes]:
     if isinstance(geometry, Extrusion):
         files[geometry.section] = read_section(folder / geometry.section)
     paths = [path for at in (scene.support, scene.surface) for path in places.files_of(scene, at)]
+    paths += regions.files_of(scene)
     if isinstance(geometry, FileBody):
         base.base_mesh(scene)
         paths += [base.body_file(scene)[1], base.stored_at(scene)]

@@ -110,7 +110,8 @@ def reference() -> str:
 def _rows(part: type[Part], path: str) -> Iterator[str]:
     for key, field in part.model_fields.items():
         kinds = kinds_of(field)
-        name = f"`{path}{key}`" if not kinds else f"**`[{path}{key}]`**"
+        ends = ("[[", "]]") if get_origin(field.annotation) is tuple else ("[", "]")
+        name = f"**`{ends[0]}{path}{key}{ends[1]}`**" if kinds else f"`{path}{key}`"
         yield f"| {name} | {'' if kinds else _default(field)} | {field.description} |"
         for kind in kinds:
             if kind is part:  # a table of its own kind within

@@ -48,7 +48,7 @@ class Answer(NamedTuple):
     time: float = 0.0  # s, since rest, of a history's step
     displacement: Field | None = None  # (k, 3) mm; this and stress are None if not asked for
     von_mises: Field | None = None  # (k,) kPa
-    peak: Mapping[str, float] | None = None  # largest displacement and stress, if asked for
+    peak: Mapping[str, Any] | None = None  # largest displacement and stress, if asked for
     timing: Mapping[str, float] = {}  # µs, where the service's time went
 
 

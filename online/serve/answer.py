@@ -19,7 +19,7 @@ from palpate.online.serve.errors import Refusal, check_json_size
 from palpate.online.serve.metrics import PHASES, Metrics
 from palpate.online.serve.schemas import Contact, HistoryRequest, SolveRequest
 from palpate.online.serve.wire import JSON
-from palpate.shared.answer import Answer, describe, peak
+from palpate.shared.answer import Answer, describe
 from palpate.shared.arrays import Field
 from palpate.shared.errors import QueryError
 from palpate.shared.model import ReducedModel
@@ -113,24 +113,28 @@ def _refused(path: str) -> Iterator[None]:
         raise Refusal("unanswerable_query", f"{path}.{error.field}", error.message) from None
 
 
+def _finite(found: Mapping[str, Any] | float) -> bool:
+    """Whether all numbers of a document are."""
+    return all(map(_finite, found.values())) if isinstance(found, Mapping) else math.isfinite(found)
+
+
 def _recover(
     model: ReducedModel, answer: Answer, request: SolveRequest | HistoryRequest
 ) -> tuple[wire.Arrays, Mapping[str, Any]]:
     """Get the fields that a request wants, and the ``peak`` if it wants that; all is finite."""
     fields: dict[str, Field] = {}
-    more: dict[str, dict[str, float]] = {}
+    more: dict[str, dict[str, Any]] = {}
     region = request.region
     if region != "none" or "peak" in request.outputs:
         displacement = model.displacement(answer)
     if "peak" in request.outputs:
-        more["peak"] = peak(displacement, model.peaks(answer, displacement))
+        more["peak"] = model.peak(answer, displacement)
     if region != "none":
         if "displacement" in request.outputs:
             nodes = model.surface_nodes if region == "surface" else slice(None)
             fields["displacement"] = displacement[nodes]
         if "von_mises" in request.outputs:
             fields["von_mises"] = model.von_mises(answer, region, displacement)
-    largest = [math.isfinite(value) for values in more.values() for value in values.values()]
-    if not (all(largest) and all(np.isfinite(field).all() for field in fields.values())):
+    if not (_finite(more) and all(np.isfinite(field).all() for field in fields.values())):
         raise Refusal("no_equilibrium", "region", "The fields of this answer are not finite")
     return fields, more

@@ -265,12 +265,20 @@ Timing = Annotated[
 ]
 
 
-class Peak(BaseModel):
-    """The largest values of the fields in the whole body."""
+class PeakStress(BaseModel):
+    """The largest stresses of a part of the body."""
 
-    displacement: float = Field(description="mm")
     von_mises: float = Field(description="kPa, outside the layer at the support.")
     von_mises_p99: float = Field(description="kPa, that 1 % of the volume is above.")
+
+
+class Peak(PeakStress):
+    """The largest values of the fields in the whole body; stress outside its regions."""
+
+    displacement: float = Field(description="mm")
+    regions: dict[str, PeakStress] | None = Field(
+        None, description="Stress in the regions of the tissue, if the scene has any."
+    )
 
 
 class _Answer(BaseModel):

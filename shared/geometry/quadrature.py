@@ -5,7 +5,7 @@ import numpy as np
 from palpate.shared.arrays import Array, Numbers
 from palpate.shared.errors import PalpateError
 from palpate.shared.geometry.elements import POINTS, face_kind_of, kind_of
-from palpate.shared.geometry.recovery import patches
+from palpate.shared.geometry.recovery import by_region
 from palpate.shared.mechanics.footprint import SurfaceQuadrature
 from palpate.shared.mechanics.stress import StressRecovery
 from palpate.shared.mechanics.tissue import Law
@@ -76,11 +76,14 @@ def surface_quadrature(
 
 
 def stress_recovery(
-    nodes: Array, elements: Numbers, law: Law, precision: type = np.float64
+    nodes: Array, elements: Numbers, law: Law, region: Numbers, precision: type = np.float64
 ) -> StressRecovery:
-    """Recovery of nodal stresses from the points of elements of one tissue; law (e,)."""
+    """Recovery of nodal stresses from the points of elements of a law and regions (e,).
+
+    Where regions meet stress jumps; nodes there are of the lowest of them, see ``by_region``.
+    """
     gradients, _ = volume_quadrature(nodes, elements, POINTS)
-    found = patches(nodes, elements)
+    found, tissue_of = by_region(nodes, elements, region)
     return StressRecovery(
         points=tuple(range(gradients.shape[1])),
         connectivity=np.ascontiguousarray(elements, dtype=np.int32),
@@ -92,5 +95,6 @@ def stress_recovery(
         line=tuple(range(found.lines.shape[1])),
         lines=found.lines,
         shares=found.shares.astype(precision),
-        law=law.at(np.zeros(len(nodes), int)),
+        tissue_of=tissue_of,
+        law=law,
     )

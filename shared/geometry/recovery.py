@@ -15,7 +15,7 @@ of Zienkiewicz & Zhu, The superconvergent patch recovery, Int. J. Numer. Meth. E
 """
 
 import itertools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_matrix, diags
@@ -27,7 +27,6 @@ from palpate.shared.geometry.elements import (
     HEX_FACES,
     POINTS,
     Box,
-    Kind,
     kind_of,
 )
 
@@ -68,6 +67,45 @@ class Patches(NamedTuple):
     shares: Array  # (m, l)
 
 
+def by_region(nodes: Array, elements: Numbers, region: Numbers) -> tuple[Patches, Numbers]:
+    """How values are carried in elements (e, n) of regions (e,), and an element (m,) of each node.
+
+    Values jump where regions meet, and are carried in each by itself.  A node there is of the
+    lowest of them; for the others it has further numbers, from the number of nodes on.
+    """
+    parts, of = [], np.zeros(len(nodes), np.int32)
+    known = np.zeros(len(nodes), dtype=bool)
+    for number in np.unique(region):
+        own = np.flatnonzero(region == number)
+        at, first = np.unique(elements[own], return_index=True)
+        again = at[known[at]]
+        name = np.arange(len(nodes))
+        name[again] = len(of) + np.arange(len(again))
+        of = np.append(of, np.zeros(len(again), np.int32))
+        of[name[at]] = own[first // elements.shape[1]]
+        known[at] = True
+        part = patches(nodes, elements[own])
+        parts.append(
+            Patches(
+                name[part.corners], own[part.elements], part.weights,
+                name[part.midsides], name[part.lines], part.shares,
+            )
+        )  # fmt: skip
+    return Patches(*map(_joined, zip(*parts, strict=True))), of
+
+
+def _joined(parts: tuple[Array | Ints, ...]) -> Any:
+    """Arrays (k, a, ...) one after the other, filled up to one length with zeros."""
+    if parts[0].ndim == 1:
+        return np.concatenate(parts)
+    wide = max(part.shape[1] for part in parts)
+    filled = [
+        np.pad(part, [(0, 0), (0, wide - part.shape[1]), *[(0, 0)] * (part.ndim - 2)])
+        for part in parts
+    ]
+    return np.concatenate(filled)
+
+
 def patches(nodes: Array, elements: Numbers) -> Patches:
     """How values are carried in elements (e, n)."""
     kind = kind_of(elements)
@@ -75,7 +113,7 @@ def patches(nodes: Array, elements: Numbers) -> Patches:
         next_to = neighbours(elements[:, :8])
         if _all_meet(elements, next_to):
             return _in_lattice(nodes, elements, next_to)
-    return _fitted_patches(nodes, elements, kind)
+    return _fitted_patches(nodes, elements)
 
 
 def _all_meet(elements: Numbers, next_to: Ints) -> bool:
@@ -89,15 +127,14 @@ def _in_lattice(nodes: Array, elements: Numbers, next_to: Ints) -> Patches:
     """As ``patches``, where all elements have the axes of one lattice."""
     at = nodes[elements[:, :8]]
     lengths = np.linalg.norm(at[:, OPPOSITE] - at[:, :, None], axis=3)  # (e, 8, 3)
-    corners, first = np.unique(elements[:, :8].astype(int), return_index=True)
-    own, corner = np.divmod(first, 8)
+    own, corner = np.divmod(np.arange(8 * len(elements)), 8)
     around, weights = own[:, None], np.ones((len(own), 1, 1))
     for d in range(3):
         side = SIDES[corner, d]
         beyond, inward = next_to[own, d, side], next_to[own, d, 1 - side]
         inside, alone = beyond >= 0, (beyond < 0) & (inward < 0)
         towards = np.where(inside, side, 1 - side)
-        further = next_to[around, d, towards[:, None]]
+        further = np.where(around >= 0, next_to[around, d, towards[:, None]], -1)
         end = np.where(inside, OPPOSITE[corner, d], corner)
         other = lengths[np.where(inside, beyond, inward), end, d] / lengths[own, corner, d]
         one = _along(other, inside, alone)  # (k, 2 elements, nearer and farther point)
@@ -106,6 +143,16 @@ def _in_lattice(nodes: Array, elements: Numbers, next_to: Ints) -> Patches:
         share = np.where(nearer, one[:, :, :1], one[:, :, 1:])  # (k, 2, 8)
         around = np.concatenate([around, np.where(alone[:, None], around, further)], axis=1)
         weights = np.concatenate([weights * share[:, :1], weights * share[:, 1:]], axis=1)
+    # of the elements that meet at a corner the first counts round which all are there
+    order = np.argsort((around < 0).any(axis=1), kind="stable")
+    corners, first = np.unique(elements[:, :8].astype(int).ravel()[order], return_index=True)
+    around, weights = around[order[first]], weights[order[first]]
+    lost = (around < 0).any(axis=1)
+    if lost.any():
+        fits, rows = _from_points(nodes, elements, elements[:, :8]), np.empty(len(corners), int)
+        rows[np.append(np.flatnonzero(~lost), np.flatnonzero(lost))] = np.arange(len(corners))
+        around = _joined((around[~lost], fits.around[lost]))[rows]
+        weights = _joined((weights[~lost], fits.weights[lost]))[rows]
     return Patches(corners, around, weights, *_midsides(lengths, elements, next_to))
 
 
@@ -169,24 +216,38 @@ def _lagrange(at: Array, known: Flags) -> Array:
     return weights
 
 
-def _fitted_patches(nodes: Array, elements: Numbers, kind: Kind) -> Patches:
-    """As ``patches``, however elements lie."""
+class _Fits(NamedTuple):
+    """What carries values at the points of elements (e,) to nodes."""
+
+    nodes: Ints  # (k,)
+    own: Ints  # (e, m) of these in each element
+    meeting: csr_matrix  # (k, e) which elements meet at each
+    around: Ints  # (k, a) elements
+    weights: Array  # (k, a, q) of their points
+
+
+def _from_points(nodes: Array, elements: Numbers, wanted: Numbers) -> _Fits:
+    """What carries values to the ``wanted`` nodes (e, m) of elements."""
+    kind = kind_of(elements)
     N, _ = kind.shape(kind.rule(POINTS)[0])
     points = N @ nodes[elements]  # (e, q, 3)
-    corners, own = np.unique(elements[:, : kind.corners].astype(int), return_inverse=True)
-    own = own.reshape(len(elements), -1)
-    ones = np.ones(own.size)
-    meeting = csr_matrix(
-        (ones, (own.ravel(), np.repeat(np.arange(len(own)), kind.corners))),
-        (len(corners), len(elements)),
+    at, own = np.unique(wanted.astype(int), return_inverse=True)
+    own = own.reshape(wanted.shape)
+    rows = own.ravel(), np.repeat(np.arange(len(elements)), wanted.shape[1])
+    meeting = csr_matrix((np.ones(own.size), rows), (len(at), len(elements)))
+    around, known = _nearest(meeting, meeting.T @ meeting, nodes[at], points.mean(axis=1), ELEMENTS)
+    away = points[around] - nodes[at][:, None, None]
+    counts = np.broadcast_to(known[..., None], away.shape[:3]).reshape(len(at), -1)
+    weights = fitted(away.reshape(len(at), -1, 3), counts.astype(float))
+    return _Fits(at, own, meeting, around, weights.reshape(away.shape[:3]))
+
+
+def _fitted_patches(nodes: Array, elements: Numbers) -> Patches:
+    """As ``patches``, however elements lie."""
+    kind = kind_of(elements)
+    corners, own, meeting, around, weights = _from_points(
+        nodes, elements, elements[:, : kind.corners]
     )
-    around, known = _nearest(
-        meeting, meeting.T @ meeting, nodes[corners], points.mean(axis=1), ELEMENTS
-    )
-    at = points[around] - nodes[corners][:, None, None]
-    counts = np.broadcast_to(known[..., None], at.shape[:3]).reshape(len(corners), -1)
-    weights = fitted(at.reshape(len(corners), -1, 3), counts.astype(float))
-    weights = weights.reshape(at.shape[:3])
     if not kind.quadratic:
         return Patches(corners, around, weights, np.empty(0, int), *np.empty((2, 0, 1), int))
     midsides, first = np.unique(elements[:, kind.corners :].astype(int), return_index=True)

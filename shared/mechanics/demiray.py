@@ -30,7 +30,7 @@ from palpate.shared.mechanics.tensors import (
     inline,
     isochoric,
 )
-from palpate.shared.mechanics.tissue import Tissue
+from palpate.shared.mechanics.tissue import REGIONS, Constants, Region, Tissue
 from palpate.shared.part import Positive
 
 
@@ -91,11 +91,21 @@ def _derivatives(law, F, J):
     )  # fmt: skip
 
 
-class DemirayTissue(Tissue):
-    """Tissue of this law."""
+class DemirayConstants(Constants):
+    """Constants of the law."""
 
     parameters = Demiray
 
-    law: Literal["demiray"] = Field(description="exponential, compressible")
     young: Positive = Field(description="Young's modulus at rest, kPa")
     b: Positive = Field(description="exponential stiffening over strain")
+
+
+class DemirayRegion(Region, DemirayConstants):
+    """Part of a body of this law."""
+
+
+class DemirayTissue(Tissue, DemirayConstants):
+    """Tissue of this law."""
+
+    law: Literal["demiray"] = Field(description="exponential, compressible")
+    region: tuple[DemirayRegion, ...] = REGIONS

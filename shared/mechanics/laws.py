@@ -13,7 +13,7 @@ many points that become vector code.
 import numpy as np
 from numba import njit
 
-from palpate.shared.arrays import Ints
+from palpate.shared.arrays import Ints, Numbers
 from palpate.shared.mechanics.demiray import DemirayTissue
 from palpate.shared.mechanics.mooney_rivlin import MooneyRivlinTissue
 from palpate.shared.mechanics.neo_hookean import NeoHookeanTissue
@@ -27,12 +27,14 @@ AnyTissue = (
 )  # fmt: skip
 
 
-def law_of(tissue: AnyTissue, count: int) -> Law:
-    """Parameters of so many points of a tissue."""
+def law_of(tissue: AnyTissue, regions: Numbers) -> Law:
+    """Parameters (n,) of a tissue at points in regions (n,): 0 is none of them, n the n-th."""
     kind = tissue.parameters
-    constants = (getattr(tissue, name) for name in kind._fields[2:])
-    values = *lame(tissue.young, tissue.poisson), *constants
-    law: Law = kind(*(np.full(count, value) for value in values))
+    values = [
+        (*lame(own.young, own.poisson), *(getattr(own, name) for name in kind._fields[2:]))
+        for own in (tissue, *tissue.region)
+    ]
+    law: Law = kind(*np.array(values)[regions].T.copy())
     return law
 
 

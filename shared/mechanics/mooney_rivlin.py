@@ -35,7 +35,7 @@ from palpate.shared.mechanics.tensors import (
     isochoric,
     scale,
 )
-from palpate.shared.mechanics.tissue import Tissue
+from palpate.shared.mechanics.tissue import REGIONS, Constants, Region, Tissue
 from palpate.shared.part import Positive
 
 
@@ -99,12 +99,12 @@ def _derivatives(law, F, C, J):
     )  # fmt: skip
 
 
-class MooneyRivlinTissue(Tissue):
-    """Tissue of this law."""
+class MooneyRivlinConstants(Constants):
+    """Constants of the law."""
 
     parameters = MooneyRivlin
+    moduli = "c10", "c01"
 
-    law: Literal["mooney-rivlin"] = Field(description="compressible, linear in two invariants")
     c10: Positive = Field(description="factor of the first invariant, kPa")
     c01: Annotated[float, Field(ge=0)] = Field(description="factor of the second invariant, kPa")
 
@@ -113,10 +113,22 @@ class MooneyRivlinTissue(Tissue):
         """Young's modulus at rest, kPa."""
         return 4.0 * (self.c10 + self.c01) * (1.0 + self.poisson)
 
+
+class MooneyRivlinRegion(Region, MooneyRivlinConstants):
+    """Part of a body of this law."""
+
+
+class MooneyRivlinTissue(Tissue, MooneyRivlinConstants):
+    """Tissue of this law."""
+
+    law: Literal["mooney-rivlin"] = Field(description="compressible, linear in two invariants")
+    region: tuple[MooneyRivlinRegion, ...] = REGIONS
+
     @model_validator(mode="after")
     def _both_invariants_stay_stiff(self) -> Self:
         """Relaxation takes the share of ``mu`` from the first invariant alone."""
-        most = self.c10 / (self.c10 + self.c01)
+        parts: list[MooneyRivlinConstants] = [self, *self.region]
+        most = min(own.c10 / (own.c10 + own.c01) for own in parts)
         if not sum(share for share, _ in self.prony) < most:
             raise PydanticCustomError(
                 "prony",

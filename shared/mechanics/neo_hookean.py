@@ -28,7 +28,7 @@ from palpate.shared.mechanics.tensors import (
     trace,
     transposed,
 )
-from palpate.shared.mechanics.tissue import Tissue
+from palpate.shared.mechanics.tissue import REGIONS, Constants, Region, Tissue
 from palpate.shared.part import Positive
 
 
@@ -77,10 +77,20 @@ class NeoHookean(NamedTuple):
         return add(scale(moduli[0], H), dot(X, T))
 
 
-class NeoHookeanTissue(Tissue):
-    """Tissue of this law."""
+class NeoHookeanConstants(Constants):
+    """Constants of the law."""
 
     parameters = NeoHookean
 
-    law: Literal["neo-hookean"] = Field(description="FEAP's compressible law")
     young: Positive = Field(description="Young's modulus at rest, kPa")
+
+
+class NeoHookeanRegion(Region, NeoHookeanConstants):
+    """Part of a body of this law."""
+
+
+class NeoHookeanTissue(Tissue, NeoHookeanConstants):
+    """Tissue of this law."""
+
+    law: Literal["neo-hookean"] = Field(description="FEAP's compressible law")
+    region: tuple[NeoHookeanRegion, ...] = REGIONS

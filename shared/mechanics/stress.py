@@ -44,7 +44,8 @@ class StressRecovery(NamedTuple):
     line: tuple[int, ...]  # (l,) numbers of a midside's corners, as ``points``
     lines: Ints  # (m, l)
     shares: NDArray[np.floating]  # (m, l)
-    law: Law  # (nodes,)
+    tissue_of: Numbers  # (m,) elements, of whose tissue nodes and what else is carried to are
+    law: Law  # (e,)
 
 
 class NearField(NamedTuple):
@@ -63,7 +64,7 @@ def nodal_von_mises(mesh, u, B, near, out):
     is a part of ``u``.  Gradients are summed in the precision of ``mesh.gradients``, which ``u``
     shares.
     """
-    count, own = len(out), _without(u, near)
+    count, own = len(mesh.tissue_of), _without(u, near)
     flat = mesh.gradients.reshape(len(mesh.connectivity), -1)
     H = np.empty((len(flat), 9 * len(mesh.points)), flat.dtype)
     for e in range(len(flat)):
@@ -74,13 +75,14 @@ def nodal_von_mises(mesh, u, B, near, out):
         for i in range(9):
             nodal[i * count + node] += near.gradient[k, i // 3, i % 3]
     if B is None:
-        for n in range(count):
-            out[n] = laws.von_mises(mesh.law.at(n), add_identity(load(nodal, n, count), 1.0))
+        for n in range(len(out)):
+            law = mesh.law.at(mesh.tissue_of[n])
+            out[n] = laws.von_mises(law, add_identity(load(nodal, n, count), 1.0))
     else:
         past = _carried(mesh, B.reshape(len(B), -1))
-        for n in range(count):
-            F = add_identity(load(nodal, n, count), 1.0)
-            out[n] = viscosity.von_mises(mesh.law.at(n), F, unpacked(load_packed(past, n, count)))
+        for n in range(len(out)):
+            law, F = mesh.law.at(mesh.tissue_of[n]), add_identity(load(nodal, n, count), 1.0)
+            out[n] = viscosity.von_mises(law, F, unpacked(load_packed(past, n, count)))
 
 
 @njit(cache=True, error_model="numpy", nogil=True, fastmath=FAST)
@@ -99,7 +101,7 @@ def point_von_mises(mesh, u, B, near, exact, out):
     H = np.empty(9 * count, flat.dtype)
     for e in range(len(mesh.connectivity)):
         _gradients(mesh.points, mesh.connectivity[e], flat[e], own, H)
-        law, found = mesh.law.at(mesh.connectivity[e, 0]), out[count * e : count * (e + 1)]
+        law, found = mesh.law.at(e), out[count * e : count * (e + 1)]
         for k in range(9 * count):
             H[k] += added[e, k]
         if B is None:
@@ -162,7 +164,7 @@ def _gradients(points, connectivity, flat, u, H):
 def _carried(mesh, values):
     """Components (k nodes,) at the nodes of those at the points of elements (e, q k)."""
     points = len(mesh.points)
-    count, components = len(mesh.law.mu), values.shape[1] // points
+    count, components = len(mesh.tissue_of), values.shape[1] // points
     nodal = np.zeros(components * count, values.dtype)
     for n in range(len(mesh.corners)):
         node = np.uint64(mesh.corners[n])

@@ -9,11 +9,15 @@ from pydantic_core import PydanticCustomError
 
 from palpate.shared.arrays import Array
 from palpate.shared.mechanics.tensors import dot, trace, transposed
-from palpate.shared.part import Fraction, Part, Positive
+from palpate.shared.part import Fraction, Part, Positive, optional
+from palpate.shared.place import Place
 
 WHOLE, COMPRESSIBLE, BULK = range(3)
 """Parts of a law: all of it; with ``lam`` at most ``mu``, a Poisson's ratio of .25; and what that
 lacks, which depends on the volume alone."""
+
+STIFFEST = 1000.0
+"""Ratio of Young's moduli of a region and the tissue round it, or the other way round."""
 
 INVERTED = math.inf
 """Energy returned where det F <= 0: a barrier every line search respects."""
@@ -49,14 +53,51 @@ class Law(Protocol):
         """``A : H`` (kPa), linear in the moduli of the state."""
 
 
-class Tissue(Part):
-    """What the body is made of; every law has a kind of its own, with its constants."""
+class Constants(Part):
+    """Constants of a law; with ``young``, Young's modulus at rest, kPa."""
 
     parameters: ClassVar[Any]
     """Named tuple of the law's parameters: mu, lam, and constants named as in the scene."""
 
-    law: str
+    moduli: ClassVar[tuple[str, ...]] = ("young",)
+    """Constants in kPa, with which all stresses go."""
+
     poisson: Annotated[float, Field(ge=0, lt=0.5)] = Field(description="Poisson's ratio at rest")
+
+    def scaled(self, ratio: float) -> Self:
+        """The same law of moduli so many times as large."""
+        return self.model_copy(update={key: ratio * getattr(self, key) for key in self.moduli})
+
+
+class Region(Place):
+    """Part of the body of the same law with constants of its own; it relaxes as the rest does."""
+
+    name: str = Field(min_length=1, max_length=40, description="what the region is, for people")
+    inside: str | None = optional(
+        "all of it", "file of a closed surface (STL, OBJ, PLY), in the unit of the body's own"
+    )
+
+    @classmethod
+    def places(cls) -> tuple[str, ...]:
+        """Keys that say where."""
+        return (*Place.model_fields, "inside")
+
+    def in_words(self) -> str:
+        """Where it is, in a line for people."""
+        return ", ".join([*self.said(), *([f"inside {self.inside}"] if self.inside else [])])
+
+
+REGIONS: Any = Field((), max_length=20, description="parts of the body with constants of their own")
+"""Field of a law's tissue."""
+
+
+class Tissue(Constants):
+    """What the body is made of; every law has a kind of its own, with its constants.
+
+    And ``region``, parts of the body with others, of which the last that holds counts.
+    """
+
+    law: str
     prony: tuple[tuple[Fraction, Positive], ...] = Field(
         (),
         max_length=6,
@@ -73,6 +114,27 @@ class Tissue(Part):
                 {"total": total},
             )
         return self
+
+    @model_validator(mode="after")
+    def _regions_are_of_a_kind(self) -> Self:
+        own: Any = self
+        for region in own.region:
+            ratio = region.young / own.young
+            if not 1.0 / STIFFEST <= ratio <= STIFFEST:
+                raise PydanticCustomError(
+                    "stiffness",
+                    "region '{name}' is {ratio} times as stiff as the rest, but 1/{most} to {most} "
+                    "times are allowed",
+                    {"name": region.name, "ratio": f"{ratio:.3g}", "most": f"{STIFFEST:g}"},
+                )
+        return self
+
+    def scaled(self, ratio: float) -> Self:
+        """The same, all regions so many times as stiff."""
+        own: Any = super().scaled(ratio)
+        regions = tuple(region.scaled(ratio) for region in own.region)
+        scaled: Self = own.model_copy(update={"region": regions})
+        return scaled
 
 
 def lame(young: float, poisson: float) -> tuple[float, float]:

@@ -22,6 +22,7 @@ from palpate.offline.fem.model import FullModel
 from palpate.offline.scenes import find_scene
 from palpate.shared.geometry.quadrature import surface_quadrature
 from palpate.shared.mechanics.footprint import footprint
+from palpate.shared.scene import parse_scene
 
 from ..offline.fem.bodies import in_tetrahedra
 
@@ -107,7 +108,8 @@ def felupe_body(model, quadrature=None, law=None):
     cell_type, region_class = REGIONS[model.mesh.elements.shape[1]]
     mesh = fem.Mesh(model.mesh.nodes, model.mesh.elements, cell_type)
     region = region_class(mesh, quadrature=quadrature or fem.GaussLegendre(order=1, dim=3))
-    umat = LAWS[model.tissue.law](*(law or model.law.at(0)))
+    constants = law or model.law
+    umat = LAWS[model.tissue.law](*(value[None] for value in constants))  # by point and element
     field = fem.FieldContainer([fem.Field(region, dim=3)])
     return fem.SolidBody(umat, field), field
 
@@ -117,10 +119,10 @@ def felupe_bodies(model):
     if model.mesh.elements.shape[1] != 10:
         solid, field = felupe_body(model)
         return [solid], field
-    mu, lam = model.law.at(0)
-    share = min(lam, mu)
+    mu, lam = model.law
+    share = np.minimum(lam, mu)
     solid, field = felupe_body(model, fem.TetrahedronQuadrature(order=2), (mu, share))
-    other, _ = felupe_body(model, fem.TetrahedronQuadrature(order=1), (0.0, lam - share))
+    other, _ = felupe_body(model, fem.TetrahedronQuadrature(order=1), (0.0 * mu, lam - share))
     return [solid, other], field
 
 
@@ -136,9 +138,11 @@ def displacement_by_felupe(model, load):
     return field[0].values
 
 
-def body(name, element, divisions):
-    """The body of a scene, of another element and other divisions."""
+def body(name, element, divisions, region=None):
+    """The body of a scene, of another element and other divisions, maybe with a region."""
     scene = find_scene(name)
+    if region:
+        scene = parse_scene(scene.text + region, scene.folder)
     hexahedra = "hex8" if element == "tet10" else element
     geometry = scene.geometry.model_copy(update={"element": hexahedra, "divisions": divisions})
     scene = scene.model_copy(update={"geometry": geometry})
@@ -177,6 +181,31 @@ def test_displacement_under_a_large_load(
     print(f"{name}, {element}: relative L2 difference {error:.1e}")
     assert np.abs(ours).max() > least
     assert error <= tolerance
+
+
+STIFF = """
+[[tissue.region]]
+name = "core"
+young = {young}
+poisson = 0.3
+x = [2.0, 8.0]
+y = [2.0, 8.0]
+z = [2.5, 6.0]
+"""
+
+
+@pytest.mark.parametrize("element", ["hex20", "tet10"])
+def test_displacement_with_a_region_a_thousand_times_as_stiff(element):
+    young = 1000.0 * find_scene("quick").tissue.young
+    model = body("quick", element, (4, 4, 3), STIFF.format(young=young))
+    assert 0 < model.mesh.region.sum() < len(model.mesh.elements) / 2
+    load = pressed(model, (5.0, 5.0, 8.0), 6.0, tilt=np.radians(20))
+    ours = model.solve(load).displacement
+    theirs = displacement_by_felupe(model, load)
+    error = np.linalg.norm(ours - theirs) / np.linalg.norm(theirs)
+    print(f"a stiff region, {element}: relative L2 difference {error:.1e}")
+    assert np.abs(ours).max() > 0.3
+    assert error <= 1e-8
 
 
 def our_step(model, load):

@@ -98,7 +98,7 @@ def test_places_can_be_read(tmp_path):
     tables = f'[support]\nside = "bottom"\n[surface]\n{text}\n'
     said = parse_scene(SCENE + BLOCK + tables).surface.in_words()
     assert said == (
-        "side top, x 0 to 6 mm, normals within 20 degrees of (0, 0, 1), within 3 mm of (1, 2, 8), "
+        "side top, x 0 to 6 mm, within 3 mm of (1, 2, 8), normals within 20 degrees of (0, 0, 1), "
         "(y 0 to 1 mm or y 2 to 3 mm), without (z 0 to 1 mm)"
     )
 

@@ -23,6 +23,13 @@ training.size.patch_spacing = 5.0
 training.size.modes = 48
 training.size.cubature_points = 64
 training.size.region_modes = 120
+[[tissue.region]]
+name = "core"
+young = 150.0
+poisson = 0.45
+x = [4.0, 8.0]
+y = [4.0, 8.0]
+z = [0.0, 4.0]
 [geometry]
 kind = "mesh"
 file = "box.vtu"
@@ -79,3 +86,18 @@ def test_info_says_what_is_known_of_the_body(file, model):
     assert found["training"]["file"]["quality"]["volume_mm3"] == pytest.approx(12 * 12 * 8)
     said = [line.split()[0] for line in lines(found)]
     assert {"volume", "elements", "thickness"} < set(said)
+    assert "core 10 times as stiff" in "\n".join(lines(found))
+
+
+def test_it_tells_the_stress_of_its_regions(file, model):
+    assert 0 < np.sum(model.body.region == 1) < 0.2 * len(model.body.region)
+    x = model.models.centres[0]
+    answer = model.press(x, 0.7 * model.press(x, 0.0).pressure_limit)
+    u = model.displacement(answer)
+    found = model.peak(answer, u)
+    field = FullProblem.of_artifact(file.with_name("box.h5")).stress_field
+    exact = [field.peaks(u.astype(float), None, answer.footprint, number) for number in (0, 1)]
+    told = [found, found["regions"]["core"]]
+    for (largest, high), own in zip(exact, told, strict=True):
+        assert own["von_mises"] == pytest.approx(largest, rel=1e-3)
+        assert own["von_mises_p99"] == pytest.approx(high, rel=1e-3)

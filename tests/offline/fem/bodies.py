@@ -75,4 +75,5 @@ def in_tetrahedra(bricks):
         faces=faces,
         clamped=np.concatenate([bricks.clamped, bricks.clamped[edges].all(axis=1)]),
         accessible=accessible,
+        regions=None if bricks.regions is None else np.repeat(bricks.regions, len(BRICK)),
     )

@@ -329,9 +329,8 @@ def stress_error(element, divisions, field):
     """Relative error of the von Mises stress at the nodes of ``manufactured``."""
     model, u = manufactured(element, divisions, field)
     nodes, found = model.mesh.nodes, np.empty(len(u))
-    nodal_von_mises(
-        stress_recovery(nodes, model.mesh.elements, model.law), u, None, NO_CONTACT, found
-    )
+    recovery = stress_recovery(nodes, model.mesh.elements, model.law, model.mesh.region)
+    nodal_von_mises(recovery, u, None, NO_CONTACT, found)
     law = model.law.at(0)
     exact = [von_mises(law, tuple(F.ravel())) for F in slope_of(field, nodes)]
     return np.linalg.norm(found - exact) / np.linalg.norm(exact)

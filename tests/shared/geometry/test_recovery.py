@@ -5,7 +5,7 @@ import pytest
 
 from palpate.offline.fem.mesh import build_mesh
 from palpate.shared.geometry.elements import POINTS, kind_of
-from palpate.shared.geometry.recovery import neighbours, patches
+from palpate.shared.geometry.recovery import by_region, neighbours, patches
 from palpate.shared.scene import parse_scene
 
 from ...offline.fem.bodies import in_tetrahedra
@@ -116,3 +116,33 @@ def test_neighbours_lie_beyond_the_sides_of_an_element():
     found = neighbours(elements)
     assert found[0].tolist() == [[-1, 8], [-1, 4], [-1, 1]]
     assert found[-1].tolist() == [[15, -1], [19, -1], [22, -1]]
+
+
+@pytest.mark.parametrize("element", ["hex8", "hex20", "tet10"])
+def test_regions_carry_fields_of_their_own_exactly(element, rng):
+    """A corner, an edge and a plate of a block, and what is left: no lattice in a box."""
+    nodes, elements = block(element, 5, 5, 4)
+    centres = nodes[elements].mean(axis=1) / np.ptp(nodes, axis=0)
+    region = np.zeros(len(elements), np.int32)
+    region[(centres > 0.6).all(axis=1)] = 1
+    region[(centres[:, :2] < 0.4).all(axis=1)] = 2
+    region[centres[:, 2] < 0.25] = 3
+    slopes = rng.standard_normal((4, 3))
+    how, of = by_region(nodes, elements, region)
+    values = np.einsum("eqi,ei->eq", at_points(nodes, elements), slopes[region])
+    found = np.full(len(of), np.nan)
+    found[how.corners] = np.einsum("kaq,kaq->k", how.weights, values[how.elements])
+    found[how.midsides] = np.sum(how.shares * found[how.lines], axis=1)
+    lowest = np.full(len(nodes), 4)
+    np.minimum.at(lowest, elements, region[:, None])
+    used = lowest < 4
+    np.testing.assert_array_equal(region[of[: len(nodes)]][used], lowest[used])
+    exact = np.einsum("ni,ni->n", nodes, slopes[np.minimum(lowest, 3)])
+    np.testing.assert_allclose(found[: len(nodes)][used], exact[used], atol=1e-11)
+
+
+def test_a_body_of_one_region_is_carried_as_ever(mesh):
+    nodes, elements = mesh
+    one, other = by_region(nodes, elements, np.full(len(elements), 2))[0], patches(nodes, elements)
+    for own, same in zip(one, other, strict=True):
+        np.testing.assert_array_equal(own, same)

@@ -10,7 +10,7 @@ TISSUES = {tissue.law: tissue for tissue in (find_scene(name).tissue for name in
 
 def law_of(name):
     """Parameters of a law, numbers."""
-    return laws.law_of(TISSUES[name], 1).at(0)
+    return laws.law_of(TISSUES[name], np.zeros(1, np.int32)).at(0)
 
 
 def stress(law, F):
