@@ -4,7 +4,9 @@ Each imports what it runs when it runs, so that ``--help`` is instant.
 """
 
 import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,9 @@ import click
 import orjson
 
 from palpate.shared.cli import Finite
+
+PATIENCE = 8.0
+"""Seconds after which people are told why there is no answer yet."""
 
 
 class _Artifact(click.Path):
@@ -315,7 +320,8 @@ def solve(table: Path | None, out: Path | None, tip: bool, **request: Any) -> Re
 
         artifact, young = request.pop("artifact"), request.pop("young")
         _need({"--out": out}, request, "beside --csv")
-        return solve_table(artifact, table, out or table, tip, young)
+        with _patience():
+            return solve_table(artifact, table, out or table, tip, young)
     _need({"--at": request["position"]}, {"out": out}, "without --csv")
     if tip:
         loads = {key: request[key] for key in ("pressure", "direction", "radius")}
@@ -324,7 +330,8 @@ def solve(table: Path | None, out: Path | None, tip: bool, **request: Any) -> Re
         _need({"--pressure": request["pressure"]}, {})
     from palpate.offline.solve import solve
 
-    return solve(**request)
+    with _patience():
+        return solve(**request)
 
 
 @click.command()
@@ -341,7 +348,21 @@ def identify(artifact: Path, recording: Path) -> Report:
     """
     from palpate.offline.identify import identify
 
-    return identify(artifact, recording)
+    with _patience():
+        return identify(artifact, recording)
+
+
+@contextmanager
+def _patience() -> Iterator[None]:
+    """Say what takes so long, if it does."""
+    words = "Compiling code, which is kept: the first answer of a release takes a minute or two …"
+    timer = threading.Timer(PATIENCE, click.echo, [words], {"err": True})
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def _need(needed: Mapping[str, object], without: Mapping[str, object], why: str = "") -> None:

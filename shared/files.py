@@ -2,6 +2,8 @@
 
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
 
@@ -16,6 +18,16 @@ def open_regular(path: Path) -> BufferedReader:
     return file
 
 
+@contextmanager
+def named(path: Path) -> Iterator[None]:
+    """Name a file in each ``OSError``: that of a full disk has no name."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = error.filename or str(path)
+        raise
+
+
 def write_whole(path: Path, *parts: bytes | memoryview) -> None:
     """Write a file beside its place, flush it to disk, then move it there.
 
@@ -23,14 +35,11 @@ def write_whole(path: Path, *parts: bytes | memoryview) -> None:
     """
     part = path.with_name(f".{path.name}.part")
     try:
-        with part.open("wb") as file:
+        with named(path), part.open("wb") as file:
             file.writelines(parts)
             file.flush()
             os.fsync(file.fileno())
         part.replace(path)
-    except OSError as error:  # of a full disk it does not
-        error.filename = error.filename or str(path)
-        raise
     finally:
         part.unlink(missing_ok=True)
 

@@ -289,6 +289,14 @@ class Estimators:
         "same under the tip; 1, depth / limit, near the rim",
     ] = None
 
+    def missing(self, scene: Scene) -> list[str]:
+        """Names of those that answers of a scene need and that are not there."""
+        needed = ["loads", "mesh"]
+        needed += ["touches", "mesh_tip"] if scene.endoscope.tip else []
+        needed += ["histories"] if scene.tissue.prony else []
+        needed += ["courses"] if scene.endoscope.tip and scene.tissue.prony else []
+        return [name for name in needed if getattr(self, name) is None]
+
     def coefficients(self, tip: bool, in_time: bool) -> Array:
         """Of answers to loads or under the tip, at once or in time; 0 if not calibrated."""
         loads, touches = (self.histories, self.courses) if in_time else (self.loads, self.touches)

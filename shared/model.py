@@ -146,8 +146,8 @@ class ReducedModel:
         mesh = Mesh(**values_of(Mesh, arrays))
         if scene.tissue.region and mesh.regions is None:
             raise PalpateError("it does not say which elements are of which region")
-        if estimators.loads is None or (scene.endoscope.tip and estimators.touches is None):
-            raise PalpateError("it has no error estimates")
+        if missing := estimators.missing(scene):
+            raise PalpateError(f"it has no error estimates: {', '.join(missing)}")
         return cls(
             name=scene.name,
             scene=scene,

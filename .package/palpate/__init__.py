@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from palpate.online.client.frame import Frame
     from palpate.online.client.http import Client
     from palpate.online.client.session import ServiceError, Session, SessionClosed
     from palpate.online.session.frames import Flag, Output
@@ -18,6 +19,7 @@ __all__ = [
     "REST",
     "Client",
     "Flag",
+    "Frame",
     "Output",
     "PalpateError",
     "ReducedModel",
@@ -29,6 +31,7 @@ __all__ = [
 _WHERE = {
     "REST": "palpate.shared.reduced.transfer",
     "Client": "palpate.online.client.http",
+    "Frame": "palpate.online.client.frame",
     "ReducedModel": "palpate.shared.model",
     "Session": "palpate.online.client.session",
     "SessionClosed": "palpate.online.client.session",

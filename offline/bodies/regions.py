@@ -25,6 +25,11 @@ ROUND = 3
 BLOCK = 4_000_000
 """Pairs of a point and a triangle that are looked at at a time."""
 
+
+class RegionsTooSmall(SceneError):
+    """Regions that no element of a mesh is of, or that reach what can be touched in it."""
+
+
 Triangles = tuple[Array, Numbers]
 """Points (p, 3) mm and triangles (t, 3), outward."""
 
@@ -36,8 +41,8 @@ def regions_at(scene: Scene, centres: Array, sets: Mapping[str, Flags]) -> Numbe
 
     Raises
     ------
-    SceneError
-        If no element is of a region.
+    RegionsTooSmall
+        If no element is of one.
     """
     if not scene.tissue.region:
         return None
@@ -46,7 +51,7 @@ def regions_at(scene: Scene, centres: Array, sets: Mapping[str, Flags]) -> Numbe
         found[_holds(scene, region, centres, sets)] = number
     for number, region in enumerate(scene.tissue.region, 1):
         if not (found == number).any():
-            raise SceneError(
+            raise RegionsTooSmall(
                 f"tissue.region '{region.name}' ({region.in_words()}): no element's centre is "
                 f"there; they have {box_of(centres)}; move it, or make the mesh finer there"
             )
@@ -65,7 +70,7 @@ def refuse_touched(
     if len(bad):
         x, y, z = nodes[elements[bad[0]]].mean(axis=0)
         name = scene.tissue.region[regions[bad[0]] - 1].name
-        raise SceneError(
+        raise RegionsTooSmall(
             f"tissue.region '{name}' reaches what can be touched, near ({x:.1f}, {y:.1f}, {z:.1f}) "
             "mm: an element of the tissue itself must lie between; move one of them, or make the "
             "mesh finer there"

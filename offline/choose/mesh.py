@@ -6,6 +6,7 @@ a tip the compliance of its footprint, beyond which its force does not err.  By 
 elasticity costs one factorisation a mesh, and the errors of larger loads are much the same.
 """
 
+import itertools
 import re
 import sys
 from collections.abc import Sequence
@@ -14,9 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
+from palpate.offline.bodies.regions import RegionsTooSmall
 from palpate.offline.fem.body_mesh import own_mesh
 from palpate.offline.fem.graded import Graded
-from palpate.offline.fem.mesh import in_order
+from palpate.offline.fem.mesh import build_mesh, in_order
 from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.fem.shapes import shape_of
@@ -127,7 +129,19 @@ def candidates(scene: Scene) -> Sequence[Divisions | float]:
         along, second, third = (max(1, round(length / edge)) for length in lengths)
         if (along, second, third) not in found:
             found.append((along, second, third))
+    if scene.tissue.region:
+        fit = itertools.dropwhile(lambda own: _too_coarse(as_fine(scene, own)), found)
+        return list(fit) or found
     return found
+
+
+def _too_coarse(scene: Scene) -> bool:
+    """Whether a mesh has no elements for the regions of the tissue."""
+    try:
+        build_mesh(scene)
+    except RegionsTooSmall:
+        return True
+    return False
 
 
 def _references(scene: Scene, problem: FullProblem) -> list[Reference]:

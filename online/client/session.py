@@ -62,6 +62,9 @@ class SessionClosed(PalpateError):
         self.code, self.reason = code, reason
 
 
+CLOSED = "this client closed it"
+
+
 class Connection:
     """An open WebSocket at a path of a service; `ServiceError` if the handshake is refused."""
 
@@ -115,9 +118,14 @@ class Connection:
         """Tell whether there is a message, without waiting for one."""
         if not self._received:
             decrypted = isinstance(self.socket, ssl.SSLSocket) and self.socket.pending() > 0
-            if decrypted or select.select([self.socket], [], [], 0)[0]:
+            if self.closed or decrypted or select.select([self.socket], [], [], 0)[0]:
                 self._take()
         return bool(self._received)
+
+    @property
+    def closed(self) -> bool:
+        """Whether this client has closed it."""
+        return self.socket.fileno() < 0
 
     def flush(self) -> None:
         """Send what the protocol has to say."""
@@ -125,8 +133,8 @@ class Connection:
 
     def _take(self) -> None:
         """Wait for bytes and sort out the messages in them."""
-        if self.socket.fileno() < 0:
-            raise SessionClosed(1000, "this client closed it")
+        if self.closed:
+            raise SessionClosed(1000, CLOSED)
         try:
             data = self.socket.recv(1 << 18)
         except ConnectionError:
@@ -330,8 +338,11 @@ class Session:
     def reconnect(self) -> None:
         """Begin another session, as `step` does, for who sends and receives without it.
 
-        Raises what the last attempt did; `step` may then be called again.
+        Raises what the last attempt did; `step` may then be called again. Who has closed a session
+        gets no other: `SessionClosed`.
         """
+        if self._connection.closed:
+            raise SessionClosed(1000, CLOSED)
         end, pause, lost = perf_counter() + self._patience, SHORTEST_PAUSE, self._connection.socket
         while True:
             try:

@@ -178,7 +178,8 @@ export class Body {
 
   /** Distance (mm) of a point from what can be touched, about. */
   gap(point) {
-    return norm(add(row(this.limits.vertices, this.vertexNear(point)), point, -1));
+    const nearest = this.touchNear(point)?.point ?? row(this.limits.vertices, this.vertexNear(point));
+    return norm(add(nearest, point, -1));
   }
 
   /** Place in the middle of what can be touched. */

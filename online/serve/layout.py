@@ -25,7 +25,7 @@ from collections.abc import Callable, Mapping
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from palpate.shared.errors import PalpateError
 
@@ -130,6 +130,15 @@ class Mesh(NamedTuple):
     triangles: Annotated[Integers, "triangle", "(t, 3), nodes counter-clockwise from outside"]
     surface_nodes: Annotated[Integers, "number", "(s,), region surface's nodes among those of all"]
     clamped: Annotated[Bits, "bit", "(k,), 1 if held fixed"]
+
+    def normals(self, displacement: ArrayLike = 0.0) -> NDArray[np.float64]:
+        """Outward unit normals (k, 3) of the surface as it is displaced (k, 3) mm; inside 0."""
+        at = np.asarray(self.nodes, float) + np.asarray(displacement, float)
+        a, b, c = (at[self.triangles[:, corner]] for corner in range(3))
+        found = np.zeros_like(at)
+        np.add.at(found, self.triangles, np.cross(b - a, c - a)[:, None])
+        length = np.linalg.norm(found, axis=1, keepdims=True)
+        return np.divide(found, length, out=found, where=length > 0.0)
 
 
 class Accessible(NamedTuple):

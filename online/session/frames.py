@@ -97,6 +97,8 @@ class Reason(IntEnum):
     BELOW_SURFACE = 2
 
 
+_REASONS = {int(reason): reason for reason in Reason}
+
 REASONS_MEAN = (
     "",
     "no equilibrium was found there",
@@ -389,6 +391,8 @@ def decode_reply(frame: bytes) -> Reply:
         head["von_mises"] = take("von_mises", kind, nodes)
     if end != len(frame):
         raise FrameError("frame", f"{len(frame)} bytes where its fields say {end}")
+    head["flags"] = Flag(head["flags"])
+    head["reason"] = _REASONS.get(head["reason"], head["reason"])
     return Reply(**head)
 
 

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from palpate.online.session.frames import REPLY, REPLY_FIELDS, REQUEST, Field, Request
 from palpate.shared.arrays import Array
 from palpate.shared.errors import PalpateError
+from palpate.shared.files import open_regular
 
 logger = logging.getLogger(__name__)
 
@@ -230,7 +231,7 @@ class Recording(NamedTuple):
 def read_recording(path: Path) -> Recording:
     """Read a recording; raise `PalpateError` if it is missing, damaged or of another version."""
     try:
-        with h5py.File(path, "r") as file:
+        with open_regular(path) as whole, h5py.File(whole, "r") as file:
             if file.attrs.get("format") != FORMAT:
                 raise PalpateError(f"{path}: not a recording of a session")
             if (version := file.attrs["format_version"]) != FORMAT_VERSION:

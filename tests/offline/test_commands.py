@@ -6,10 +6,12 @@ import os
 import re
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
 
+from palpate.offline import commands
 from palpate.offline.info import LABELS, budget, closing, info, percent
 from palpate.offline.scenes import FOLDER, find_scene
 from palpate.offline.train import is_of
@@ -356,3 +358,14 @@ def test_training_into_a_folder_that_can_only_be_read_ends_in_a_sentence(
     said = f"Error: {tmp_path}/.quick.training.*: {os.strerror(errno.EROFS)}\n"
     assert re.fullmatch(said, ended.stderr)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_who_waits_long_for_an_answer_is_told_why(capfd, monkeypatch):
+    monkeypatch.setattr(commands, "PATIENCE", 0.05)
+    with commands._patience():
+        time.sleep(0.5)
+    assert "Compiling code" in capfd.readouterr().err
+    with commands._patience():
+        pass
+    time.sleep(0.2)
+    assert capfd.readouterr().err == ""

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.shared.answer import Answer, Answers
+from palpate.shared.answer import Answer, Answers, peak
 from palpate.shared.errors import QueryError
 from palpate.shared.fields import Composition
 from palpate.shared.geometry.surface import Surface
@@ -228,6 +228,9 @@ class FakeModel:
     def peaks(self, answer: Answer, displacement: np.ndarray) -> tuple[float, float]:
         stress = self.von_mises(answer)
         return float(stress.max()), float(np.percentile(stress, 99))
+
+    def peak(self, answer: Answer, displacement: np.ndarray) -> dict[str, Any]:
+        return peak(displacement, [self.peaks(answer, displacement)], [])
 
     def von_mises(
         self, answer: Answer, region: str = "all", displacement: Any = None

@@ -199,6 +199,29 @@ def test_a_drag_beside_the_tissue_turns_it_and_the_address_says_how(page):
     page.open(address)
     page.wait(OPENED)
     assert page.run("palpate.camera.toText()") == view
+    page.wait("palpate.movedAt > 0")  # it is drawn
+
+
+def test_keys_press_the_middle_where_nothing_is_pointed_at(page):
+    page.run("palpate.tool.cursor = [-0.99, -0.99]")
+    page.run("document.getElementById('canvas').focus()")
+    page.call("Input.dispatchKeyEvent", type="keyDown", key="Enter")
+    page.wait("palpate.answer?.CONTACT && palpate.tool.now === palpate.tool.level")
+    assert page.run("document.getElementById('lamp').dataset.state") != "bad"
+    point = page.run("palpate.tool.place.point")
+    np.testing.assert_allclose(point, [5.0, 5.0, 8.0], atol=1.5)
+    at = page.run("palpate.camera.project(palpate.tool.place.point)")
+    np.testing.assert_allclose(page.run("palpate.tool.cursor"), at)
+    page.call("Input.dispatchKeyEvent", type="keyDown", key="Enter")
+    page.wait("palpate.tool.now < -0.9")
+
+
+def test_who_slides_past_the_rim_is_told(page):
+    press(page, *MIDDLE)
+    page.mouse("moved", 5, 5, button="left", buttons=1)
+    page.wait("document.getElementById('trust').textContent.includes('held at the rim')")
+    release(page, 5, 5)
+    page.wait("!document.getElementById('trust').textContent.includes('held at the rim')")
 
 
 def test_keys_turn_zoom_and_press(page):
@@ -411,6 +434,8 @@ RECORDINGS = [
     ("time,x,y,z\n", "no positions"),
     ("time,x,y,z\n0,1,2,3\n1,1,,3\n", "Line 3"),
     ("time,x,y,z\n1,1,2,3\n0,1,2,3\n", "Line 3"),
+    ("time,x,y,z\n0,500,2,3\n1,500,2,3\n", "far from this body"),
+    ("\x89HDF\r\n\x1a\n", "palpate replay"),
 ]
 TASKS = [
     ("{", "This is no JSON"),
@@ -419,6 +444,7 @@ TASKS = [
     ('{"path": [[1, 2, 3], [1, 2, null]], "force_limit": 1}', "[x, y, z]"),
     ('{"path": [[1, 2, 3], [1, 2, 4]]}', '"force_limit"'),
     ('{"path": [[1, 2, 3], [1, 2, 4]], "force_limit": 1, "reach": 0}', '"reach"'),
+    ('{"path": [[5, 5, 8], [5, 5, 2]], "force_limit": 1}', "Point 2 of the path is 6.0 mm from"),
 ]
 
 

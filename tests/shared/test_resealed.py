@@ -34,7 +34,6 @@ LEFT = {
     "shorter": {"surface_triangles"},
     "longer": {"elements", "surface_triangles"},
     "wider": {"basis"},
-    "absent": {"mesh_error_coefficients", "tip_mesh_error_coefficients"},
 }
 """What an artifact could hold as well."""
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from palpate.offline.bodies.regions import inside
+from palpate.offline.bodies.regions import RegionsTooSmall, inside
+from palpate.offline.choose.mesh import as_fine, candidates
 from palpate.offline.fem.mesh import build_mesh
 from palpate.offline.fem.model import FullModel
 from palpate.offline.fem.problem import FullProblem, Load
@@ -174,3 +175,14 @@ def test_tetrahedra_have_faces_on_the_surface_of_a_region(tmp_path):
     border = np.intersect1d(own[:, :4], mesh.elements[mesh.region == 0][:, :4])
     away = np.linalg.norm(mesh.nodes[border] - [0.0, 0.0, -2.0], axis=1)
     np.testing.assert_allclose(away, 4.0, atol=0.25)
+
+
+def test_meshes_too_coarse_for_a_region_are_not_tried():
+    text = BLOCK.replace("geometry.divisions = [6, 6, 4]\n", "")
+    core = CORE.format(young=60.0, poisson=0.45, place="z = [3.2, 4.0]")
+    plain, own = (candidates(parse_scene(text + more)) for more in ("", core))
+    assert own == plain[-len(own) :]
+    assert 0 < len(own) < len(plain)
+    with pytest.raises(RegionsTooSmall):
+        build_mesh(as_fine(parse_scene(text + core), plain[0]))
+    assert build_mesh(as_fine(parse_scene(text + core), own[0])).region.any()

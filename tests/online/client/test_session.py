@@ -60,8 +60,9 @@ def test_without_being_asked_to_it_ends(in_time):
 def test_who_closed_it_gets_no_other(in_time):
     with Session(in_time, "toy", reconnect=5.0) as session:
         session.close()
-        with pytest.raises(SessionClosed, match="this client closed it"):
-            session.step(PRESSED)
+        for what in (lambda: session.step(PRESSED), session.poll, session.reconnect):
+            with pytest.raises(SessionClosed, match="this client closed it"):
+                what()
 
 
 def test_it_is_tried_for_as_long_as_was_said_and_then_told_why_not(serving):

@@ -1,4 +1,5 @@
 import json
+import os
 import re
 import resource
 import threading
@@ -253,3 +254,9 @@ def test_the_command_tells_and_its_exit_code_too(recorded, stiff, monkeypatch):
     result = CliRunner().invoke(commands.replay, [str(path), "toy.h5"])
     assert result.exit_code == 1
     assert "different" in result.output
+
+
+def test_a_pipe_is_no_recording(tmp_path):
+    os.mkfifo(tmp_path / "pipe.h5")
+    with pytest.raises(PalpateError, match="not a regular file"):
+        read_recording(tmp_path / "pipe.h5")
