@@ -463,7 +463,7 @@ async def scene(name: SceneName, request: Request) -> Any:
                 "surface_nodes": len(model.surface_nodes),
                 "triangles": len(model.surface_triangles),
             },
-            "info": model.info,
+            "info": {name: own for name, own in model.info.items() if name != "training"},
             "artifact": model.seal,
             "example": {"contacts": [served.example]},
         }

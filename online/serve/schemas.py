@@ -404,7 +404,9 @@ class SceneSummary(SceneEntry):
     size: dict[Literal["nodes", "dofs", "surface_nodes", "triangles"], int] = Field(
         description="What the fields of this scene hold."
     )
-    info: dict[str, Any] = Field(description="Training, validation and provenance.")
+    info: dict[str, Any] = Field(
+        description="Validation and provenance; palpate info tells how it was trained, too."
+    )
     artifact: str = Field(description="SHA-256 of the trained file that is served.")
     example: dict[str, Any] = Field(description="A request that this scene can answer.")
 

@@ -64,7 +64,11 @@ class FakeModel:
         tissue = scene.tissue.model_copy(update={"prony": ((0.5, 0.1),) if in_time else ()})
         self.name = name
         self.scene = scene.model_copy(update={"name": name, "tissue": tissue})
-        self.info: dict[str, Any] = {"modes": 1, "validation": {"queries": 0}}
+        self.info: dict[str, Any] = {
+            "modes": 1,
+            "training": {"seconds": {}},
+            "validation": {"queries": 0},
+        }
         self.steps: list[float] = []
         axis = np.linspace(0.0, 10.0, divisions + 1)
         grid = np.stack(np.meshgrid(axis, axis, axis / 2, indexing="ij"), axis=-1)
