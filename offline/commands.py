@@ -239,11 +239,13 @@ def train(
     if only_check:
         click.echo(f"{check(scene, workers)}\nnothing is wrong; next: palpate train {scene}")
         return
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as an interrupt does
+    ended = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as by an interrupt
     try:
         artifact = train(scene, out, workers, force, scheduler)
     except KeyboardInterrupt:
         raise click.ClickException("stopped; the same command continues from here") from None
+    finally:
+        signal.signal(signal.SIGTERM, ended)
     click.echo("\n".join(closing(artifact)))
 
 

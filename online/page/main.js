@@ -444,7 +444,7 @@ class Page {
   /** Set a task, which is a JSON file. */
   set(file) {
     return this.take(file, "task", (text) => {
-      this.task = new Task(text, (point) => this.body.gap(point));
+      this.task = new Task(text, (point) => this.body.gap(point), this.scene.ranges.radius);
       this.showTask();
     });
   }

@@ -4,7 +4,6 @@ import { add, norm } from "./vectors.js";
 
 const REACH = 1; // mm from a point of the path within which it is passed, unless the task says
 const MOST = 500; // points of a path
-const FAR = 2; // reaches from what can be touched, about, within which a point can be passed
 
 /** What is wrong with a task that a person wrote; nothing if it can be done. */
 function faults({ path, force_limit: limit, reach = REACH }) {
@@ -19,10 +18,10 @@ function faults({ path, force_limit: limit, reach = REACH }) {
 
 /**
  * Of the text of a JSON file `{"name", "path", "force_limit", "reach"}`; throws what is wrong. `gap`
- * is the distance of a point from what can be touched, mm.
+ * is the distance of a point from what can be touched at rest, and may be `deep`, mm.
  */
 export class Task {
-  constructor(text, gap) {
+  constructor(text, gap, deep) {
     let said;
     try {
       said = JSON.parse(text);
@@ -32,7 +31,7 @@ export class Task {
     const wrong = faults(said ?? {});
     if (wrong) throw new Error(wrong);
     const { name = "Task", path, force_limit: limit, reach = REACH } = said;
-    const far = path.findIndex((point) => gap(point) > FAR * reach);
+    const far = path.findIndex((point) => gap(point) > deep + reach);
     if (far >= 0) {
       const away = gap(path[far]).toFixed(1);
       throw new Error(`Point ${far + 1} of the path is ${away} mm from what can be touched here.`);

@@ -4,6 +4,7 @@ import json
 import pytest
 from click.testing import CliRunner
 
+from palpate.offline import commands
 from palpate.offline.fem.mesh import build_mesh
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.scenes import find_scene
@@ -34,12 +35,14 @@ def drawn(path):
 
 @pytest.fixture(scope="session")
 def run():
-    """Return a function that runs a command in this process."""
+    """Return a function that runs a command in this process, which says nothing of waiting."""
 
     def run(*arguments):
         return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
-    return run
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(commands, "PATIENCE", 1e6)
+        yield run
 
 
 @pytest.fixture(scope="session")
