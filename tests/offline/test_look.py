@@ -67,7 +67,7 @@ def test_missing_pyvista_is_named(run, tmp_path, monkeypatch):
 
 
 def test_what_training_a_body_from_a_file_would_make_is_told(run):
-    result = run("train", "turbinate-mri", "--check")
+    result = run("train", "liver", "--check")
     assert result.exit_code == 0, result.output
-    assert "turbinate-mri: " in result.stdout
+    assert "liver: " in result.stdout
     assert " elements tet10 or more, " in result.stdout

@@ -123,12 +123,14 @@ def test_a_report_tells_of_the_body_and_of_its_mesh(scene):
     assert told["crossings"] == 0
 
 
-def test_the_turbinate_comes_with_its_mesh_which_no_extra_is_needed_for():
-    scene = find_scene("turbinate-mri")
+@pytest.mark.parametrize("name", ["turbinate-mri", "turbinate-bone"])
+def test_the_turbinate_comes_with_its_mesh_which_no_extra_is_needed_for(name):
+    scene = find_scene(name)
     assert stored_at(scene).parent == FOLDER
     assert stored_at(scene).exists()
     mesh = build_mesh(scene)
-    assert mesh.nodes.size == pytest.approx(20_000, rel=0.1)
+    assert mesh.nodes.size == pytest.approx(30_000, rel=0.03)
+    assert mesh.region.any() == (name == "turbinate-bone")
     held, touched = mesh.nodes[mesh.clamped], mesh.nodes[mesh.faces[mesh.accessible]]
     assert held[:, 0].mean() < 7 < 12 < touched[..., 0].mean()  # lateral and medial
     assert held[:, 2].mean() > 14 > touched[..., 2].mean()  # above and below
@@ -140,6 +142,8 @@ def test_the_liver_is_what_its_generator_draws():
     assert np.ptp(points, axis=0).max() == pytest.approx(146, abs=1)
     mesh = build_mesh(find_scene("liver"))
     assert mesh.nodes[mesh.clamped][:, 1].mean() < mesh.nodes[mesh.faces[mesh.accessible], 1].mean()
+    tumour = mesh.nodes[mesh.elements[mesh.region == 1, :4]] - [26.0, 24.0, 15.0]
+    assert np.linalg.norm(tumour, axis=2).max() < 10.0 + 0.75
 
 
 def test_results_depend_on_the_mesh_and_on_surfaces_that_places_name(scene):
