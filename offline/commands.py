@@ -3,7 +3,6 @@
 Each imports what it runs when it runs, so that ``--help`` is instant.
 """
 
-import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -239,13 +238,10 @@ def train(
     if only_check:
         click.echo(f"{check(scene, workers)}\nnothing is wrong; next: palpate train {scene}")
         return
-    ended = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as by an interrupt
     try:
         artifact = train(scene, out, workers, force, scheduler)
     except KeyboardInterrupt:
         raise click.ClickException("stopped; the same command continues from here") from None
-    finally:
-        signal.signal(signal.SIGTERM, ended)
     click.echo("\n".join(closing(artifact)))
 
 
