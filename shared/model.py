@@ -114,7 +114,10 @@ class ReducedModel:
         self.surface_nodes, self.surface_triangles = boundary_triangles(body.faces)
         self.fields = FieldRecovery(body, models, lambda: self.transfer)
         self._own = self.new_warm()
-        contact = body.contact_fields(surface)
+        with np.errstate(divide="ignore", invalid="ignore"):  # of triangles without an area
+            contact = body.contact_fields(surface)
+        if not np.isfinite(contact).all():
+            raise PalpateError("surface: triangles of it have no area")
         rim = surface.rim_distance()[:, None] / body.tip.radius
         self._index: SurfaceIndex = surface.ground(np.hstack([self.limits, contact, rim]))
 

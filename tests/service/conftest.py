@@ -1,4 +1,5 @@
 import ctypes
+import gc
 import os
 import re
 import signal
@@ -23,8 +24,9 @@ def rewritten(artifact, path, old, new):
 
 
 def process_memory(pid):
-    """Bytes that a process holds; this one gives back first what its allocator keeps for later."""
+    """Bytes that a process holds; this one first gives back what it would give back later."""
     if pid == os.getpid():
+        gc.collect()
         ctypes.CDLL(None).malloc_trim(0)
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE")

@@ -136,3 +136,12 @@ def test_what_does_not_fit_together_is_refused_when_it_is_loaded(whole, tmp_path
     path = sealed(tmp_path / "apart.h5", whole, arrays=whole.arrays | {name: values})
     with pytest.raises(ArtifactError, match="incomplete or inconsistent"):
         ReducedModel.load(path)
+
+
+def test_a_surface_whose_triangles_have_no_area_is_refused(whole, tmp_path):
+    path, vertices = tmp_path / "resealed.h5", whole.arrays["surface_vertices"].copy()
+    vertices[whole.arrays["surface_triangles"][0]] = vertices[0]
+    sealed(path, whole, arrays=whole.arrays | {"surface_vertices": vertices})
+    model, reason = loaded(path)
+    assert model is None
+    assert "triangles of it have no area" in reason
