@@ -3,8 +3,11 @@
 import math
 import re
 
+import numpy as np
 import pytest
 
+from palpate.offline.scenes import find_scene
+from palpate.shared.mechanics.laws import law_of
 from palpate.shared.scene import (
     Block,
     Extrusion,
@@ -239,3 +242,13 @@ def test_every_number_of_a_scene_says_its_unit_or_what_it_is_relative_to() -> No
             tables = "$ref" in field.get("items", {})
             if field.get("type") in ("number", "array") and not tables:
                 assert any(word in field.get("description", "") for word in words), (name, key)
+
+
+@pytest.mark.parametrize("name", ["quick", "quick-mooney-rivlin", "quick-demiray"])
+def test_tissue_of_every_law_can_be_as_stiff_as_wanted(name: str) -> None:
+    scene = find_scene(name)
+    twice = scene.of_tissue(young=2.0 * scene.tissue.young).tissue
+    assert twice.young == pytest.approx(2.0 * scene.tissue.young)
+    assert twice.poisson == scene.tissue.poisson
+    once = law_of(scene.tissue, np.zeros(1, np.int32))
+    np.testing.assert_allclose(law_of(twice, np.zeros(1, np.int32))[0], 2.0 * once[0])
