@@ -10,7 +10,7 @@ from palpate.offline.bodies import surface
 from palpate.offline.bodies.files import checked
 from palpate.shared.anatomy import Unit
 from palpate.shared.arrays import Array, Flags
-from palpate.shared.place import Patch
+from palpate.shared.place import Patch, Place
 from palpate.shared.scene import Scene, SceneError
 
 
@@ -94,14 +94,12 @@ def _keys(scene: Scene, name: str, patch: Patch, faces: Boundary) -> Iterator[tu
     centres = faces.centres
     if patch.side is not None:
         yield "side", faces.sides[patch.side]
-    for axis, key in enumerate("xyz"):
-        if (bounds := getattr(patch, key)) is not None:
-            yield key, (bounds[0] <= centres[:, axis]) & (centres[:, axis] <= bounds[1])
+    yield from ranges(patch, centres)
     if patch.normal is not None and patch.within is not None:
         cosine = faces.normals @ patch.normal / np.linalg.norm(patch.normal)
         yield "normal", cosine >= np.cos(np.radians(patch.within))
     if patch.near is not None and patch.radius is not None:
-        yield "near", np.linalg.norm(centres - patch.near, axis=1) <= patch.radius
+        yield "near", near(patch, centres)
     if patch.close_to is not None and patch.distance is not None:
         yield "close_to", _gaps(scene, name, patch.close_to, centres) <= patch.distance
     if patch.set is not None:
@@ -110,6 +108,19 @@ def _keys(scene: Scene, name: str, patch: Patch, faces: Boundary) -> Iterator[tu
         yield "any", np.any([_holds(scene, name, own, faces) for own in patch.any], axis=0)
     if patch.without is not None:
         yield "without", ~_holds(scene, name, patch.without, faces)
+
+
+def ranges(place: Place, centres: Array) -> Iterator[tuple[str, Flags]]:
+    """Each range of a place, and which centres (n, 3) mm lie in it."""
+    for axis, key in enumerate("xyz"):
+        if (bounds := getattr(place, key)) is not None:
+            yield key, (bounds[0] <= centres[:, axis]) & (centres[:, axis] <= bounds[1])
+
+
+def near(place: Place, centres: Array) -> Flags:
+    """Which centres (n, 3) mm are near the picked point of a place that has one."""
+    assert place.near is not None and place.radius is not None  # noqa: PT018
+    return np.asarray(np.linalg.norm(centres - place.near, axis=1) <= place.radius)
 
 
 def _named(name: str, wanted: str, sets: Mapping[str, Flags]) -> Flags:

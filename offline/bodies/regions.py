@@ -13,7 +13,7 @@ import numpy as np
 
 from palpate.offline.bodies import surface
 from palpate.offline.bodies.files import checked, require
-from palpate.offline.bodies.places import box_of
+from palpate.offline.bodies.places import box_of, near, ranges
 from palpate.shared.anatomy import Unit
 from palpate.shared.arrays import Array, Flags, Numbers
 from palpate.shared.mechanics.tissue import Region
@@ -116,11 +116,10 @@ def inside(points: Array, closed: Triangles) -> Flags:
 
 def _holds(scene: Scene, region: Region, centres: Array, sets: Mapping[str, Flags]) -> Flags:
     every = np.ones(len(centres), dtype=bool)
-    for axis, key in enumerate("xyz"):
-        if (bounds := getattr(region, key)) is not None:
-            every &= (bounds[0] <= centres[:, axis]) & (centres[:, axis] <= bounds[1])
+    for _, own in ranges(region, centres):
+        every &= own
     if region.near is not None:
-        every &= np.linalg.norm(centres - region.near, axis=1) <= region.radius
+        every &= near(region, centres)
     if region.set is not None:
         if region.set not in sets:
             raise SceneError(

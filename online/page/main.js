@@ -453,7 +453,11 @@ class Page {
   play(file) {
     return this.take(file, "play", (text) => {
       if (!this.scene?.serves.sessions) throw new Error("Only scenes with a tip play recordings.");
-      this.player = new Player(text, (point) => this.body.gap(point) < FAR * this.body.radius);
+      const { body } = this, away = (point) => norm(add(point, body.centre, -1));
+      // far beyond the ball round the body nothing need be searched for
+      this.player = new Player(text, (point) => (
+        away(point) < (1 + FAR) * body.radius && body.gap(point) < FAR * body.radius
+      ));
       this.playedSince = seconds();
       this.tool.held = false;
       element("stop").hidden = false;
