@@ -165,7 +165,9 @@ def test_tetrahedra_have_faces_on_the_surface_of_a_region(tmp_path):
     text = scene(150.0, 0.4, "near = [0.0, 0.0, -2.0]\nradius = 4.0").text
     head, _, core = text.partition("[[tissue.region]]")
     kept = [line for line in head.splitlines() if not line.startswith(("geometry", "su"))]
-    body = 'geometry = {kind = "surface", file = "ball.stl", unit = "mm", deviation = 0.2}'
+    body = (
+        'geometry = {kind = "surface", file = "ball.stl", unit = "mm", deviation = 0.2, edge = 2.0}'
+    )
     places = "support.z = [-10.0, -8.0]\nsurface.z = [4.0, 10.0]"
     whole = "\n".join([*kept, body, places, "[[tissue.region]]" + core])
     mesh = build_mesh(parse_scene(whole, tmp_path))
