@@ -196,11 +196,12 @@ def verdict(plan: Plan, summary: dict[str, Any]) -> dict[str, str]:
     parts += [f"{plan.sessions} sessions at {plan.rate:g} frames/s"] if plan.sessions else []
     parts += [f"{plan.queries:g} queries/s"] if plan.queries else []
     asked = f"{plan.scene}: {' and '.join(parts)} for {plan.duration:g} s"
-    late = machine["lateness_us"]["p99_us"]
-    if late is None or late > ON_TIME or 2 * machine["clean_windows"] < machine["windows"]:
-        why = f"the load test was late itself, by {late or 0:.0f} µs (p99), or the machine's host "
-        why += f"took time ({machine['steal_s']} s): {machine['clean_windows']} of "
-        why += f"{machine['windows']} windows are clean"
+    late, latest = (machine["lateness_us"][name] for name in ("p99_us", "max_us"))
+    windows, clean = machine["windows"], machine["clean_windows"]
+    if late is None or late > ON_TIME or 2 * clean < windows:
+        why = f"in {windows - clean} of {windows} windows the load test itself was more than "
+        why += f"{ON_TIME:.0f} µs late, by up to {latest or 0:.0f} µs, or the machine's host took "
+        why += f"time ({machine['steal_s']} s)"
         do = "run it where it has a core of its own, or ask for less"
         return {"verdict": "void", "asked": asked, "why": why, "do": do}
     if "overload" in summary:
@@ -226,9 +227,8 @@ def verdict(plan: Plan, summary: dict[str, Any]) -> dict[str, str]:
             advice = advice or _ADVICE["superseded"]
     if said:
         return {"verdict": _KEPT[False], "asked": asked, "why": "; ".join(said), "do": advice}
-    latest = {name: kind["clean"]["p99_us"] for name, kind in kinds.items()}
     why = "99 of 100 within " + " and ".join(
-        f"{value or 0:.0f} µs ({name})" for name, value in latest.items()
+        f"{kind['clean']['p99_us'] or 0:.0f} µs ({name})" for name, kind in kinds.items()
     )
     return {"verdict": _KEPT[True], "asked": asked, "why": why, "do": ""}
 
