@@ -108,10 +108,7 @@ def solve(
         u = problem.displaced(exact, contact)
         stress = problem.von_mises(u, contact=contact)
         regions = [region.name for region in problem.scene.tissue.region]
-        peaks = [
-            problem.stress_field.peaks(u, None, contact, number)
-            for number in range(len(regions) + 1)
-        ]
+        peaks = problem.stress_field.peaks_by_region(u, None, contact)
         kept = problem.beyond_clamped_layer
         report["full_model"] = {
             "error": {

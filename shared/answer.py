@@ -135,9 +135,9 @@ def describe(answer: Answer) -> dict[str, Any]:
 def peak(
     displacement: Field | Array, stresses: Sequence[tuple[float, float]], regions: Sequence[str]
 ) -> dict[str, Any]:
-    """Largest displacement (mm) of nodes (n, 3), and stresses (kPa) as in ``StressField.peaks``.
+    """Largest displacement (mm) of nodes (n, 3), and stresses by region (kPa), JSON-able.
 
-    Those of the tissue that is in no region, and of ``regions``, if there are any.
+    See ``StressField.peaks_by_region``; those of ``regions`` by name, if there are any.
     """
     names = "von_mises", "von_mises_p99"
     rest, *others = (dict(zip(names, own, strict=True)) for own in stresses)

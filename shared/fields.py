@@ -13,7 +13,7 @@ from palpate.shared.local_models import Body, LocalModels
 from palpate.shared.mechanics.tensors import SYMMETRIC
 from palpate.shared.reduced.points import expand
 from palpate.shared.reduced.transfer import Transfer
-from palpate.shared.stress_field import StressField
+from palpate.shared.stress_field import Peaks, StressField
 
 
 class Composition(NamedTuple):
@@ -121,11 +121,11 @@ class FieldRecovery:
         with np.errstate(over="ignore"):
             return (answer.stiffness * stress).astype(np.float32)
 
-    def peaks(self, answer: Answer, displacement: Field, region: int = 0) -> tuple[float, float]:
-        """Largest stress and 99th percentile (kPa) of an answer; see ``StressField.peaks``."""
+    def peaks_by_region(self, answer: Answer, displacement: Field) -> list[Peaks]:
+        """Of an answer, kPa; see ``StressField``."""
         past, contact = self._remembered(answer), answer.footprint
-        found = self._stress.peaks(displacement, past, contact, region)
-        return answer.stiffness * found[0], answer.stiffness * found[1]
+        found = self._stress.peaks_by_region(displacement, past, contact)
+        return [(answer.stiffness * most, answer.stiffness * high) for most, high in found]
 
     def _remembered(self, answer: Answer) -> Array | None:
         """``B`` of ``mechanics.viscosity`` (e, 6, q) at the points of all elements, of a past."""

@@ -45,6 +45,7 @@ from palpate.shared.reduced.past import Elastic, Remembering
 from palpate.shared.reduced.transfer import LeftBehind, Local, Past, Transfer, estimate_history
 from palpate.shared.reduced.workspace import Warm, Workspace
 from palpate.shared.scene import Scene, parse_scene
+from palpate.shared.stress_field import Peaks
 from palpate.shared.tables import press_models
 
 Region = Literal["surface", "all"]
@@ -528,12 +529,12 @@ class ReducedModel:
         """What the displacement of the surface is made of."""
         return self.fields.composition(answer, self.surface_nodes)
 
-    def peaks(self, answer: Answer, displacement: Field, region: int = 0) -> tuple[float, float]:
+    def peaks(self, answer: Answer, displacement: Field) -> Peaks:
         """Largest von Mises stress and its 99th percentile (kPa) outside the clamped layer.
 
         ``displacement`` is that of all nodes.  See ``StressField.peaks``.
         """
-        return self.fields.peaks(answer, displacement, region)
+        return self.fields.peaks_by_region(answer, displacement)[0]
 
     def peak(self, answer: Answer, displacement: Field) -> dict[str, Any]:
         """Largest displacement (mm) and stresses (kPa) of an answer by name, JSON-able.
@@ -541,8 +542,7 @@ class ReducedModel:
         ``displacement`` is that of all nodes; see ``answer.peak``.
         """
         regions = [region.name for region in self.scene.tissue.region]
-        found = [self.peaks(answer, displacement, number) for number in range(len(regions) + 1)]
-        return peak(displacement, found, regions)
+        return peak(displacement, self.fields.peaks_by_region(answer, displacement), regions)
 
 
 def _total(

@@ -16,6 +16,7 @@ HIGHEST = 0.01
 """Share of the volume with stress above the 99th percentile."""
 
 Displacement = NDArray[np.floating]
+Peaks = tuple[float, float]
 
 
 class StressField:
@@ -47,25 +48,28 @@ class StressField:
         nodal_von_mises(self._recovery, u, B, near, out)
         return out
 
-    def peaks(
-        self, u: Displacement, B: Array | None, contact: Contact | None, region: int = 0
-    ) -> tuple[float, float]:
+    def peaks(self, u: Displacement, B: Array | None, contact: Contact | None) -> Peaks:
+        """Those of the tissue that is in no region; see ``peaks_by_region``."""
+        return self.peaks_by_region(u, B, contact)[0]
+
+    def peaks_by_region(
+        self, u: Displacement, B: Array | None, contact: Contact | None
+    ) -> list[Peaks]:
         """Largest stress and 99th percentile by volume (kPa), outside the clamped layer.
 
-        Of the elements of a region, 0 is what is in none; of all where all are in the layer.
-        Both are of the integration points: under a contact there are more of them than of nodes,
-        and stress at the nodes is carried there.
+        First of the elements that are in no region, then of each region; of all of them where all
+        are in the layer.  Both are of the integration points: under a contact there are more of
+        them than of nodes, and stress at the nodes is carried there.
         """
         points, volumes, counted = self._points
-        own = np.repeat(self._body.region == region, len(points) // len(volumes))
-        counts = own & counted if (own & counted).any() else own
         near, exact = (self._near.at(at, contact) for at in (self._body.nodes, points))
-        out = np.empty(len(points))
-        point_von_mises(self._recovery, u, B, near, exact, out)
-        out, volumes = out[counts], volumes.reshape(-1)[counts]
-        order = np.argsort(-out)
-        above = np.searchsorted(np.cumsum(volumes[order]), HIGHEST * volumes.sum())
-        return float(out[order[0]]), float(out[order[above]])
+        stress = np.empty(len(points))
+        point_von_mises(self._recovery, u, B, near, exact, stress)
+        region = np.repeat(self._body.region, len(points) // len(volumes))
+        owns = (region == number for number in range(region.max() + 1))
+        flat = volumes.reshape(-1)
+        counts = (own & counted if (own & counted).any() else own for own in owns)
+        return [_peaks(stress[own], flat[own]) for own in counts]
 
     def remember(self, u: Displacement, share: float | None, B: Array) -> None:
         """See ``stress.remember``."""
@@ -81,3 +85,9 @@ class StressField:
         counts = body.beyond_clamped_layer(points)
         _, volumes = volume_quadrature(body.nodes, body.elements, POINTS)
         return points, volumes, counts
+
+
+def _peaks(stress: Array, volumes: Array) -> Peaks:
+    order = np.argsort(-stress)
+    above = np.searchsorted(np.cumsum(volumes[order]), HIGHEST * volumes.sum())
+    return float(stress[order[0]]), float(stress[order[above]])

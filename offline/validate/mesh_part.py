@@ -41,6 +41,10 @@ LEVELS, DEPTHS = (0.3, 1.0), (0.15, 0.8)
 CLOSE = 1e-4
 """Residual of solutions, relative to the load or the tip's force, which then errs by as little."""
 
+SMALLEST_STEP = 1 / 8
+"""Fraction of a load below which a level is left out: on a fine mesh a step that fails takes
+minutes, and tissue that no step of this size finds in balance has given way."""
+
 GIVEN_WAY = 0.3
 """Error of displacement, of all or under the footprint, or of the tip's force, beyond which the
 finer mesh has given way where the scene's own has not: that is no error of a size, and the limit
@@ -86,14 +90,15 @@ class Pressed:
         if near is None and before is not None:
             start = level / before[0] * before[1]
         contact, felt = None, None
+        how: Any = {"start": start, "smallest_step": SMALLEST_STEP, "tolerance": CLOSE}
         if isinstance(step, Load):  # where it is on every mesh, however far its surface goes
             nodal = problem.unit_load_at(step.position, -step.direction)
             forces = step.pressure * nodal[:, None] * step.direction
-            found = problem.model.solve(forces, start=start, tolerance=CLOSE)
+            found = problem.model.solve(forces, **how)
             contact, felt = problem.footprint(step), nodal @ found.displacement / nodal.sum()
         elif self._integrated:
             load = problem.sphere_at(step.position)
-            found = problem.model.solve(load, start=start, tolerance=CLOSE)
+            found = problem.model.solve(load, **how)
         else:
             found = problem.solve(step, start=start)
             contact = problem.footprint(step, found)

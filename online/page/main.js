@@ -7,7 +7,7 @@ import { Readings, digits } from "./readings.js";
 import { Player, Recording } from "./recording.js";
 import { Refused, getArrays, getJson, postForArrays } from "./service.js";
 import { Session } from "./session.js";
-import { Task } from "./task.js";
+import { Task, exampleTask } from "./task.js";
 import { Tool } from "./tool.js";
 import { add, across, cross, dot, norm, scale, unit } from "./vectors.js";
 import { MOST_PARTS, View } from "./view.js";
@@ -76,6 +76,10 @@ class Page {
     element("play").onchange = ({ target }) => this.play(target.files[0]);
     element("task").onchange = ({ target }) => this.set(target.files[0]);
     element("again").onclick = () => { this.task.again(); this.showTask(); };
+    element("replay").onclick = () => this.play(new File([this.recorded.csv()], "Recording"));
+    element("example").onclick = () => this.scene && this.set(
+      new File([exampleTask(this.body, this.young, this.scene.ranges.radius)], "Example"),
+    );
     element("stop").onclick = () => this.stop();
     document.addEventListener("dragover", (event) => event.preventDefault());
     document.addEventListener("drop", (event) => {
@@ -184,6 +188,7 @@ class Page {
     this.player = null;
     element("stop").hidden = true;
     if (this.recording) this.record(); // of another scene
+    element("replay").hidden = this.recorded?.scene !== this.name;
     this.task = null;
     this.showTask();
     Object.assign(this, { answer: null, sentAt: null, placed: null, checkedAt: 0, stress: null, colouredAt: 0, measuredAt: 0 });
@@ -415,6 +420,7 @@ class Page {
     }
     element("record").textContent = this.recording ? "Stop recording" : "Record";
     element("save").hidden = !this.recorded;
+    element("replay").hidden = this.recorded?.scene !== this.name;
   }
 
   /** Save what has been recorded, as "csv" or as "h5". */
@@ -530,7 +536,7 @@ class Page {
       apart = Math.max(apart, Math.hypot(own[i] - server[i], own[i + 1] - server[i + 1], own[i + 2] - server[i + 2]));
     }
     this.compared = most > 0 ? apart / most : 0;
-    element("difference").textContent = `The picture's own differs from it by ${(100 * this.compared).toPrecision(2)} % of the largest at most.`;
+    element("difference").textContent = `Shown as the service sent it; as the picture makes it, it differs by at most ${(100 * this.compared).toPrecision(2)} % of the largest.`;
   }
 
   /** Fetch the modes of the local models nearest to a point. */

@@ -1,6 +1,6 @@
 // What is read: numbers with their error bars, the trace of the force, trust in words, times.
 
-import { colourOf } from "./colours.js";
+import { colourOf, roundUp } from "./colours.js";
 
 const TRACE = 10; // s that the trace shows
 const RECENT = 5; // s over which times are taken together
@@ -30,13 +30,16 @@ export function trust(answer, tolerance) {
   if (answer.BESIDE) words.push("Out of range: position. The tip presses beyond the rim.");
   for (const field of answer.out_of_range ?? []) words.push(`Out of range: ${field}.`);
   if (answer.STALLED) words.push("Stalled: more time passed than the tissue follows at once.");
-  const wanted = ([name]) => `${NAMES[name]} ${Number((100 * tolerance[name]).toFixed(1))} %`;
+  if (!words.length && !answer.CONTACT) return { state: "none", words: "The tool does not touch the tissue." };
+  const percent = (share) => `${Number((100 * share).toFixed(1))} %`;
+  const allowed = ([name]) => `${NAMES[name]} ${percent(tolerance[name])}`;
   const known = Object.entries(answer.errors).filter(([, error]) => Number.isFinite(error));
-  const doubted = known.filter(([name, error]) => error > tolerance[name]).map(wanted);
-  if (doubted.length) words.push(`Errors may exceed what is wanted: ${doubted.join(", ")}.`);
+  const beyond = known.filter(([name, error]) => error > tolerance[name]).map(([name, error]) => (
+    `${NAMES[name]} ± ${percent(error)}, allowed ${percent(tolerance[name])}`
+  ));
+  if (beyond.length) words.push(`Estimated errors are larger than this scene allows: ${beyond.join("; ")}.`);
   if (words.length) return { state: "doubt", words: words.join(" ") };
-  if (!answer.CONTACT) return { state: "none", words: "The tool does not touch the tissue." };
-  return { state: "good", words: `In range, converged, errors within what is wanted (${known.map(wanted).join(", ")}).` };
+  return { state: "good", words: `In range, converged, estimated errors within what this scene allows (${known.map(allowed).join(", ")}).` };
 }
 
 /** Median and 99th percentile of the numbers of the last seconds. */
@@ -58,7 +61,7 @@ class Times {
   }
 }
 
-/** A bar with a value, its error, and a limit where there is one. */
+/** A bar with a value, its error, a limit where there is one, and what its end stands for. */
 function drawGauge(canvas, { value, error, limit, most }) {
   const { context: c, width, height, ink } = sheet(canvas);
   const x = (v) => Math.min(Math.max(v / most, 0), 1) * width;
@@ -76,9 +79,10 @@ function drawGauge(canvas, { value, error, limit, most }) {
     c.stroke();
   };
   if (Number.isFinite(error)) {
-    const low = Math.max(x(value * (1 - error)), 1), high = Math.min(x(value * (1 + error)), width - 1);
-    line([low, height / 2], [high, height / 2]);
-    for (const end of [low, high]) line([end, height * 0.1], [end, height * 0.9]);
+    const ends = [value * (1 - error), value * (1 + error)];
+    line(...ends.map((end) => [x(end), height / 2]));
+    // without a cap where it goes on beyond the bar
+    for (const end of ends.filter((v) => v >= 0 && v <= most)) line([x(end), height * 0.1], [x(end), height * 0.9]);
   } else if (value > 0) { // anything
     c.setLineDash([3, 3]);
     line([0, height / 2], [width, height / 2]);
@@ -88,6 +92,10 @@ function drawGauge(canvas, { value, error, limit, most }) {
     c.strokeStyle = "#e07a1f";
     line([x(limit), 0], [x(limit), height]);
   }
+  c.fillStyle = ink;
+  c.textAlign = "right";
+  c.font = "10px system-ui, sans-serif";
+  c.fillText(digits(most), width - 2, height / 2 + 3.5);
 }
 
 /** A canvas of the right fineness, wiped: its context, size, and the colour of text. */
@@ -109,7 +117,7 @@ export class Readings {
   constructor() {
     const ids = [
       "lamp", "trust", "force", "force-bar", "depth", "depth-bar", "depth-name", "moved", "stress",
-      "stress-bar", "trace", "solve", "trip", "frames", "legend", "legend-name",
+      "stress-bar", "trace", "where", "solve", "trip", "frames", "legend", "legend-name",
     ];
     for (const id of ids) this[id] = document.getElementById(id);
     this.clear();
@@ -131,8 +139,8 @@ export class Readings {
     const size = Math.hypot(...answer.force);
     this.points.push([now, size, answer.errors.force]);
     while (this.points.length && this.points[0][0] < now - TRACE - 1) this.points.shift();
-    this.most.force = Math.max(this.most.force, 1.2 * size);
-    this.most.stress = Math.max(this.most.stress, 1.2 * (answer.largest_stress || 0));
+    this.most.force = Math.max(this.most.force, roundUp(1.1 * size));
+    this.most.stress = Math.max(this.most.stress, roundUp(1.1 * (answer.largest_stress || 0)));
   }
 
   countFrame(now) {
@@ -156,12 +164,14 @@ export class Readings {
     this["depth-name"].textContent = level.name;
     const apart = Number.isFinite(level.error) ? `± ${digits(100 * level.error)} %` : "± unknown";
     this.moved.textContent = level.error === null ? "–" : apart;
-    const most = level.limit > 0 ? ` of ${digits(level.limit)}` : "";
-    this.depth.textContent = `${digits(level.value)}${most} ${level.unit}`;
+    const range = level.limit > 0 ? `, trained to ${digits(level.limit)}` : "";
+    this.depth.textContent = `${digits(level.value)} ${level.unit}${range}`;
     drawGauge(this["depth-bar"], { ...level, error: level.error ?? 0 });
     const stress = answer?.largest_stress ?? 0;
     this.stress.textContent = told(stress, "kPa", errors.von_mises);
     drawGauge(this["stress-bar"], { value: stress, error: errors.von_mises ?? 0, most: this.most.stress });
+    const at = answer?.CONTACT ? answer.contact_point : null;
+    this.where.textContent = at ? Array.from(at, (x) => x.toFixed(1)).join(", ") : "–";
     this.solve.textContent = this.solves.text(now);
     this.trip.textContent = this.trips.text(now);
     while (this.drawn.length && this.drawn[0] < now - 1) this.drawn.shift();

@@ -1,9 +1,12 @@
 // A task: a path over the surface to be followed within a limit of force, and how well it went.
 
-import { add, norm } from "./vectors.js";
+import { roundUp } from "./colours.js";
+import { across, add, norm } from "./vectors.js";
 
 const REACH = 1; // mm from a point of the path within which it is passed, unless the task says
 const MOST = 500; // points of a path
+const EXAMPLE = [-0.25, -0.15, -0.05, 0.05, 0.15, 0.25]; // points of one, in radii of the body
+const FIRM = 0.25; // its limit, in Young's moduli times the tool's radius squared
 
 /** What is wrong with a task that a person wrote; nothing if it can be done. */
 function faults({ path, force_limit: limit, reach = REACH }) {
@@ -14,6 +17,13 @@ function faults({ path, force_limit: limit, reach = REACH }) {
   if (!(limit > 0 && limit < Infinity)) return '"force_limit" must be a force above 0 in mN.';
   if (!(reach > 0 && reach < Infinity)) return '"reach" must be a distance above 0 in mm.';
   return "";
+}
+
+/** The text of a task over the middle of what can be touched of a body, for tissue and tool. */
+export function exampleTask(body, young, radius) {
+  const { point, normal } = body.middle(), along = across(normal);
+  const path = EXAMPLE.map((s) => body.touchNear(add(point, along, s * body.radius))?.point).filter(Boolean);
+  return JSON.stringify({ name: "Example", path, force_limit: roundUp(FIRM * young * radius ** 2) });
 }
 
 /**

@@ -153,6 +153,26 @@ def test_the_wheel_presses_deeper_and_the_lamp_says_what_is_wrong(page):
     release(page, x, y)
 
 
+def test_the_lamp_tells_an_error_beside_what_is_allowed_and_moves_nothing(page):
+    top = "document.getElementById('level').getBoundingClientRect().top"
+    page.wait("document.getElementById('lamp').dataset.state === 'none'")
+    before = page.run(top)
+    press(page, *MIDDLE)
+    page.wait("palpate.answer?.CONTACT && palpate.tool.now === palpate.tool.level")
+    page.run("palpate.scene.tolerance.von_mises = 0.001")
+    page.wait(
+        "document.getElementById('trust').textContent.includes('larger than this scene allows')"
+    )
+    words, error = page.run("""[
+        document.getElementById("trust").textContent, 100 * palpate.answer.errors.von_mises,
+    ]""")
+    assert f"stress ± {error:.1f}".rstrip("0").rstrip(".") in words
+    assert "allowed 0.1 %" in words
+    assert page.run(top) == before
+    release(page, *MIDDLE)
+    page.wait("document.getElementById('lamp').dataset.state === 'none'")
+
+
 def test_the_slider_makes_the_tissue_as_stiff(page, server, atlas):
     x, y = MIDDLE
     press(page, x, y)
@@ -385,6 +405,9 @@ def test_what_is_recorded_is_replayed_played_again_and_tells_the_modulus(
     most = max(recorded.values())
     for entry in log:
         assert abs(entry["force"][2] - recorded[tuple(entry["asked"])]) < 1e-3 * most
+    page.run("document.getElementById('replay').click()")
+    page.wait("palpate.player !== null && palpate.answer.CONTACT")
+    page.wait("palpate.player === null && !palpate.answer.CONTACT")
 
 
 SET = PLAY.replace("play(", "set(").replace("played.csv", "task.json")
@@ -395,6 +418,19 @@ THERE = """(() => {
     return answer?.CONTACT && !answer.CLAMPED && tool.now === tool.level
         && String(asked) === String(tool.centre(scene.ranges.radius));
 })()"""
+
+
+def test_a_task_to_try_lies_on_what_can_be_touched(page, atlas):
+    page.run("document.getElementById('example').click()")
+    page.wait("document.getElementById('score').textContent.includes('touch its first point')")
+    path, limit = page.run("[palpate.task.path, palpate.task.limit]")
+    assert len(path) > 2
+    away = [atlas.surface.project(np.array(point))[2] for point in path]
+    assert max(away) < 0.05
+    assert 0.0 < limit < np.inf
+    press(page, *MIDDLE)
+    page.wait("document.getElementById('where').textContent.split(', ').length === 3")
+    release(page, *MIDDLE)
 
 
 def test_a_task_is_followed_and_scored(page):
