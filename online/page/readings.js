@@ -164,7 +164,7 @@ export class Readings {
     this["depth-name"].textContent = level.name;
     const apart = Number.isFinite(level.error) ? `± ${digits(100 * level.error)} %` : "± unknown";
     this.moved.textContent = level.error === null ? "–" : apart;
-    const range = level.limit > 0 ? `, trained to ${digits(level.limit)}` : "";
+    const range = level.limit > 0 ? `, range ${digits(level.limit)}` : "";
     this.depth.textContent = `${digits(level.value)} ${level.unit}${range}`;
     drawGauge(this["depth-bar"], { ...level, error: level.error ?? 0 });
     const stress = answer?.largest_stress ?? 0;
