@@ -69,6 +69,7 @@ class Page {
     element("lock").onchange = () => { this.changed = true; this.tell(); };
     element("range").onchange = () => { element("lock").checked = true; this.changed = true; this.tell(); };
     element("server-field").onchange = () => { this.sentAt = null; this.tell(); };
+    element("bare").onchange = () => { this.changed = true; };
     element("snapshot").onclick = () => { this.session?.command("snapshot"); element("restore").disabled = false; };
     element("restore").onclick = () => { this.session?.command("restore"); this.sentAt = null; };
     element("record").onclick = () => this.record();
@@ -647,8 +648,9 @@ class Page {
     let most = 0, mark = 0;
     if (answer && stress) {
       const sorted = Float32Array.from(this.stress).sort();
-      most = sorted.at(-1);
       mark = sorted[Math.floor(0.99 * (sorted.length - 1))];
+      // beyond the largest outside the clamped layer there is only what grows with the mesh's fineness
+      most = Math.min(sorted.at(-1), Math.max(answer.largest_stress ?? Infinity, mark));
     } else if (answer) {
       most = Math.max(answer.depth ?? norm(answer.contact_displacement ?? [1, 0, 0]), 0.1);
     }
@@ -665,7 +667,7 @@ class Page {
     const { radius } = scene.ranges, legend = this.measure(colouring);
     readings.drawLegend(legend);
     const parts = { tool: null, arrow: null, task: this.task };
-    if (tool.place) {
+    if (tool.place && !element("bare").checked) {
       const axis = scene.serves.sessions || !tool.active ? tool.place.normal : scale(this.direction(), -1);
       const tip = scene.serves.sessions, ghost = !tool.active && tool.now <= 0;
       const centre = tip ? add(tool.place.point, tool.place.normal, radius - Math.max(tool.now, ghost ? 0 : -10)) : tool.place.point;

@@ -57,6 +57,16 @@ def page(tab, server):
     return tab
 
 
+PIXELS = """(() => {
+    const { view } = palpate, { gl, canvas } = view;
+    palpate.draw();
+    const pixels = new Uint8Array(4 * canvas.width * canvas.height);
+    gl.readPixels(0, 0, canvas.width, canvas.height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+    return new Uint32Array(pixels.buffer);
+})()"""
+"""Colours of the picture, read before it is shown."""
+
+
 def test_it_is_up_without_complaints_and_asks_nobody_else(page, server):
     for address in page.requests:
         assert address.startswith((server.url, server.url.replace("http:", "ws:"))), address
@@ -64,14 +74,7 @@ def test_it_is_up_without_complaints_and_asks_nobody_else(page, server):
     assert page.run("document.getElementById('link').textContent") == "connected"
     press(page, *MIDDLE)
     page.wait("palpate.answer?.CONTACT && palpate.tool.now === palpate.tool.level")
-    # colours of some pixels, read before they are shown
-    different = page.run("""(() => {
-        const { view } = palpate, { gl, canvas } = view;
-        palpate.draw();
-        const pixels = new Uint8Array(4 * canvas.width * canvas.height);
-        gl.readPixels(0, 0, canvas.width, canvas.height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
-        return new Set(new Uint32Array(pixels.buffer)).size;
-    })()""")
+    different = page.run(f"new Set({PIXELS}).size")
     release(page, *MIDDLE)
     assert different > 100
     assert not page.run("palpate.view.gl.isContextLost()")
@@ -171,6 +174,29 @@ def test_the_lamp_tells_an_error_beside_what_is_allowed_and_moves_nothing(page):
     assert page.run(top) == before
     release(page, *MIDDLE)
     page.wait("document.getElementById('lamp').dataset.state === 'none'")
+
+
+def test_colours_are_those_of_the_tissue_that_is_not_held_and_the_tool_can_be_left_out(page):
+    press(page, *MIDDLE)
+    page.wait("palpate.answer?.CONTACT && palpate.tool.now === palpate.tool.level && !palpate.pale")
+    ordinary, beside = page.run("""(() => {
+        const ordinary = palpate.measure("stress").range, own = palpate.stress;
+        palpate.stress = Float32Array.from(own);
+        palpate.stress[0] = 1e6;  // as at the edge of what is held
+        const beside = palpate.measure("stress").range;
+        palpate.stress = own;
+        return [ordinary, beside];
+    })()""")
+    assert ordinary <= beside < 10.0 * page.run("palpate.answer.largest_stress")
+    apart = page.run(f"""(() => {{
+        const seen = {PIXELS};
+        document.getElementById("bare").click();
+        const bare = {PIXELS};
+        document.getElementById("bare").click();
+        return seen.reduce((sum, colour, i) => sum + (colour !== bare[i]), 0);
+    }})()""")
+    assert apart > 1000
+    release(page, *MIDDLE)
 
 
 def test_the_slider_makes_the_tissue_as_stiff(page, server, atlas):
