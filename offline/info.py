@@ -197,7 +197,9 @@ def closing(artifact: Path) -> list[str]:
         for place, how in ways.items()
         if example[place]
     ]
-    return [f"{artifact}: {report['bytes'] / 1e6:.1f} MB", *errors, *following]
+    seconds = report["provenance"]["wall_seconds"]
+    made = f"{artifact}: {report['bytes'] / 1e6:.1f} MB, made in {duration(seconds)}"
+    return [made, *errors, *following]
 
 
 def percent(share: float) -> str:

@@ -83,7 +83,8 @@ class Extrusion(Part):
     )
     corners: tuple[Point2, Point2, Point2, Point2] = Field(
         description="points (x, z) of the outline, mm, clockwise (x right, z up); the side outer "
-        "runs from the first to the second, then tip, inner, and lip back to the first"
+        "runs from the first to the second, then tip, inner, and lip back to the first; elements "
+        "go across from each side to the opposite one, which should be about as long"
     )
     length: Length = Field(description="length along y, mm")
     element: Element = "hex20"

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from palpate.offline.bodies.regions import RegionsTooSmall
 from palpate.offline.fem.body_mesh import own_mesh
 from palpate.offline.fem.graded import Graded
-from palpate.offline.fem.mesh import build_mesh, in_order
+from palpate.offline.fem.mesh import Inverted, build_mesh, in_order
 from palpate.offline.fem.norms import relative
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.fem.shapes import shape_of
@@ -129,17 +129,15 @@ def candidates(scene: Scene) -> Sequence[Divisions | float]:
         along, second, third = (max(1, round(length / edge)) for length in lengths)
         if (along, second, third) not in found:
             found.append((along, second, third))
-    if scene.tissue.region:
-        fit = itertools.dropwhile(lambda own: _too_coarse(as_fine(scene, own)), found)
-        return list(fit) or found
-    return found
+    fit = itertools.dropwhile(lambda own: _too_coarse(as_fine(scene, own)), found)
+    return list(fit) or found
 
 
 def _too_coarse(scene: Scene) -> bool:
-    """Whether a mesh has no elements for the regions of the tissue."""
+    """Whether a mesh is inverted somewhere, or has no elements for the regions of the tissue."""
     try:
         build_mesh(scene)
-    except RegionsTooSmall:
+    except (Inverted, RegionsTooSmall):
         return True
     return False
 

@@ -131,15 +131,19 @@ def in_order(geometry: Extrusion | Block, three: Sequence[T]) -> tuple[T, T, T]:
     return (first, third, second) if isinstance(geometry, Extrusion) else (first, second, third)
 
 
+class Inverted(SceneError):
+    """A mesh with elements that are inverted or flat somewhere."""
+
+
 def _refuse_inverted(nodes: Array, elements: Numbers) -> None:
     """Refuse elements that are inverted or flat somewhere."""
     least = determinants(nodes, elements).min(axis=1)
     if not (least > 0).all():
         x, y, z = nodes[elements[np.argmin(least)]].mean(axis=0)
-        raise SceneError(
+        raise Inverted(
             f"geometry: {np.sum(~(least > 0))} of {len(elements)} elements are inverted, the worst "
-            f"near ({x:.2f}, {y:.2f}, {z:.2f}) mm; change divisions, grading or corners, or "
-            "give the outline more points"
+            f"near ({x:.2f}, {y:.2f}, {z:.2f}) mm; move corners, so that opposite sides are about "
+            "as long, change divisions or grading, or give the outline more points"
         )
 
 

@@ -70,4 +70,4 @@ def _outline() -> str:
     """An ellipse, 6 mm wide and 16 mm high, as a closed outline in CSV."""
     angle = 2.0 * np.pi * np.arange(POINTS) / POINTS
     rows = zip(3.0 * np.sin(angle), 8.0 + 8.0 * np.cos(angle), strict=True)
-    return "x_mm,z_mm\n" + "".join(f"{x:.4f},{z:.4f}\n" for x, z in rows)
+    return "x,z\n" + "".join(f"{x:.4f},{z:.4f}\n" for x, z in rows)

@@ -99,7 +99,10 @@ def test_training_ends_with_where_how_large_how_accurate_and_what_is_next(
 ):
     monkeypatch.setattr("palpate.offline.train.is_of", lambda *_: True)
     first, *said = run("train", "quick", "--out", artifact).stdout.splitlines()
-    assert first == f"{artifact}: {artifact.stat().st_size / 1e6:.1f} MB"
+    path, made = first.split(": ")
+    assert path == str(artifact)
+    size = f"{artifact.stat().st_size / 1e6:.1f}"
+    assert re.fullmatch(rf"{size} MB, made in [\d.]+ (s|min)", made)
     assert re.match(r"errors: 95 of 100 within: displacement [\d.]+ %, von Mises ", said[0])
     assert said[-2].startswith(f"next: palpate solve {artifact} --at ")
 

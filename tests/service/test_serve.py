@@ -50,6 +50,24 @@ def test_it_ends_cleanly_on_a_signal_and_logs_no_requests_nor_clients_that_hang_
     assert "/scenes" not in server.log
 
 
+def test_who_says_twice_that_it_shall_end_reads_no_traceback(artifact):
+    process = subprocess.Popen(
+        [*PALPATE, "serve", "--artifacts", artifact.parent, "--port", "0"],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    said = ""
+    while "loading models" not in said:
+        said += process.stderr.readline()
+        assert process.poll() is None, said
+    for _ in range(2):
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.005)
+    _, log = process.communicate(timeout=30)
+    assert process.returncode == 0
+    assert "Traceback" not in said + log
+
+
 def test_it_ends_while_kernels_are_compiled(artifact, tmp_path):
     process = subprocess.Popen(
         [*PALPATE, "serve", "--artifacts", artifact.parent, "--port", "0"],

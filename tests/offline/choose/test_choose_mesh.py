@@ -2,10 +2,11 @@
 
 import re
 
+import numpy as np
 import pytest
 
-from palpate.offline.choose.mesh import with_mesh
-from palpate.offline.fem.mesh import build_mesh
+from palpate.offline.choose.mesh import as_fine, candidates, with_mesh
+from palpate.offline.fem.mesh import Inverted, build_mesh
 from palpate.offline.scenes import find_scene
 from palpate.shared.scene import SceneError, parse_scene
 
@@ -25,6 +26,38 @@ def test_a_scene_that_fixes_its_mesh_keeps_it_and_without_divisions_there_is_non
     assert with_mesh(scene) == (scene, None)
     with pytest.raises(SceneError, match=r"geometry.divisions: not given; palpate train"):
         build_mesh(unmeshed())
+
+
+DOME = """
+name = "dome"
+geometry.kind = "extrusion"
+geometry.section = "dome.csv"
+geometry.corners = [[-3.97, 1.75], [3.94, 2.05], [3.12, 0.0], [-3.24, 0.01]]
+geometry.length = 12.0
+tissue.law = "neo-hookean"
+tissue.young = 12.0
+tissue.poisson = 0.45
+support.side = "inner"
+surface.side = "outer"
+endoscope.radius = 2.0
+endoscope.max_tilt = 20.0
+load.max_indentation = 0.15
+"""
+
+
+def test_meshes_that_are_too_coarse_for_the_outline_are_not_tried(tmp_path):
+    """A dome whose round top is one side, so long beside the others that few elements fold."""
+    angle = np.linspace(np.pi, 0.0, 40)
+    c, s = np.cos(angle), np.sin(angle)
+    dome = np.column_stack([4.0 * np.sign(c) * abs(c) ** 0.87, 0.9 + 5.1 * s**0.87])
+    flat = np.column_stack([np.linspace(3.1, -3.1, 12), np.zeros(12)])
+    np.savetxt(tmp_path / "dome.csv", [*dome, *flat], delimiter=",", header="x,z", comments="")
+    scene = parse_scene(DOME, tmp_path)
+    with pytest.raises(Inverted, match="move corners, so that opposite sides are about as long"):
+        build_mesh(as_fine(scene, (4, 2, 6)))
+    coarsest = candidates(scene)[0]
+    assert np.prod(coarsest) > 48
+    build_mesh(as_fine(scene, coarsest))
 
 
 LOOSE = {"displacement": 0.25, "von_mises": 0.5, "force": 0.2}
