@@ -94,6 +94,15 @@ class Question(NamedTuple):
         return self.jump if apart > APART else None
 
     @property
+    def lost(self) -> bool:
+        """Whether the full model cannot follow the path to a load that has an equilibrium.
+
+        Where tissue has given way on the way, and comes back to, is not known then.
+        """
+        on_path = self.case.follow and len(self.case.steps) > 1
+        return on_path and self.exact is None and self.jump is not None
+
+    @property
     def several(self) -> bool:
         """Whether path and jump end in different equilibria."""
         return self.exact is not None and self.other is not None

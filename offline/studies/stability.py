@@ -101,7 +101,7 @@ def stability(
     -------
     dict
         See ``outcomes.summaries``; ``without_equilibrium``: cases of each kind that the full model
-        has no answer to.
+        has no answer to.  Those that it loses on the way there are not asked.
     """
     in_time = scene is None
     atlas, problem = full.opened(artifact, scene)
@@ -129,8 +129,9 @@ def stability(
         for kind, own in (asked | learning).items()
     }
     solved = full.in_parallel(artifact, checkpoint, "full solutions", tasks)
-    questions = {kind: solved[kind] for kind in asked}
-    questions |= hard_cases.several(questions, cases)
+    answered = {kind: solved[kind] for kind in asked}
+    answered |= hard_cases.several(answered, cases)
+    questions = {kind: [q for q in own if not q.lost] for kind, own in answered.items()}
     table: dict[str, dict[str, list[Result]]] = {name: {} for name in wanted}
     for poisson, solutions in zip(poissons, learning, strict=True):
         pairs = [(question.case.steps, question.jump) for question in solved[solutions]]
@@ -150,7 +151,7 @@ def stability(
     kept = [kind for kind, own in questions.items() if own]
     outcomes.publish(artifact.parent / atlas.name / "report", title, table, kept, noun)
     checkpoint.remove()
-    missing = {kind: sum(q.exact is None for q in own) for kind, own in questions.items()}
+    missing = {kind: sum(q.exact is None for q in own) for kind, own in answered.items()}
     return outcomes.summaries(table) | {
         "without_equilibrium": {kind: count for kind, count in missing.items() if count}
     }

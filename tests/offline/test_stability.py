@@ -147,6 +147,15 @@ def test_a_load_that_snapped_and_was_lowered_stays_on_its_branch():
     assert several({LOWERED: [raised, lowered]}, 9) == {SEVERAL: [], HYSTERESIS: [lowered]}
 
 
+def test_where_the_full_model_is_lost_on_the_way_nothing_is_known_to_be_right():
+    raised, lowered = (buckled(*loads).case for loads in ((3.0,), (3.0, 6.0, 3.0)))
+    jump = buckled(3.0).jump
+    assert Question(lowered, None, jump).lost
+    assert not Question(lowered, jump, jump).lost
+    assert not Question(lowered, None, None).lost  # there is none, which is known
+    assert not Question(raised, None, jump).lost
+
+
 def test_an_answer_on_another_branch_is_told_apart_and_counts_as_silent(problem):
     x, normal, _ = problem.surface.project(np.array([4.0, 5.5, 8.0]))
     path, jump, half = (
