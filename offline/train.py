@@ -37,8 +37,9 @@ from palpate.offline.fem.mesh import mesh_quality
 from palpate.offline.fem.norms import statistics
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.info import duration
-from palpate.offline.reduce.footprint_models import compile_query, train_patch
+from palpate.offline.reduce.footprint_models import train_patch
 from palpate.offline.reduce.join import bases_of, join
+from palpate.offline.reduce.kernels import KERNELS
 from palpate.offline.reduce.layout import PATCHES, RITZ_SPACING, Layout
 from palpate.offline.reduce.load_range import SEARCHES, ask, bearable_shares, load_range, untested
 from palpate.offline.reduce.ritz import region
@@ -234,8 +235,8 @@ def forecast(problem: FullProblem, workers: int, coarsest: bool = False) -> str:
     return (
         f"{scene.name}: {len(problem.mesh.elements)} elements {scene.geometry.element}"
         f"{' or more' if coarsest else ''}, {dofs} DOFs; about "
-        f"{models}{more} local models; {about} {duration(seconds)} on {cores}, and some 3 min more "
-        "the first time, while code is compiled"
+        f"{models}{more} local models; {about} {duration(seconds)} on {cores}, and a minute or two "
+        "more the first time, while code is compiled"
     )
 
 
@@ -258,9 +259,10 @@ class Pipeline:
     def run(self, path: Path, mesh_choice: dict[str, Any] | None = None) -> None:
         """Train and write the artifact; it keeps how its mesh was chosen."""
         # beside the first stage, so that no worker waits for another's compiler
-        compiled = self.executor.submit(run, compile_query)
+        compiled = [self.executor.submit(run, kernels) for kernels in KERNELS]
         limits = self._load_range()
-        compiled.result()
+        for kernels in compiled:
+            kernels.result()
         size = self.scene.training.size
         training: dict[str, Any] = {"mesh": mesh_quality(self.problem.mesh)}
         if isinstance(self.scene.geometry, FileBody):

@@ -5,6 +5,7 @@ query for the sixty arrays it needs.  Inside compiled code a tuple travels array
 function to the next, which takes longer to compile.  A ``Bound`` value is one pointer for both.
 """
 
+import hashlib
 import inspect
 import math
 from collections.abc import Callable, Mapping
@@ -28,8 +29,9 @@ class _BoundType(types.StructRef):
     def __init__(self, fields, kind):
         self.instance_class = kind
         super().__init__(fields)
-        # tuples of two classes with the same fields are two types
-        types.Type.__init__(self, f"Bound({kind.__module__}.{kind.__qualname__}){self._fields}")
+        # tuples of two classes with the same fields are two types; the name is in every symbol
+        fields_too = hashlib.sha256(repr(self._fields).encode()).hexdigest()[:16]
+        types.Type.__init__(self, f"{kind.__module__}.{kind.__qualname__}({fields_too})")
 
     def preprocess_fields(self, fields):
         """Drop literal types: they would compile a kernel anew for every value."""

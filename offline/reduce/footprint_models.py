@@ -20,7 +20,6 @@ from palpate.shared.local_models import LocalModels, ViscousModels
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.footprint import pressure_limit
 from palpate.shared.mechanics.tip import EDGE_FIELD
-from palpate.shared.reduced import touch
 from palpate.shared.reduced.features import (
     CHANGES,
     CHANGING,
@@ -30,7 +29,7 @@ from palpate.shared.reduced.features import (
 )
 from palpate.shared.reduced.outcome import PRESS_FEATURES
 from palpate.shared.reduced.past import Elastic
-from palpate.shared.reduced.points import LANES, STATE, increments, linearise
+from palpate.shared.reduced.points import STATE, increments, linearise
 from palpate.shared.reduced.press import place, press
 from palpate.shared.reduced.workspace import Workspace
 from palpate.shared.scene import Scene
@@ -150,13 +149,6 @@ class LocalTrainer:
         found = warm.q[0], scratch.load, warm.inverse[0], scratch.features, scratch.tangent_features
         return Sample(*map(np.copy, found))
 
-    def lift(self, position: Array) -> None:
-        """Ask for a tip off the tissue, centred at a position (3,) mm."""
-        solver = self._workspace.solver
-        touch.place(solver, position)
-        touch.begin(solver, position, position)
-        touch.touch(solver, position)
-
     def answers(self, draw: Callable[[], Load], count: int) -> list[Sample]:
         """Answers to drawn loads; those that it does not solve are left out."""
         return [sample for _ in range(count) if (sample := self.solve(draw())) is not None]
@@ -170,19 +162,6 @@ class LocalTrainer:
             increments(self.law[1], moduli, self.rows, products)
             changes.append(self.rows @ products.T)
         return np.array(changes, float)
-
-
-def compile_query(problem: FullProblem) -> None:
-    """Compile what local models are trained and queried with, on a model of nothing."""
-    surface = problem.surface
-    x, normal = surface.vertices[0], surface.normals[0]
-    stored, factors = np.zeros((LANES, LANES), np.int16), np.zeros((LANES, LANES), np.float32)
-    basis = np.zeros((len(problem.model.free), LANES))
-    models = _untrained(problem, basis, Footprint(x, normal, 1.0), 1.0, stored, factors)
-    trainer = LocalTrainer(problem, models)
-    trainer.solve(Load(x, normal, 0.0))
-    if problem.scene.endoscope.tip:
-        trainer.lift(x + 2.0 * problem.scene.endoscope.radius * normal)
 
 
 def train_patch(problem: FullProblem, region: Region, patch: Patch) -> LocalModels:
@@ -203,7 +182,7 @@ def trained_patch(problem: FullProblem, region: Region, patch: Patch) -> LocalMo
     whole, mix = whole_numbers(region.orthonormal @ leading, region.orthonormal)
     # stored in these and in half precision, so trained in it
     states = region.states(model)
-    models = _untrained(problem, states, patch.at, patch.extent, whole, mix)
+    models = untrained(problem, states, patch.at, patch.extent, whole, mix)
     galerkin = LocalTrainer(problem, models)
     most = patch.size.cubature_points
     forces = _training_forces(galerkin, loads)[: len(weights)]
@@ -235,7 +214,7 @@ def trained_patch(problem: FullProblem, region: Region, patch: Patch) -> LocalMo
     )
 
 
-def _untrained(
+def untrained(
     problem: FullProblem,
     states: Array,
     at: Footprint,

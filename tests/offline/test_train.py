@@ -9,13 +9,15 @@ import time
 import numpy as np
 import pytest
 
-from palpate.offline.reduce.footprint_models import compile_query
+from palpate.offline.reduce.kernels import KERNELS
 from palpate.offline.run.workers import content_key
 from palpate.offline.scenes import find_scene
 from palpate.offline.train import is_of, train
 from palpate.shared.artifact import read_artifact
+from palpate.shared.mechanics.stress import nodal_von_mises, point_von_mises
 from palpate.shared.model import STORED, ReducedModel
 from palpate.shared.reduced import press
+from palpate.shared.reduced.many import press_many
 
 from ..conftest import PALPATE
 
@@ -107,14 +109,17 @@ def test_what_is_there_is_not_trained_again_and_a_changed_scene_is(tiny, resumed
 
 
 def test_one_compilation_serves_training_and_queries(atlas, problem):
-    compile_query(problem)
-    atlas.press(atlas.surface.vertices[0], 0.1)
-    queries = press.place, press.press
+    for kernels in KERNELS:
+        kernels(problem)
+    queries = press.place, press.press, press_many, nodal_von_mises, point_von_mises
     known = [len(query.signatures) for query in queries]
     by_columns = np.asfortranarray(atlas.limits)
     other = ReducedModel(
         atlas.name, atlas.scene, {}, atlas.body, atlas.surface, by_columns, atlas.models,
         atlas.estimators,
     )  # fmt: skip
-    other.press(atlas.surface.vertices[0], 0.1)
+    answer = other.press(atlas.surface.vertices[0], 0.1)
+    other.peaks(answer, other.displacement(answer))
+    other.von_mises(answer)
+    other.solve_many(atlas.surface.vertices[:1], [0.1])
     assert [len(query.signatures) for query in queries] == known
