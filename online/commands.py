@@ -59,7 +59,9 @@ def serve(**settings: Any) -> None:
 )  # fmt: skip
 @options(Settings)
 def demo(scene: str, beside: tuple[str, ...], browser: bool, **settings: Any) -> None:
-    """Press a first piece of tissue: train SCENE (or a small pad), serve it and open its page.
+    """Press a first piece of tissue: serve SCENE, trained if needed, and open its page.
+
+    The small pad that is served without SCENE comes trained with Palpate.
 
     The other options are those of palpate serve.
     """

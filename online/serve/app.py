@@ -24,6 +24,7 @@ from starlette.websockets import WebSocket
 from palpate.online.serve import errors, guard, layout, schemas, tickets, wire
 from palpate.online.serve.answer import answer, checked
 from palpate.online.serve.errors import Refusal, check_numbers
+from palpate.online.serve.first_start import compile_kernels
 from palpate.online.serve.metrics import CONTENT_TYPE, Metrics
 from palpate.online.serve.page import pages
 from palpate.online.serve.schemas import (
@@ -131,6 +132,7 @@ def _prepare(
         on_ready()
 
     def load() -> None:
+        compile_kernels(here.settings.artifacts)
         here.open(warm_up)
         with suppress(RuntimeError):  # the service has ended meanwhile
             loop.call_soon_threadsafe(finish)
@@ -144,25 +146,43 @@ def _prepare(
 
 def warm(sessions: Sessions, served: ServedModel) -> None:
     """Call every kernel and encoder once, so that no client pays for a first time."""
+    warm_loads(served)
+    warm_tip(sessions, served)
+
+
+def warm_loads(served: ServedModel) -> None:
+    """Ask about loads in every way."""
     uncounted, outputs = Metrics(), get_args(schemas.Output)
     for region, media_type in zip(("surface", "all", "none"), OFFERED, strict=True):
         asked = {"contacts": [served.example], "region": region, "outputs": outputs}
         body = orjson.dumps(asked)
         answer(served.model, parse(SolveRequest, body), media_type, uncounted)
-    models, radius = served.model.models, served.model.scene.endoscope.radius
-    tour: list[int] = []
-    if models.viscous is not None:  # a history goes from one local model to the next and back
-        here, there = models.viscous.pairs[0]
-        tour = [here, there, here]
-        contacts = ({"position": at, "pressure": 0.1} for at in models.centres[tour].tolist())
+    if tour := _tour(served):
+        contacts = (
+            {"position": at, "pressure": 0.1} for at in served.model.models.centres[tour].tolist()
+        )
         steps = [{"time": 0.1 * i, "contact": contact} for i, contact in enumerate(contacts)]
         body = orjson.dumps({"steps": steps, "region": "all", "outputs": outputs})
         answer(served.model, parse(HistoryRequest, body), JSON, uncounted)
     served.model.solve_many([served.example["position"]], [served.example["pressure"]])
+
+
+def warm_tip(sessions: Sessions, served: ServedModel) -> None:
+    """Ask about the tip in every way, if the scene has one."""
+    models, radius = served.model.models, served.model.scene.endoscope.radius
     if served.model.has_tip:
         served.model.touch_many([served.tip])
-        above = [models.centres[k] + 0.9 * radius * models.frames[k, 0] for k in tour]
+        above = [models.centres[k] + 0.9 * radius * models.frames[k, 0] for k in _tour(served)]
         sessions.prepare(served, [position.tolist() for position in above])
+
+
+def _tour(served: ServedModel) -> list[int]:
+    """Local models of a history: from one to the next and back; none without a past."""
+    viscous = served.model.models.viscous
+    if viscous is None:
+        return []
+    here, there = viscous.pairs[0]
+    return [here, there, here]
 
 
 SceneName = Annotated[str, Path(description="Name of a served scene.", examples=["turbinate"])]

@@ -326,9 +326,11 @@ def serve(
 def _loaded(settings: Settings) -> "Service":
     """Load and warm the models for workers to share."""
     from palpate.online.serve.app import warm
+    from palpate.online.serve.first_start import compile_kernels
     from palpate.online.serve.service import Service
     from palpate.online.session.session import Sessions
 
+    compile_kernels(settings.artifacts)
     service = Service(settings)
     sessions = Sessions(service)
     service.open(lambda served: warm(sessions, served))

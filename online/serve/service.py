@@ -61,8 +61,8 @@ class Service:
         """Load and warm what there is to serve."""
         if self._shared is not None:
             self.models, self._files = self._shared.models, dict(self._shared._files)
-            for served in self.models.values():
-                warm(served)
+            for model in self.models.values():
+                warm(model)
         self.look(warm)
 
     def look(self, warm: Callable[[ServedModel], Any]) -> None:
@@ -92,11 +92,11 @@ class Service:
         before = self._files[path].name if path in self._files else None
         others = {file.name for other, file in self._files.items() if other != path}
         try:
-            served = _served(ReducedModel.load(path))
-            name = served.model.name
+            opened = served(ReducedModel.load(path))
+            name = opened.model.name
             if name in others:
                 raise PalpateError(f"{path}: another file already holds {name!r}")
-            warm(served)
+            warm(opened)
         except Exception as error:
             reason = str(error)
             if not isinstance(error, PalpateError):  # no reason to withhold the others
@@ -111,7 +111,7 @@ class Service:
             self._files[path] = _File(stamp, before, told)
         else:
             kept = {own: model for own, model in self.models.items() if own != before}
-            self.models = dict(sorted({**kept, name: served}.items()))
+            self.models = dict(sorted({**kept, name: opened}.items()))
             self._files[path] = _File(stamp, name, None)
             logger.info("serving %s from %s", name, printable(str(path)))
 
@@ -138,7 +138,7 @@ class Service:
         return self.models[name]
 
 
-def _served(model: ReducedModel) -> ServedModel:
+def served(model: ReducedModel) -> ServedModel:
     """Make examples in the middle of the surface: half its pressure limit, a tip a tenth deep."""
     vertices, radius = model.surface.vertices, model.scene.endoscope.radius
     middle = int(((vertices - vertices.mean(axis=0)) ** 2).sum(axis=1).argmin())

@@ -10,6 +10,7 @@ import urllib.request
 
 import pytest
 
+from palpate.online.demo import TRAINED
 from palpate.shared.progress import trainings
 
 from ..conftest import PALPATE
@@ -50,6 +51,18 @@ def test_a_slab_is_served_and_what_trains_beside_it_is_told_and_ends_with_it(art
                 time.sleep(0.2)
         else:
             raise AssertionError("the training goes on")
+
+
+def test_the_pad_comes_trained_and_the_other_it_would_be_is_not_made(tmp_path):
+    command = [*PALPATE, "demo", "--artifacts", tmp_path / "new", "--port", "0", "--no-browser"]
+    for _ in range(2):
+        demo = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, stderr=-3)
+        said = demo.stdout.readline()
+        demo.terminate()
+        demo.communicate(timeout=20)
+        assert said.startswith("Open http")
+    (artifact,) = (tmp_path / "new").iterdir()
+    assert artifact.read_bytes() == (TRAINED / "pad.h5").read_bytes()
 
 
 def test_a_scene_that_cannot_be_trained_is_told(tmp_path):

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import time
 import urllib.request
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -68,7 +69,15 @@ def test_who_says_twice_that_it_shall_end_reads_no_traceback(artifact):
     assert "Traceback" not in said + log
 
 
-def test_it_ends_while_kernels_are_compiled(artifact, tmp_path):
+def compiles_in(folder, process):
+    """Whether a process, by its folder in /proc, has its kernels there."""
+    try:
+        return f"NUMBA_CACHE_DIR={folder}".encode() in (process / "environ").read_bytes()
+    except OSError:  # it has ended
+        return False
+
+
+def test_it_ends_while_kernels_are_compiled_and_so_do_those_that_compile(artifact, tmp_path):
     process = subprocess.Popen(
         [*PALPATE, "serve", "--artifacts", artifact.parent, "--port", "0"],
         stderr=subprocess.PIPE,
@@ -85,6 +94,10 @@ def test_it_ends_while_kernels_are_compiled(artifact, tmp_path):
         process.kill()
     assert process.returncode == 0
     assert "Traceback" not in log
+    end = time.monotonic() + 20
+    while left := [pid for pid in Path("/proc").glob("[0-9]*") if compiles_in(tmp_path, pid)]:
+        assert time.monotonic() < end, left
+        time.sleep(0.1)
 
 
 def test_a_connection_survives_refusals_also_of_other_names_of_this_machine(server):

@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 from palpate.offline.run.streams import stream
+from palpate.offline.scenes import find_scene
 from palpate.offline.validate.queries import LOADS, held_out_loads, random_loads
+from palpate.online.demo import TRAINED
+from palpate.shared.artifact import read_artifact
 
 from ..conftest import table
 
@@ -117,3 +120,15 @@ def test_validation_over_histories_of_the_tip(touched):
     assert report["von_mises"]["mean"] <= 0.02
     assert report["force"]["mean"] <= 0.01
     assert all(float(row["force"]) for row in rows)
+
+
+@pytest.mark.parametrize("kind", [(), ("--tip",)])
+def test_the_pad_that_comes_trained_is_that_of_its_scene_and_as_right_as_it_asks(validate, kind):
+    artifact, scene = TRAINED / "pad.h5", find_scene("pad")
+    assert read_artifact(artifact).scene == scene.text
+    report, _ = validate(artifact, "--queries", 20, "--seed", 7, *kind)
+    assert report["unconverged"] == 0
+    assert report["covered"] >= 0.8  # of 20
+    asked = scene.tolerance.model_dump()
+    for name in ("displacement", "von_mises", "force") if kind else ("displacement", "von_mises"):
+        assert report[name]["p95"] < 0.5 * asked[name]  # the rest is the mesh's
