@@ -139,7 +139,7 @@ def _prepare(
         while not ended.wait(LOOKED):
             here.look(warm_up)
 
-    logger.info("loading models; where kernels are compiled for the first time, it takes minutes")
+    logger.info("loading models; the first start of a release compiles kernels for a minute or two")
     # a daemon: a service that has to stop does not wait for it
     threading.Thread(target=load, name="loading", daemon=True).start()
 
