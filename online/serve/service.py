@@ -26,6 +26,18 @@ class ServedModel(NamedTuple):
     tip: list[float]  # mm, a position of the tip's centre at which it presses a little
     spare: list[Any]  # trackers for sessions to come, see `session.session`
 
+    @classmethod
+    def of(cls, model: ReducedModel) -> Self:
+        """Give a model examples in its middle: half the pressure limit, a tip a tenth deep."""
+        vertices, radius = model.surface.vertices, model.scene.endoscope.radius
+        middle = int(((vertices - vertices.mean(axis=0)) ** 2).sum(axis=1).argmin())
+        tip = vertices[middle] + 0.9 * radius * model.surface.normals[middle]
+        example = {
+            "position": vertices[middle].round(3).tolist(),
+            "pressure": round(0.5 * float(model.limits[middle, 0]), 3),
+        }
+        return cls(model, example, tip.round(3).tolist(), [])
+
 
 Stamp = tuple[int, int, int]
 """When a file was written, its size and its number: another file has another one."""
@@ -61,8 +73,8 @@ class Service:
         """Load and warm what there is to serve."""
         if self._shared is not None:
             self.models, self._files = self._shared.models, dict(self._shared._files)
-            for model in self.models.values():
-                warm(model)
+            for served in self.models.values():
+                warm(served)
         self.look(warm)
 
     def look(self, warm: Callable[[ServedModel], Any]) -> None:
@@ -74,11 +86,9 @@ class Service:
         """
         directory = self.settings.artifacts
         try:
-            names = sorted(os.listdir(directory))
+            found = artifacts_in(directory)
         except OSError:  # out of reach for a moment
             return
-        paths = [directory / n for n in names if n.endswith(".h5") and not n.startswith(".")]
-        found = {path: stamp for path in paths if (stamp := _stamp(path))}
         for path in self._files.keys() - found.keys():
             self._forget(path)
         for path, stamp in found.items():
@@ -92,11 +102,11 @@ class Service:
         before = self._files[path].name if path in self._files else None
         others = {file.name for other, file in self._files.items() if other != path}
         try:
-            opened = served(ReducedModel.load(path))
-            name = opened.model.name
+            served = ServedModel.of(ReducedModel.load(path))
+            name = served.model.name
             if name in others:
                 raise PalpateError(f"{path}: another file already holds {name!r}")
-            warm(opened)
+            warm(served)
         except Exception as error:
             reason = str(error)
             if not isinstance(error, PalpateError):  # no reason to withhold the others
@@ -111,7 +121,7 @@ class Service:
             self._files[path] = _File(stamp, before, told)
         else:
             kept = {own: model for own, model in self.models.items() if own != before}
-            self.models = dict(sorted({**kept, name: opened}.items()))
+            self.models = dict(sorted({**kept, name: served}.items()))
             self._files[path] = _File(stamp, name, None)
             logger.info("serving %s from %s", name, printable(str(path)))
 
@@ -138,16 +148,10 @@ class Service:
         return self.models[name]
 
 
-def served(model: ReducedModel) -> ServedModel:
-    """Make examples in the middle of the surface: half its pressure limit, a tip a tenth deep."""
-    vertices, radius = model.surface.vertices, model.scene.endoscope.radius
-    middle = int(((vertices - vertices.mean(axis=0)) ** 2).sum(axis=1).argmin())
-    tip = vertices[middle] + 0.9 * radius * model.surface.normals[middle]
-    example = {
-        "position": vertices[middle].round(3).tolist(),
-        "pressure": round(0.5 * float(model.limits[middle, 0]), 3),
-    }
-    return ServedModel(model, example, tip.round(3).tolist(), [])
+def artifacts_in(directory: Path) -> dict[Path, Stamp]:
+    """Files of a folder that are to be served, not hidden ones; `OSError` if it cannot be read."""
+    names = (n for n in sorted(os.listdir(directory)) if n.endswith(".h5") and n[0] != ".")
+    return {path: stamp for n in names if (stamp := _stamp(path := directory / n))}
 
 
 def _stamp(path: Path) -> Stamp | None:

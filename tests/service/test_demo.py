@@ -53,7 +53,7 @@ def test_a_slab_is_served_and_what_trains_beside_it_is_told_and_ends_with_it(art
             raise AssertionError("the training goes on")
 
 
-def test_the_pad_comes_trained_and_the_other_it_would_be_is_not_made(tmp_path):
+def test_the_pad_comes_trained_and_is_not_trained_again(tmp_path):
     command = [*PALPATE, "demo", "--artifacts", tmp_path / "new", "--port", "0", "--no-browser"]
     for _ in range(2):
         demo = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, stderr=-3)

@@ -5,6 +5,7 @@ import time
 import pytest
 
 from palpate.online.serve.errors import Refusal
+from palpate.online.serve.first_start import compile_kernels
 from palpate.shared.errors import PalpateError
 from palpate.shared.progress import FILE, SILENT, Progress, tell, training_folder
 
@@ -155,3 +156,10 @@ def test_trainings_are_told_while_they_go_on(fake_service, tmp_path):
     os.utime(folder / FILE, (long_ago, long_ago))
     service.look(ignore)
     assert service.trainings == []
+
+
+def test_a_link_to_nothing_keeps_no_first_start_from_compiling(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
+    (tmp_path / "gone.h5").symlink_to(tmp_path / "nothing")
+    compile_kernels(tmp_path)
+    compile_kernels(tmp_path / "nothing")
