@@ -4,13 +4,11 @@
 
 Blobs, bent plates and thick tubes in turn, of which the lower side is held and the upper one can be
 touched. A shape that training refuses is told with its sentence. Results are written to
-``shapes.csv`` in the folder; what is there already is not made again.
+``shapes.csv`` in the folder; artifacts that are there already are not made again.
 """
 
-import csv
 import json
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -18,29 +16,26 @@ import click
 import numpy as np
 import pyvista as pv
 
-from palpate.offline.studies.figures import RUN
+from palpate.offline.run.tables import write_csv
+
+from ...conftest import PALPATE
+from .conftest import SCENE
 
 STEP = 0.8  # mm between points of the grid
-SCENE = """
-name = "{name}"
+SHAPE = """
+support.normal = [0.0, 0.0, -1.0]
+support.within = 50.0
+support.z = [-100.0, 0.0]
+surface.normal = [0.0, 0.0, 1.0]
+surface.within = 50.0
+surface.z = [0.0, 100.0]
 geometry.kind = "surface"
-geometry.file = "{name}.stl"
 geometry.unit = "mm"
-tissue.law = "neo-hookean"
-tissue.young = 15.0
-tissue.poisson = 0.45
-endoscope.radius = 3.0
-endoscope.max_tilt = 30.0
-load.max_indentation = 0.15
-[support]
-normal = [0.0, 0.0, -1.0]
-within = 50.0
-z = [-100.0, 0.0]
-[surface]
-normal = [0.0, 0.0, 1.0]
-within = 50.0
-z = [0.0, 100.0]
+geometry.file = "body.stl"
 """
+COLUMNS = (
+    "shape", "refused", "seconds", "displacement_p95", "von_mises_p95", "covered", "unconverged",
+)  # fmt: skip
 
 
 def blob(points, rng):
@@ -82,19 +77,20 @@ def write(folder, number, seed):
     grid["level"] = made(np.array(grid.points), rng)
     surface = grid.contour([0.0], scalars="level", method="flying_edges").extract_largest()
     surface.smooth_taubin(n_iter=20).clean().save(folder / f"{name}.stl")
-    (folder / f"{name}.toml").write_text(SCENE.format(name=name).lstrip())
-    return folder / f"{name}.toml"
+    file, scene = folder / f"{name}.toml", SCENE.replace("radius = 4.0", "radius = 3.0")
+    file.write_text((scene + SHAPE).replace("body", name))
+    return file
 
 
 def palpate(*words):
     """What a command of palpate prints, and how it ends."""
-    command = [sys.executable, "-c", RUN, *map(str, words)]
+    command = [*PALPATE, *map(str, words)]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def study(file, queries):
     """Train and validate one shape: a row of the table."""
-    artifact, row = file.with_suffix(".h5"), {"shape": file.stem}
+    artifact, row = file.with_suffix(".h5"), dict.fromkeys(COLUMNS, "") | {"shape": file.stem}
     begun = time.perf_counter()
     if not artifact.exists():
         trained = palpate("train", file, "--out", artifact)
@@ -106,7 +102,7 @@ def study(file, queries):
     told = palpate("validate", artifact, "--queries", queries, "--seed", 1, "--json")
     found = json.loads(told.stdout)
     keys = "displacement", "von_mises"
-    row |= {f"{key}_p95": round(found[key]["p95"], 5) for key in keys}
+    row |= {f"{key}_p95": found[key]["p95"] for key in keys}
     return row | {key: found[key] for key in ("covered", "unconverged")}
 
 
@@ -118,11 +114,11 @@ def study(file, queries):
 def main(folder, count, queries, seed):
     """Make shapes in a FOLDER, train and validate them."""
     folder.mkdir(parents=True, exist_ok=True)
+    rows = []
     for number in range(count):
-        row = study(write(folder, number, seed), queries)
-        with (folder / "shapes.csv").open("a", newline="") as table:
-            csv.writer(table).writerow([f"{key} {value}" for key, value in row.items()])
-        click.echo(row)
+        rows.append(study(write(folder, number, seed), queries))
+        write_csv(folder / "shapes.csv", rows)
+        click.echo(rows[-1])
 
 
 if __name__ == "__main__":

