@@ -13,9 +13,10 @@ pressed everywhere, in all directions and a little beyond the range, and shows w
 turns, or where it has no answer; the full model's turns close by.  The range is lowered to end
 before that.
 
-Where an endoscope is pushed inwards over the rim of the surface, or over a corner, it can fold a
-few elements of the full model that the modes of the reduced one do not tell apart.  There the full
-model's tangent at the reduced model's answer is not positive definite.
+Where an endoscope pushes the rim of the surface aside, above all at a corner, it can fold a few
+elements of the full model that the modes of the reduced one do not tell apart.  There Newton's
+method of the full model leads far away from the reduced model's answer, in a dozen corrections,
+where otherwise it is at its own after two or three.
 
 Under the rigid tip a free edge can lie on either side of it, and slips off to the other as the tip
 slides on.  There one position has several answers, and which is the right one hangs on the way that
@@ -34,7 +35,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from palpate.offline.fem.mesh import local_thickness
-from palpate.offline.fem.model import FullModel, NoEquilibrium
+from palpate.offline.fem.model import KEEP_TANGENT, FullModel, NoEquilibrium
 from palpate.offline.fem.potential import Potential, Projected
 from palpate.offline.fem.problem import FullProblem, Load
 from palpate.offline.fem.terms import DeadLoad
@@ -56,7 +57,7 @@ from palpate.shared.errors import QueryError
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.local_models import Estimators, LocalModels
 from palpate.shared.mechanics import newton
-from palpate.shared.mechanics.footprint import TIP_DEPTH
+from palpate.shared.mechanics.footprint import TIP_DEPTH, footprint
 from palpate.shared.mechanics.tip import approach
 from palpate.shared.model import ReducedModel
 
@@ -101,10 +102,14 @@ FIRM = 0.6
 """Pressure over the shear modulus below which no rim folds."""
 
 FIRM_SHARES = np.linspace(1.0, 0.5, 6)
-"""Of the limit that are tried, until the full model is stable."""
+"""Of the limit that are tried, until the full model does not fold."""
 
-ASIDE = np.pi / 4
-"""Largest angle of a tilt to the way inwards that is tried."""
+CLOSE_BY = 6
+"""Newton's corrections from the reduced model's answer to the full model's.  Of 437 largest loads
+on the rim of a turbinate 415 took up to 4, and 22 took 10 to more than 20."""
+
+TILTS = 6
+"""Directions in which one point of the rim is pushed."""
 
 DEPTH_SHARES = np.linspace(1.0, 0.1, 7)
 """Of the depth limit that are tried, until one has the same answer by all ways."""
@@ -339,17 +344,24 @@ def bears(model: ReducedModel, load: Load) -> bool:
 
 
 def firm_share(model: ReducedModel, x: Array, direction: Array, limit: float) -> float:
-    """Share of a pressure (kPa) up to which the full model is stable, with ``MARGIN``; at most 1.
+    """Share of a pressure (kPa) up to which the full model is close by, with ``MARGIN``; at most 1.
 
-    At the reduced model's answers.
+    To the reduced model's answers.
     """
     if limit < FIRM * model.body.touched[0]:
         return 1.0
-    full = _full(model)
-    tissue = Potential(full, [])
+    full, nodal = _full(model), np.zeros(len(model.body.nodes))
+    normal, radius = model.surface.project(x)[1], model.scene.endoscope.radius
+    footprint(model.body.boundary, x, normal, radius, nodal)
     for share in FIRM_SHARES:
+        load = DeadLoad(np.outer(nodal, share * limit * direction).reshape(-1))
         u = model.fields.of_mesh(model.press(x, share * limit, direction)).astype(float)
-        if tissue.factorise(u.reshape(-1)[full.free], 0.0):
+        u = u.reshape(-1)[full.free]
+        status, *_ = newton.newton(
+            Potential(full, [load]), u, np.empty((4, len(u))), TOLERANCE * load.size, KEEP_TANGENT,
+            CLOSE_BY, False,
+        )  # fmt: skip
+        if status == newton.CONVERGED:
             return 1.0 if share == 1.0 else float(share) / MARGIN
     return float(FIRM_SHARES[-1]) / MARGIN
 
@@ -449,21 +461,19 @@ def _largest_load(
 
 
 def _rim_points(surface: Surface, count: int, rng: Rng) -> Array:
-    """So many vertices of the rim, or every other one, corners first."""
+    """So many vertices of the rim, each ``TILTS`` times, or every fourth one, corners first."""
     rim = surface.vertices[rng.permutation(surface.rim())]
-    return rim[farthest(rim, min(count, -(-len(rim) // 2)))]
+    spread = rim[farthest(rim, min(count // TILTS, -(-len(rim) // 4)))]
+    return np.repeat(spread, TILTS, axis=0)
 
 
-def _pushed_inwards(
-    model: ReducedModel, _: int, point: Array, rng: Rng
+def _pushed_aside(
+    model: ReducedModel, i: int, point: Array, rng: Rng
 ) -> tuple[Array, Array, float]:
-    """Contact, direction and largest pressure of a load tilted towards the surface around."""
-    place, endoscope = Place.at(model, point), model.scene.endoscope
-    around = np.linalg.norm(model.surface.vertices - point, axis=1) < endoscope.radius
+    """Contact, direction and largest pressure of a load of the largest tilt, all round in turn."""
+    place, tilt = Place.at(model, point), np.radians(model.scene.endoscope.max_tilt)
+    turn = 2.0 * np.pi * (i + rng.random()) / TILTS
     one, two = tangents(place.normal)
-    inwards = model.surface.vertices[around].mean(axis=0) - point
-    turn = np.arctan2(inwards @ two, inwards @ one) + rng.uniform(-ASIDE, ASIDE)
-    tilt = np.radians(endoscope.max_tilt)
     aside = np.cos(turn) * one + np.sin(turn) * two
     direction = np.sin(tilt) * aside - np.cos(tilt) * place.normal
     return place.position, direction, place.limit(direction)
@@ -490,8 +500,8 @@ GIVING_WAY = Search(
     first=16, closer=24, reach=2.0,
 )  # fmt: skip
 FOLDING = Search(
-    "folding of the rim", 0, Stage.FOLDING, _rim_points, _pushed_inwards, firm_share,
-    first=1, closer=4, reach=2.0,
+    "folding of the rim", 0, Stage.FOLDING, _rim_points, _pushed_aside, firm_share,
+    first=3, closer=4, reach=2.0,
 )  # fmt: skip
 SLIPPING_OFF = Search(
     "slipping off", TIP_DEPTH, Stage.SLIPPING_OFF, _points_and_whole_rim, _contact,

@@ -17,6 +17,7 @@ from palpate.offline.reduce.load_range import (
     GIVING_WAY,
     MARGIN,
     SLIPPING_OFF,
+    TILTS,
     UNANSWERED,
     LoadPath,
     bearable_shares,
@@ -189,47 +190,49 @@ def test_a_trained_slab_hardly_gives_way_in_its_range_and_nothing_slips_off(atla
     assert (borne(SLIPPING_OFF, atlas, rng) == 1.0).all()
 
 
-class Squeezed:
-    """A reduced model whose answer to a pressure squeezes the middle of a surface along x.
+class Behind:
+    """A reduced model that answers as the full one up to a pressure, and the same beyond."""
 
-    By a percent for a kilopascal.  From some 30 percent on a free surface folds.
-    """
-
-    def __init__(self, problem):
+    def __init__(self, problem, last):
         self.body, self.scene, self.fields = problem.body, problem.scene, self
+        self.problem, self.surface, self.last = problem, problem.surface, last
 
     def press(self, position, pressure, direction):
-        return 0.01 * pressure
+        load = self.problem.load_vector(Load(position, direction, min(pressure, self.last)))
+        return self.problem.model.solve(load).displacement
 
-    def of_mesh(self, share):
-        x, _, z = self.body.nodes.T
-        away, height = (x - x.mean()) / 6.0, z / z.max()
-        along = -6.0 * share * np.tanh(away) * height
-        up = share * z * height / (2.0 * np.cosh(away) ** 2)  # volumes are kept
-        return np.column_stack([along, 0.0 * x, up])
+    def of_mesh(self, displacement):
+        return displacement
 
 
-@pytest.mark.parametrize(("squeezed", "least", "most"), [(20, 1.0, 1.0), (50, 0.5, 0.6)])
-def test_the_range_ends_before_the_full_model_folds(squeezed, least, most):
+@pytest.mark.parametrize(("last", "least", "most"), [(1.0, 1.0, 1.0), (0.68, 0.5, 0.75)])
+def test_the_range_ends_before_the_full_model_is_elsewhere(last, least, most):
     problem = FullProblem(parse_scene(STRIP.format(past="")))
-    model, down = Squeezed(problem), np.array([0.0, 0.0, -1.0])
-    assert least <= firm_share(model, np.zeros(3), down, squeezed) <= most
+    corner, outwards = np.array([48.0, 8.0, 6.0]), np.array([0.4, 0.3, -np.sqrt(0.75)])
+    limit = 1.3 * problem.model.law.mu[0]
+    model = Behind(problem, last * limit)
+    assert least <= firm_share(model, corner, outwards, limit) <= most
     soft = 0.99 * FIRM * problem.model.law.mu[0]
-    assert firm_share(SimpleNamespace(body=model.body), np.zeros(3), down, soft) == 1.0
+    assert firm_share(SimpleNamespace(body=model.body), corner, outwards, soft) == 1.0
 
 
-def test_the_rim_is_pushed_inwards(rng):
+def test_the_rim_is_pushed_aside_all_round(rng):
     plate, middle = Plate(np.inf), np.array([5.0, 5.0, 0.0])
-    points = list(FOLDING.points(plate.surface, 30, rng))
+    points = FOLDING.points(plate.surface, 30, rng)
     assert len(points) == 30
-    for point in points:
-        assert np.abs(point - middle).max() == 5.0
-        x, direction, limit = FOLDING.draw(plate, 0, point, rng)
-        np.testing.assert_array_equal(x, point)
-        assert direction[2] == pytest.approx(-np.cos(np.radians(30.0)))
-        assert np.linalg.norm(direction) == pytest.approx(1.0)
-        assert direction @ (middle - point) > 0.0
-        assert 0.0 < limit <= LIMIT
+    for around in points.reshape(-1, TILTS, 3):
+        assert np.all(around == around[0])
+        assert np.abs(around[0] - middle).max() == 5.0
+        turns = []
+        for i, point in enumerate(around):
+            x, direction, limit = FOLDING.draw(plate, i, point, rng)
+            np.testing.assert_array_equal(x, point)
+            assert direction[2] == pytest.approx(-np.cos(np.radians(30.0)))
+            assert np.linalg.norm(direction) == pytest.approx(1.0)
+            assert 0.0 < limit <= LIMIT
+            turns.append(np.arctan2(direction[1], direction[0]))
+        between = np.diff(np.sort(turns), append=min(turns) + 2.0 * np.pi)
+        assert between.max() < 2.0 * 2.0 * np.pi / TILTS
 
 
 class Side:
