@@ -18,9 +18,6 @@ PATCHES = "training.size.patch_spacing"
 RITZ_SPACING = 0.455
 """Of the footprints whose Ritz vectors are taken, in units of the patch spacing."""
 
-RITZ_REACH = 0.8
-"""How far from its centre a local model learns from footprints, in units of the patch spacing."""
-
 CONTACTS_PER_PATCH = 400
 
 LLOYD_SAMPLE, LLOYD_STEPS = 100, 40
@@ -56,8 +53,6 @@ class Layout:
         count = spacing_count(surface, RITZ_SPACING * size.patch_spacing, PATCHES)
         ritz = spread_points(surface, count, rng)
         self.footprints = [Footprint.of(surface, x, limits) for x in ritz]
-        # footprints of each local model, ascending
-        self.learns_from = _within(RITZ_REACH * size.patch_spacing, self.centres, ritz)
         count = CONTACTS_PER_PATCH * len(self.centres)
         contacts = np.vstack([surface.vertices, random_points(surface, count, rng)])
         near, _ = cKDTree(self.centres).query(contacts)
@@ -68,6 +63,9 @@ class Layout:
             contacts[hits][np.linalg.norm(contacts[hits] - x, axis=1) < near[hits] + blend]
             for x, hits in zip(self.centres, reached, strict=True)
         ]
+        # the footprints nearest to these, ascending
+        nearest = cKDTree(ritz)
+        self.learns_from = [np.unique(nearest.query(own)[1]) for own in self._contacts]
 
     def patch(self, k: int) -> Patch:
         """What local model k is trained from."""

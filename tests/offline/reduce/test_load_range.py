@@ -218,8 +218,8 @@ def test_the_range_ends_before_the_full_model_is_elsewhere(last, least, most):
 
 def test_the_rim_is_pushed_aside_all_round(rng):
     plate, middle = Plate(np.inf), np.array([5.0, 5.0, 0.0])
-    points = FOLDING.points(plate.surface, 30, rng)
-    assert len(points) == 30
+    points = FOLDING.points(plate.surface, 7 * TILTS, rng)
+    assert len(points) == 7 * TILTS
     for around in points.reshape(-1, TILTS, 3):
         assert np.all(around == around[0])
         assert np.abs(around[0] - middle).max() == 5.0
