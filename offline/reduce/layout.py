@@ -57,7 +57,9 @@ class Layout:
         contacts = np.vstack([surface.vertices, random_points(surface, count, rng)])
         near, _ = cKDTree(self.centres).query(contacts)
         self._extent = 1.02 * near.max() + blend
-        reached = _within(near.max() + blend, self.centres, contacts)
+        reached = cKDTree(contacts).query_ball_point(
+            self.centres, near.max() + blend, return_sorted=True
+        )
         # contacts (c, 3) mm of each local model
         self._contacts = [
             contacts[hits][np.linalg.norm(contacts[hits] - x, axis=1) < near[hits] + blend]
@@ -109,9 +111,3 @@ def centred_points_and_rim(
     points = centred_points(surface, count, rng)
     points[::rim] = surface.vertices[rng.choice(surface.rim(), len(points[::rim]))]
     return points
-
-
-def _within(radius: float, at: Array, points: Array) -> list[Ints]:
-    """Indices of ``points`` within ``radius`` of each row of ``at``, ascending."""
-    found = cKDTree(points).query_ball_point(at, radius, return_sorted=True)
-    return [np.array(rows, dtype=np.int64) for rows in found]

@@ -344,17 +344,18 @@ def bears(model: ReducedModel, load: Load) -> bool:
 
 
 def firm_share(model: ReducedModel, x: Array, direction: Array, limit: float) -> float:
-    """Share of a pressure (kPa) up to which the full model is close by, with ``MARGIN``; at most 1.
+    """Share of a pressure (kPa) up to which the full model is close to the reduced one; at most 1.
 
-    To the reduced model's answers.
+    Less ``MARGIN`` where that is not all of it.
     """
     if limit < FIRM * model.body.touched[0]:
         return 1.0
     full, nodal = _full(model), np.zeros(len(model.body.nodes))
     normal, radius = model.surface.project(x)[1], model.scene.endoscope.radius
     footprint(model.body.boundary, x, normal, radius, nodal)
+    whole = DeadLoad(np.outer(nodal, limit * direction).reshape(-1))
     for share in FIRM_SHARES:
-        load = DeadLoad(np.outer(nodal, share * limit * direction).reshape(-1))
+        load = whole.at(share)
         u = model.fields.of_mesh(model.press(x, share * limit, direction)).astype(float)
         u = u.reshape(-1)[full.free]
         status, *_ = newton.newton(
