@@ -24,14 +24,15 @@ class Potential:
     """Elastic tissue and further terms.
 
     Only one potential of a full model can be minimised at a time: they share its linear solver.
+    What is clamped is held where ``held`` (3 nodes,) mm has it, else at rest.
     """
 
-    def __init__(self, model: FullModel, terms: Sequence[Term]) -> None:
+    def __init__(self, model: FullModel, terms: Sequence[Term], held: Array | None = None) -> None:
         self.free = model.free
         self.keeps = False  # see ``keep``
         self.terms = terms
         self._model = model
-        self._displacement = np.zeros(3 * len(model.mesh.nodes))
+        self._displacement = np.zeros(3 * len(model.mesh.nodes)) if held is None else held.copy()
         self._force = np.zeros_like(self._displacement)
         self._data = np.empty(model.pattern.nnz)
         self._springs: list[tuple[Array, Array]] = []  # see ``solve``

@@ -212,7 +212,7 @@ def _draw_goals(axes: Axes, panel: Panel, rows: Sequence[Row], scene: Scene, per
     (left, right), (bottom, top), error = axes.get_xlim(), axes.get_ylim(), full[panel.error]
     if panel.is_total:
         axes.axhline(error, color="0.4", lw=0.9, ls=":")
-        _write(axes, f"scene's own mesh: {percent(error)}", (left, error), (8, 4))
+        _write(axes, f"scene's own\nmesh: {percent(error)}", (left, error), (8, 4))
     else:
         axes.axvline(full["time_us"], color="black", lw=0.9, ls=":")
         where = full["time_us"], bottom ** (2 / 3) * top ** (1 / 3)

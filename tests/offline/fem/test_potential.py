@@ -1,10 +1,13 @@
 """Terms of the potential energy, each by itself, and their sum in a basis."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from palpate.offline.fem.contact import SphereLoad
-from palpate.offline.fem.potential import Projected
+from palpate.offline.fem.model import FullModel
+from palpate.offline.fem.potential import Potential, Projected
 from palpate.offline.fem.terms import DeadLoad, PastStress
 from palpate.shared.mechanics import newton
 from palpate.shared.mechanics.viscosity import step_weights
@@ -106,3 +109,14 @@ def test_the_tool_feels_what_holds_the_body(model, load):
     found = model.solve(load)
     np.testing.assert_allclose(found.force, support_force(model, found.displacement), atol=1e-8)
     assert found.tangent.any() == isinstance(load, SphereLoad)
+
+
+def test_what_is_clamped_is_held_where_it_is_said_to_be(model, dead_load):
+    mesh, whole = model.mesh, model.solve(dead_load).displacement.ravel()
+    part = FullModel(replace(mesh, clamped=mesh.clamped | (mesh.nodes[:, 0] > 2.0)), model.tissue)
+    tissue, u = Potential(part, [dead_load], whole), np.zeros(len(part.free))
+    target = 1e-10 * dead_load.size
+    status, *_ = newton.newton(tissue, u, np.empty((4, len(u))), target, 0.0, 20, False)
+    assert status == newton.CONVERGED
+    np.testing.assert_allclose(u, whole[part.free], atol=1e-8)
+    assert np.abs(whole[part.free]).max() > 0.05
