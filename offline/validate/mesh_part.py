@@ -32,8 +32,12 @@ TIP_GRADING = Grading(finest=0.15, even=0.2, growth=1.0, coarsest=3.0)
 """The same under a tip, whose contact is a fifth of its radius across at a depth of a fiftieth."""
 
 APART, LEAST, RIM = 5.0, 9, 3
-"""Distance of the places looked at, in radii, and their least number, which are those of the tip;
-one in so many is on the rim of the surface."""
+"""Distance of the places looked at, in radii, and their least number; one in so many is on the rim
+of the surface."""
+
+TIP_PLACES = 15
+"""Under the tip, where errors differ more from place to place: on a turbinate 86 % of answers
+elsewhere are within all estimates from 9 places, 95 % from 15."""
 
 LEVELS, DEPTHS = (0.3, 1.0), (0.15, 0.8)
 """Shares of the limit at which footprints and tips press there."""
@@ -136,7 +140,7 @@ def places_of(scene: Scene, surface: Surface) -> int:
 
 def places(model: ReducedModel, rng: np.random.Generator, tip: bool = False) -> list[Levels]:
     """Footprints pressed along the normal at places all over the surface, or tips at a few."""
-    count = LEAST if tip else places_of(model.scene, model.surface)
+    count = TIP_PLACES if tip else places_of(model.scene, model.surface)
     points = centred_points_and_rim(model.surface, count, RIM, rng)
     found = [Place.at(model, point) for point in points]
     if tip:
