@@ -36,8 +36,8 @@ APART, LEAST, RIM = 5.0, 9, 3
 of the surface."""
 
 TIP_PLACES = 15
-"""Under the tip, where errors differ more from place to place: on a turbinate 86 % of answers
-elsewhere are within all estimates from 9 places, 95 % from 15."""
+"""Under the tip, where errors differ more from place to place: on a turbinate 42 of 50 answers
+elsewhere in range are within all estimates from 9 places, 47 from 15."""
 
 LEVELS, DEPTHS = (0.3, 1.0), (0.15, 0.8)
 """Shares of the limit at which footprints and tips press there."""
