@@ -138,10 +138,10 @@ def budget(report: Mapping[str, Any]) -> list[str]:
         "reduction": report["validation"] | ({"force": tip["force"]} if tip else {}),
         "- cubature": training["cubature_errors"],
         "- solver": {"displacement": {"p95": TOLERANCE * math.sqrt(scene.tolerance.looseness)}},
-        "tolerance": {
-            name: {"p95": most} for name, most in scene.tolerance.total._asdict().items()
-        },
     }
+    for label, pressed in {"tolerance": False, **({"- under it": True} if tip else {})}.items():
+        most = scene.tolerance.of(pressed).total._asdict()
+        sources[label] = {name: {"p95": value} for name, value in most.items()}
     columns = {name: text for name, text in COLUMNS.items() if tip or name != "force"}
     rows = {
         source: [percent(found.get(name, {}).get("p95", math.nan)) for name in columns]
@@ -183,7 +183,7 @@ def closing(artifact: Path) -> list[str]:
     for label, found, mesh in _validations(report):
         over = [
             f"{COLUMNS[name]} {percent(mesh[name]['p95'])} (tolerance {percent(allowed)})"
-            for name, allowed in tolerance.total._asdict().items()
+            for name, allowed in tolerance.of("force" in found).total._asdict().items()
             if name in found and name in mesh and mesh[name]["p95"] > allowed
         ]
         if over:

@@ -146,9 +146,10 @@ def cautions(atlas: ReducedModel, answer: Answer) -> Iterator[str]:
         limit = f" of {answer.pressure_limit:.3g} kPa" if name == "pressure" else ""
         limit = f" of {answer.depth_limit:.3g} mm" if name == "depth" else limit
         yield f"{name} is outside the trained range{limit}: the error is unknown"
+    most = atlas.scene.tolerance.of(answer.tip)
     beyond = [
         f"{name} {percent(getattr(answer, f'error_{name}'))} "
-        f"(tolerance {percent(getattr(atlas.scene.tolerance, name))})"
+        f"(tolerance {percent(getattr(most, name))})"
         for name in atlas.doubts(answer)
         if name not in answer.out_of_range
     ]

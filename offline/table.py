@@ -92,7 +92,7 @@ def _cautions(answers: Answers, tolerance: Tolerance, tip: bool) -> Iterator[str
     rows, sound = len(answers.converged), answers.converged & answers.in_range
     if tip and (off := answers.converged & ~answers.force.any(axis=1)).any():
         yield f"the tip touches nothing in {off.sum()} of {rows} rows"
-    for name, most in tolerance.total._asdict().items():
+    for name, most in tolerance.of(tip).total._asdict().items():
         errors = getattr(answers, f"error_{name}")
         if (beyond := sound & (errors > most)).any():
             yield (

@@ -492,7 +492,7 @@ class ReducedModel:
         if not answer.converged:
             return ("convergence",)
         errors = answer.error_displacement, answer.error_von_mises, answer.error_force
-        return answer.out_of_range or self.scene.tolerance.exceeded(errors)
+        return answer.out_of_range or self.scene.tolerance.of(answer.tip).exceeded(errors)
 
     def _memory(self, tip: bool, warm: Warm | None, past: Past | None, dt: float) -> Workspace:
         """Memory to answer with: the caller's, or the model's own, which knows no last answer."""

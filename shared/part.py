@@ -20,6 +20,15 @@ def optional(absent: str, description: str) -> Any:
     return Field(None, description=description, json_schema_extra={"absent": absent})
 
 
+def times(multiple: float, key: str, description: str) -> Any:
+    """Field that is a multiple of another of its table, above it, unless it is given."""
+    return Field(
+        default_factory=lambda found: multiple * found.get(key, 0.0),  # 0 if that is refused
+        description=description,
+        json_schema_extra={"absent": f"{multiple:g} times {key}"},
+    )
+
+
 def in_radii(multiple: float, description: str) -> Any:
     """Field of a length (mm) that is a multiple of the endoscope's radius unless it is given."""
     extra: Any = {"absent": f"{multiple:g} radii of the endoscope", "radii": multiple}

@@ -32,7 +32,7 @@ from palpate.shared.anatomy import CHOSEN, FileBody, LabelBody, MeshBody, Surfac
 from palpate.shared.errors import PalpateError
 from palpate.shared.files import open_regular
 from palpate.shared.mechanics.laws import AnyTissue
-from palpate.shared.part import Fraction, Length, Part, Positive, in_radii, optional
+from palpate.shared.part import Fraction, Length, Part, Positive, in_radii, optional, times
 from palpate.shared.place import Patch
 
 ElementName = Literal["hex8", "hex20"]
@@ -167,6 +167,15 @@ class Tolerance(Part):
     displacement: Fraction = Field(0.03, description="relative L2 error over all nodes")
     von_mises: Fraction = Field(0.12, description="relative L2 error over all unclamped nodes")
     force: Fraction = Field(0.05, description="relative error of the force of a rigid tip")
+    tip_displacement: Fraction = times(2, "displacement", "error of displacement under a rigid tip")
+    tip_von_mises: Fraction = times(3, "von_mises", "error of stress under a rigid tip")
+
+    def of(self, tip: bool) -> Self:
+        """That of answers to loads, or under the tip, where all that moves is near the contact."""
+        if not tip:
+            return self
+        own = {"displacement": self.tip_displacement, "von_mises": self.tip_von_mises}
+        return self.model_copy(update=own)
 
     @property
     def total(self) -> Errors:
@@ -423,7 +432,11 @@ def parse_scene(text: str, folder: Path | None = None, source: str = "scene") ->
             json.dumps(data, default=str), context=_kind_of("geometry", data["geometry"])
         )
     except ValidationError as error:
-        faults = [_explain(dict(detail)) for detail in error.errors(include_url=False)]
+        faults = [
+            _explain(dict(detail))
+            for detail in error.errors(include_url=False)
+            if detail["type"] != "default_factory_not_called"  # what follows from a wrong value
+        ]
         between = "\n  " if len(faults) > 1 else " "
         raise SceneError(between.join([f"{source}:", *faults])) from error
     except (ValueError, RecursionError) as error:  # of integers without an end as well

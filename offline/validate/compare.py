@@ -227,7 +227,7 @@ def summarise(kind: Kind, rows: Sequence[Row], tolerance: Tolerance) -> dict[str
     summary["covered"] = covered
     if rim := [answer for answer in converged if answer.near_rim]:
         summary["near_rim"] = {"queries": len(rim), "covered": coverage(rim)[0]}
-    summary["flagged"] = flags(converged, tolerance)
+    summary["flagged"] = flags(converged, tolerance.of(kind.tip))
     if kind.tip and kind.in_time:
         moments = [row["apart"] for row in answered]
         summary["apart"] = {"histories": int(np.count_nonzero(moments)), "moments": sum(moments)}

@@ -396,7 +396,7 @@ class Page {
     const stress = reply.stress ?? this.stress;
     const largest = reply.measured ? reply.max_von_mises : this.answer?.largest_stress;
     const answer = {
-      ...reply, stress, trip_ms: trip, solve_ms: 1e3 * reply.solve_time, largest_stress: largest,
+      ...reply, tip: true, stress, trip_ms: trip, solve_ms: 1e3 * reply.solve_time, largest_stress: largest,
       errors: {
         force: reply.CONTACT ? reply.error_force : null,
         displacement: reply.error_displacement, von_mises: reply.error_von_mises,

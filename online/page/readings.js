@@ -31,11 +31,12 @@ export function trust(answer, tolerance) {
   for (const field of answer.out_of_range ?? []) words.push(`Out of range: ${field}.`);
   if (answer.STALLED) words.push("Stalled: more time passed than the tissue follows at once.");
   if (!words.length && !answer.CONTACT) return { state: "none", words: "The tool does not touch the tissue." };
+  const most = answer.tip ? { ...tolerance, displacement: tolerance.tip_displacement, von_mises: tolerance.tip_von_mises } : tolerance;
   const percent = (share) => `${Number((100 * share).toFixed(1))} %`;
-  const allowed = ([name]) => `${NAMES[name]} ${percent(tolerance[name])}`;
+  const allowed = ([name]) => `${NAMES[name]} ${percent(most[name])}`;
   const known = Object.entries(answer.errors).filter(([, error]) => Number.isFinite(error));
-  const beyond = known.filter(([name, error]) => error > tolerance[name]).map(([name, error]) => (
-    `${NAMES[name]} ± ${percent(error)}, allowed ${percent(tolerance[name])}`
+  const beyond = known.filter(([name, error]) => error > most[name]).map(([name, error]) => (
+    `${NAMES[name]} ± ${percent(error)}, allowed ${percent(most[name])}`
   ));
   if (beyond.length) words.push(`Estimated errors are larger than this scene allows: ${beyond.join("; ")}.`);
   if (words.length) return { state: "doubt", words: words.join(" ") };

@@ -49,7 +49,7 @@ def test_info_for_people_is_ten_lines_in_units_and_for_who_asks_a_table_of_error
     own += f", tip's force {share}"
     assert re.fullmatch(f"tip's errors +95 of 100 within: {own}; {mesh}, {share}", lines[8])
     table = run("info", artifact, "--errors").stdout.splitlines()
-    assert re.match(r"trust +covers 95 % of errors, confidence \d\d %; doubts", table[7])
+    assert re.match(r"trust +covers 95 % of errors, confidence \d\d %; doubts", table[8])
     for line in lines + table:
         assert len(line) <= 120
         assert not re.search(r"[{}\[\]]|  %|None", line), line
@@ -57,10 +57,11 @@ def test_info_for_people_is_ten_lines_in_units_and_for_who_asks_a_table_of_error
 
 def test_info_tells_the_sources_of_errors_side_by_side(answer, artifact):
     report = answer("info", artifact)
-    table = {line[:LABELS].strip(): line[LABELS:].split("  ") for line in budget(report)[:7]}
+    table = {line[:LABELS].strip(): line[LABELS:].split("  ") for line in budget(report)[:8]}
     table = {key: [value.strip() for value in row if value.strip()] for key, row in table.items()}
     assert table["95 of 100"] == ["displacement", "von Mises", "tip's force"]
     assert table["tolerance"] == ["3 %", "12 %", "5 %"]
+    assert table["- under it"] == ["6 %", "36 %", "5 %"]
     reduction = [report["validation"][key]["p95"] for key in ("displacement", "von_mises")]
     reduction.append(report["validation_tip"]["force"]["p95"])
     assert table["reduction"] == [percent(error) for error in reduction]
@@ -154,7 +155,7 @@ def test_a_tip_in_the_air_is_told_with_its_way_to_the_tissue(run, artifact):
 def test_estimates_beyond_the_tolerance_are_told(run, artifact, atlas, press):
     told = run("solve", artifact, *press, "--json")
     found = json.loads(told.stdout)["trust"]["error_estimate"]
-    most = atlas.scene.tolerance.total._asdict()
+    most = atlas.scene.tolerance.of("--tip" in press).total._asdict()
     beyond = [
         f"{name} {percent(error)} (tolerance {percent(most[name])})"
         for name, error in found.items()

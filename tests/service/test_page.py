@@ -162,7 +162,7 @@ def test_the_lamp_tells_an_error_beside_what_is_allowed_and_moves_nothing(page):
     before = page.run(top)
     press(page, *MIDDLE)
     page.wait("palpate.answer?.CONTACT && palpate.tool.now === palpate.tool.level")
-    page.run("palpate.scene.tolerance.von_mises = 0.001")
+    page.run("palpate.scene.tolerance.tip_von_mises = 0.001")
     page.wait("document.getElementById('trust').textContent.includes('allowed 0.1 %')")
     words, error = page.run("""[
         document.getElementById("trust").textContent, 100 * palpate.answer.errors.von_mises,

@@ -55,6 +55,7 @@ def test_an_answer_is_doubted_for_what_its_estimates_of_mesh_and_reduction_excee
     assert atlas.doubts(good) == ()
     assert atlas.doubts(good._replace(error_von_mises=1.01 * most.von_mises)) == ("von_mises",)
     assert atlas.doubts(good._replace(error_force=1.01 * most.force)) == ("force",)
+    assert atlas.doubts(good._replace(tip=True, error_von_mises=2 * most.von_mises)) == ()
     assert atlas.doubts(good._replace(converged=False)) == ("convergence",)
     assert atlas.doubts(atlas.press(contact[0], 2.5 * contact[1])) == ("pressure",)
 

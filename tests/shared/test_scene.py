@@ -97,6 +97,15 @@ def test_mesh_and_reduction_together_have_the_tolerance() -> None:
     assert tolerance.exceeded((0.01, math.inf, math.nan)) == ("von_mises", "force")
 
 
+def test_under_a_tip_errors_may_be_larger_than_under_loads() -> None:
+    tolerance = Tolerance(displacement=0.04, tip_von_mises=0.4)
+    assert tolerance.of(tip=False) is tolerance
+    assert tolerance.of(tip=True).total == pytest.approx((0.08, 0.4, 0.05))
+    with pytest.raises(SceneError) as told:
+        parse_scene(SLAB.replace("displacement = 0.01", "displacement = 3.0"))
+    assert str(told.value) == "scene: tolerance.displacement = 3.0: Input should be less than 1"
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
