@@ -228,7 +228,7 @@ def forecast(problem: FullProblem, workers: int, coarsest: bool = False) -> str:
         spacing_count(problem.surface, spacing, key)
     models = spacing_count(problem.surface, size.patch_spacing, PATCHES)
     seconds = (models + tried) * (MODEL + MODEL_AND_DOF * dofs)
-    seconds += PLACE * (mesh_part.places_of(scene, problem.surface) + tip * mesh_part.TIP_PLACES)
+    seconds += PLACE * (mesh_part.places_of(scene, problem.surface) + tip * mesh_part.MOST)
     seconds *= (TIP if tip else 1.0) * (TIME if scene.tissue.prony else 1.0) / workers
     cores = "1 free core" if workers == 1 else f"{workers} free cores"
     about = "at least" if coarsest or more else "about"

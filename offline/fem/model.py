@@ -252,6 +252,7 @@ class FullModel:
         smallest_step: float = SMALLEST_STEP,
         keep: bool = False,
         tolerance: float = TOLERANCE,
+        max_iterations: int = MAX_ITERATIONS,
     ) -> Equilibrium:
         """Equilibrium under a load, in one jump if that converges, else in load steps.
 
@@ -272,6 +273,8 @@ class FullModel:
             with, and for the tangent of the reaction, which then is about right.
         tolerance : float
             See ``TOLERANCE``.
+        max_iterations : int
+            Of each load step, beyond which it has failed.
 
         Raises
         ------
@@ -300,7 +303,7 @@ class FullModel:
             if keep:
                 potential.keep(u)
             status, made, energy, smallest = newton.newton(
-                potential, u, np.empty((4, len(u))), target, KEEP_TANGENT, MAX_ITERATIONS, keep,
+                potential, u, np.empty((4, len(u))), target, KEEP_TANGENT, max_iterations, keep,
                 noise=noise,
             )  # fmt: skip
             iterations, load_steps = iterations + made, load_steps + 1
