@@ -23,7 +23,7 @@ def optional(absent: str, description: str) -> Any:
 def times(multiple: float, key: str, description: str) -> Any:
     """Field that is a multiple of another of its table, above it, unless it is given."""
     return Field(
-        default_factory=lambda found: multiple * found.get(key, 0.0),  # 0 if that is refused
+        default_factory=lambda found: float(f"{multiple * found[key]:.6g}"),
         description=description,
         json_schema_extra={"absent": f"{multiple:g} times {key}"},
     )

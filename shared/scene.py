@@ -167,8 +167,8 @@ class Tolerance(Part):
     displacement: Fraction = Field(0.03, description="relative L2 error over all nodes")
     von_mises: Fraction = Field(0.12, description="relative L2 error over all unclamped nodes")
     force: Fraction = Field(0.05, description="relative error of the force of a rigid tip")
-    tip_displacement: Fraction = times(2, "displacement", "error of displacement under a rigid tip")
-    tip_von_mises: Fraction = times(3, "von_mises", "error of stress under a rigid tip")
+    tip_displacement: Positive = times(2, "displacement", "error of displacement under a rigid tip")
+    tip_von_mises: Positive = times(3, "von_mises", "error of stress under a rigid tip")
 
     def of(self, tip: bool) -> Self:
         """That of answers to loads, or under the tip, where all that moves is near the contact."""

@@ -25,7 +25,13 @@ def test_a_scene_tells_what_may_be_asked_with_an_example(client):
     }
     assert scene["size"] == {"nodes": 1331, "dofs": 3993, "surface_nodes": 121, "triangles": 200}
     assert scene["young"] == FakeModel().scene.tissue.young
-    assert scene["tolerance"] == {"displacement": 0.03, "von_mises": 0.12, "force": 0.05}
+    assert scene["tolerance"] == {
+        "displacement": 0.03,
+        "von_mises": 0.12,
+        "force": 0.05,
+        "tip_displacement": 0.06,
+        "tip_von_mises": 0.36,
+    }
     assert scene["info"] == {"modes": 1, "validation": {"queries": 0}}
     assert scene["serves"] == {"sessions": True, "histories": False}
 
