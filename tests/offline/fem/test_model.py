@@ -243,6 +243,10 @@ def test_a_load_without_equilibrium_is_reported(slab, pressure, monkeypatch):
     with pytest.raises(NoEquilibrium, match="no equilibrium found beyond 0 %"):
         slab.solve(pressed(slab.mesh, pressure))
     assert len(corrections) <= 7 * 40  # load steps 1, 1/2, ... 1/64 of at most 40 iterations
+    corrections.clear()
+    with pytest.raises(NoEquilibrium):
+        slab.solve(pressed(slab.mesh, pressure), max_iterations=2, smallest_step=0.5)
+    assert len(corrections) <= 2 * 2
     # The failure leaves nothing behind.
     assert slab.solve(pressed(slab.mesh, 2.0)).load_steps == 1
 
