@@ -132,16 +132,20 @@ def budget(report: Mapping[str, Any]) -> list[str]:
     """A table of what each source of errors has of them, and how far their estimates hold."""
     training, scene = report["training"], parse_scene(report["text"])
     tip = report.get("validation_tip", {})
+
+    def allowed(pressed_by_tip: bool) -> dict[str, dict[str, float]]:
+        most = scene.tolerance.of(pressed_by_tip).total._asdict()
+        return {name: {"p95": value} for name, value in most.items()}
+
     sources = {
         "mesh": training["mesh_errors"],
         **({"- of the tip": training["mesh_errors_tip"]} if "mesh_errors_tip" in training else {}),
         "reduction": report["validation"] | ({"force": tip["force"]} if tip else {}),
         "- cubature": training["cubature_errors"],
         "- solver": {"displacement": {"p95": TOLERANCE * math.sqrt(scene.tolerance.looseness)}},
+        "tolerance": allowed(False),
+        **({"- under it": allowed(True)} if tip else {}),
     }
-    for label, pressed in {"tolerance": False, **({"- under it": True} if tip else {})}.items():
-        most = scene.tolerance.of(pressed).total._asdict()
-        sources[label] = {name: {"p95": value} for name, value in most.items()}
     columns = {name: text for name, text in COLUMNS.items() if tip or name != "force"}
     rows = {
         source: [percent(found.get(name, {}).get("p95", math.nan)) for name in columns]

@@ -31,7 +31,8 @@ export function trust(answer, tolerance) {
   for (const field of answer.out_of_range ?? []) words.push(`Out of range: ${field}.`);
   if (answer.STALLED) words.push("Stalled: more time passed than the tissue follows at once.");
   if (!words.length && !answer.CONTACT) return { state: "none", words: "The tool does not touch the tissue." };
-  const most = answer.tip ? { ...tolerance, displacement: tolerance.tip_displacement, von_mises: tolerance.tip_von_mises } : tolerance;
+  const most = { ...tolerance };
+  if (answer.tip) Object.assign(most, { displacement: most.tip_displacement, von_mises: most.tip_von_mises });
   const percent = (share) => `${Number((100 * share).toFixed(1))} %`;
   const allowed = ([name]) => `${NAMES[name]} ${percent(most[name])}`;
   const known = Object.entries(answer.errors).filter(([, error]) => Number.isFinite(error));
