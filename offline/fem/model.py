@@ -308,7 +308,8 @@ class FullModel:
             )  # fmt: skip
             iterations, load_steps = iterations + made, load_steps + 1
             if status == newton.CONVERGED:
-                converged[:], reached, step = u, fraction, 2.0 * step
+                converged[:], reached = u, fraction
+                step = min(2.0 * step, 1.0 - reached)
                 continue
             step, keep = 0.5 * step, False
             if step < smallest_step:

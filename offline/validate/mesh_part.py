@@ -43,7 +43,8 @@ LEVELS, DEPTHS = (0.3, 1.0), (0.15, 0.8)
 CLOSE = 1e-4
 """Residual of solutions, relative to the load or the tip's force, which then errs by as little."""
 
-EFFORT = {"tolerance": CLOSE, "smallest_step": 1 / 8, "max_iterations": 25}
+EFFORT = {"tolerance": CLOSE, "smallest_step": 1 / 8}
+UNDER_LOAD, UNDER_TIP = {"max_iterations": 12}, {"max_iterations": 25}
 """Steps smaller, as fractions of a load, or with more iterations have failed, and a level without a
 step is left out: its tissue has given way.  Steps that find it in balance take 4 to 7 iterations
 under a load and 9 to 18 under a tip, each of which takes seconds on a fine mesh."""
@@ -97,11 +98,11 @@ class Pressed:
         if isinstance(step, Load):  # where it is on every mesh, however far its surface goes
             nodal = problem.unit_load_at(step.position, -step.direction)
             forces = step.pressure * nodal[:, None] * step.direction
-            found = problem.model.solve(forces, **how)
+            found = problem.model.solve(forces, **how | UNDER_LOAD)
             contact, felt = problem.footprint(step), nodal @ found.displacement / nodal.sum()
         elif self._integrated:
             load = problem.sphere_at(step.position)
-            found = problem.model.solve(load, **how)
+            found = problem.model.solve(load, **how | UNDER_TIP)
         else:
             found = problem.solve(step, start=start)
             contact = problem.footprint(step, found)
