@@ -280,7 +280,7 @@ class Pipeline:
         model = untested(self.problem, models, limits)
         tables: dict[Kind, list[Row]] = {}
         documents: dict[str, Any] = {"provenance": self.provenance, "training": training}
-        estimators = self._mesh_part(model, training)
+        estimators, limits = self._mesh_part(model, training)
         model = untested(self.problem, models, limits, Estimators(**estimators))
         for kind in KINDS:
             if not kind.lacks(self.scene):
@@ -370,13 +370,7 @@ class Pipeline:
             shares = bearable_shares(
                 search, model, asking, stream(self.scene.seed, search.stage, i)
             )
-            lowered[:, search.field] *= shares
-            if np.any(shares < 1):
-                tqdm.write(
-                    f"{search.title}: load range lowered on {np.mean(shares < 1):.1%} of the "
-                    f"surface, to {shares.min():.0%} of what it was",
-                    file=sys.stderr,
-                )
+            _lower(lowered, search.field, shares, search.title)
         return lowered
 
     def _ask(self, path: Path, title: str, function: Callable[..., float], at: list[Any]) -> Array:
@@ -405,20 +399,27 @@ class Pipeline:
         ]
         return calibrate_by_halves([row.known for row in rows], kind.damping), rows
 
-    def _mesh_part(self, model: ReducedModel, training: dict[str, Any]) -> dict[str, Array]:
-        """Fit the mesh's part of the error estimates of loads and of the tip; tell of it."""
+    def _mesh_part(
+        self, model: ReducedModel, training: dict[str, Any]
+    ) -> tuple[dict[str, Array], Array]:
+        """Fit the mesh's part of the error estimates of loads and of the tip; tell of it.
+
+        Also the load range, lowered where a finer mesh gives way under footprints.
+        """
         rng = partial(stream, self.scene.seed, Stage.MESH_PART)
         # those under the tip first: where tissue gives way sideways one takes minutes
         touched = mesh_part.places(model, rng(), tip=True) if model.has_tip else []
         places = [*touched, *mesh_part.places(model, rng())]
         tasks = {f"mesh-{i}": (mesh_part.mesh_errors, own) for i, own in enumerate(places)}
         found, fitted = self._stage("errors of the mesh", tasks), dict[str, Array]()
-        pressed = found[len(touched) :]
-        fitted["mesh"], training["mesh_errors"] = mesh_part.fit(pressed)
+        under_tip, pressed = found[: len(touched)], found[len(touched) :]
         if touched:
-            under_tip = found[: len(touched)]
             fitted["mesh_tip"], training["mesh_errors_tip"] = mesh_part.fit(under_tip, tip=True)
-        return fitted
+        shares = mesh_part.borne(places[len(touched) :], pressed, self.surface)
+        fitted["mesh"], training["mesh_errors"] = mesh_part.fit(pressed)
+        limits = model.limits.copy()
+        _lower(limits, 0, shares, "giving way on finer meshes")
+        return fitted, limits
 
     # --- pieces --------------------------------------------------------------------------------
 
@@ -444,6 +445,17 @@ class Pipeline:
             "cubature_points_max": int(points.max()),
             "quadrature_points": self.problem.model.weights.size,
         }
+
+
+def _lower(limits: Array, field: int, shares: Array, why: str) -> None:
+    """Lower one field of the load range (v, LIMIT_FIELDS), in place, to shares of it; say so."""
+    limits[:, field] *= shares
+    if np.any(shares < 1):
+        tqdm.write(
+            f"{why}: load range lowered on {np.mean(shares < 1):.1%} of the surface, to "
+            f"{shares.min():.0%} of what it was",
+            file=sys.stderr,
+        )
 
 
 # --- the artifact ------------------------------------------------------------------------------

@@ -3,12 +3,17 @@
 The errors found make the mesh's part of every answer's error estimate, as those of random queries
 make the reduction's.  Those under the tip are found beside the sphere integrated over the faces of
 such meshes, so that what the law of the tip and its dent in the fields err by is in them.
+
+A finer mesh shows folds of the surface that coarse faces bridge: nearly incompressible tissue jumps
+to half as deep again under four fifths of a pressure that the scene's own mesh bears.  The load
+range is lowered to end before that.
 """
 
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from palpate.offline.fem.body_mesh import own_mesh
 from palpate.offline.fem.graded import Graded, Grading
@@ -40,11 +45,15 @@ from 15."""
 LEVELS, DEPTHS = (0.3, 1.0), (0.15, 0.8)
 """Shares of the limit at which footprints and tips press there."""
 
+LESS = (7 / 8, 3 / 4, 5 / 8, 1 / 2)
+"""Shares at which footprints press where the finer mesh gives way at the limit, down to one that it
+bears."""
+
 CLOSE = 1e-4
 """Residual of solutions, relative to the load or the tip's force, which then errs by as little."""
 
-EFFORT = {"tolerance": CLOSE, "smallest_step": 1 / 8}
-UNDER_LOAD, UNDER_TIP = {"max_iterations": 12}, {"max_iterations": 25}
+UNDER_LOAD: Any = {"tolerance": CLOSE, "smallest_step": 1.0, "max_iterations": 12}
+UNDER_TIP: Any = {"tolerance": CLOSE, "smallest_step": 1 / 8, "max_iterations": 25}
 """Steps smaller, as fractions of a load, or with more iterations have failed, and a level without a
 step is left out: its tissue has given way.  Steps that find it in balance take 4 to 7 iterations
 under a load and 9 to 18 under a tip, each of which takes seconds on a fine mesh."""
@@ -91,18 +100,17 @@ class Pressed:
     def harder(self, level: float, step: Load | TipPosition, near: Array | None = None) -> Seen:
         """What it says at a level, sought ``near`` or from what the last level's state grows to."""
         problem, before, start = self._problem, self._last, near
-        if near is None and before is not None:
+        if near is None and before is not None and before[0] < level:
             start = level / before[0] * before[1]
         contact, felt = None, None
-        how: Any = EFFORT | {"start": start}
         if isinstance(step, Load):  # where it is on every mesh, however far its surface goes
             nodal = problem.unit_load_at(step.position, -step.direction)
             forces = step.pressure * nodal[:, None] * step.direction
-            found = problem.model.solve(forces, **how | UNDER_LOAD)
+            found = problem.model.solve(forces, start=start, **UNDER_LOAD)
             contact, felt = problem.footprint(step), nodal @ found.displacement / nodal.sum()
         elif self._integrated:
             load = problem.sphere_at(step.position)
-            found = problem.model.solve(load, **how | UNDER_TIP)
+            found = problem.model.solve(load, start=start, **UNDER_TIP)
         else:
             found = problem.solve(step, start=start)
             contact = problem.footprint(step, found)
@@ -145,7 +153,8 @@ def places(model: ReducedModel, rng: np.random.Generator, tip: bool = False) -> 
     found = [Place.at(model, point) for point in points]
     if tip:
         return [answered(model, [(at, place.touch(at)) for at in DEPTHS]) for place in found]
-    along = [[(at, place.press(-place.normal, at)) for at in LEVELS] for place in found]
+    levels = (*LEVELS, *LESS)
+    along = [[(at, place.press(-place.normal, at)) for at in levels] for place in found]
     return [answered(model, own) for own in along]
 
 
@@ -159,7 +168,8 @@ def mesh_errors(problem: FullProblem, levels: Levels) -> list[Array]:
 
     Relative L2 norms over its volume, of stress outside the clamped layer; the relative error of a
     tip's force, or of the mean displacement under a footprint; those of the largest stress and its
-    99th percentile.  Last 1 within a radius of the rim of the surface, else 0.
+    99th percentile.  Last 1 within a radius of the rim of the surface, else 0.  The first level and
+    the next that the finer mesh bears are looked at.
     """
     surface, away = problem.surface, problem.surface.rim_distance()[:, None]
     near = surface.locate(levels[0][1].position, away)[-1] < problem.scene.endoscope.radius
@@ -173,7 +183,24 @@ def mesh_errors(problem: FullProblem, levels: Levels) -> list[Array]:
             *np.abs(np.divide(own.peaks, exact.peaks) - 1.0),
         )
         found.append(np.array([level, *errors, near.item()]))
+        if level > levels[0][0] and _known(found[-1], None).comparable:
+            break
     return found
+
+
+def borne(places: Sequence[Levels], found: Sequence[list[Array]], surface: Surface) -> Array:
+    """Shares of the load range at the vertices (v,) that finer meshes bear: at the nearest place.
+
+    Levels of rows found by ``mesh_errors`` under footprints become shares of what is left of it.
+    """
+    shares = np.ones(len(found))
+    for k, rows in enumerate(found):
+        held = (row[0] for row in rows if _known(row, None).comparable)
+        shares[k] = max(held, default=LEVELS[0])
+        for row in rows:
+            row[0] /= shares[k]
+    points = [levels[0][1].position for levels in places]
+    return shares[cKDTree(points).query(surface.vertices)[1]]
 
 
 def fit(found: Sequence[list[Array]], tip: bool = False) -> tuple[Array, dict[str, Any]]:

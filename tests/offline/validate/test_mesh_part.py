@@ -1,16 +1,28 @@
 """The mesh's part of an error, and meshes graded towards a contact, which it is found with."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from palpate.offline.fem.body_mesh import own_mesh
 from palpate.offline.fem.graded import Graded, Grading
 from palpate.offline.fem.mesh import ticks_of
+from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.problem import FullProblem, Load, TipPosition
 from palpate.offline.fem.shapes import shape_of
 from palpate.offline.scenes import find_scene
 from palpate.offline.validate import mesh_part
-from palpate.offline.validate.mesh_part import GIVEN_WAY, LEVELS, Pressed, fit, mesh_errors
+from palpate.offline.validate.mesh_part import (
+    GIVEN_WAY,
+    LESS,
+    LEVELS,
+    Pressed,
+    borne,
+    fit,
+    mesh_errors,
+)
 
 PLACE, DOWN = np.array([5.6, 4.7, 8.0]), np.array([0.0, 0.0, -1.0])
 COARSE = Grading(finest=0.5, even=0.5, growth=0.9)
@@ -77,6 +89,31 @@ def test_errors_fall_with_the_mesh_and_a_finer_reference_says_the_same():
     # largest stress and 99th percentile, whose errors change sign on the way
     assert (fine[:, 4:6] < 0.1).all()
     assert (fine[:, 5] < 0.6 * coarse[:, 5]).all()
+
+
+def test_where_the_finer_mesh_gives_way_less_is_pressed(monkeypatch):
+    monkeypatch.setattr(mesh_part, "GRADING", COARSE)
+    problem = FullProblem(block(3, 3, 2))
+    limit = Load(PLACE, DOWN, 8.0)
+    assert problem.solve(limit).load_steps == 1  # the scene's own mesh bears it
+    levels = [
+        (share, replace(limit, pressure=share * limit.pressure), None) for share in (*LEVELS, *LESS)
+    ]
+    rows = mesh_errors(problem, levels)
+    share = rows[1][0]
+    assert [row[0] for row in rows] == [0.3, share]
+    assert 0.5 < share < 1.0
+    fine = Pressed(Graded(block(3, 3, 2), PLACE, COARSE).problem)
+    fine.harder(0.3, levels[0][1])
+    with pytest.raises(NoEquilibrium):
+        fine.harder(1.0, limit)
+    # there and no further, as far as the place is the nearest
+    elsewhere = [(0.3, replace(limit, position=np.array([1.0, 9.0, 8.0])), None)]
+    bears = [np.array([level, *[0.02] * 5, 0.0]) for level in LEVELS]
+    shares = borne([levels, elsewhere], [rows, bears], problem.surface)
+    nearest = cKDTree([PLACE, elsewhere[0][1].position]).query(problem.surface.vertices)[1]
+    np.testing.assert_array_equal(shares, np.where(nearest == 0, share, 1.0))
+    assert [row[0] for row in rows] == [0.3 / share, 1.0]
 
 
 def test_under_the_tip_errors_are_those_beside_a_sphere(monkeypatch):
