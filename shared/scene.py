@@ -118,6 +118,12 @@ class Block(Part):
     size: tuple[Length, Length, Length] = Field(description="lengths along [x, y, z], mm")
     element: Element = "hex20"
     divisions: Divisions | None = optional(CHOSEN, "elements along [x, y, z]")
+    grading: float = Field(
+        1.0,
+        ge=1,
+        le=3,
+        description="depth below the top over height = (layer / layers)^grading: thin layers there",
+    )
 
 
 def divisions_of(geometry: Extrusion | Block) -> Divisions:

@@ -73,12 +73,12 @@ def build_mesh(scene: Scene, ticks: Ticks | None = None, bare: bool = False) -> 
 
 
 def ticks_of(geometry: Extrusion | Block) -> Ticks:
-    """Ticks of a geometry's divisions: even, but for the layers of an extrusion and its lip."""
+    """Ticks of a geometry's divisions: even, but for graded layers and the lip of an extrusion."""
     first, second, third = _even(in_order(geometry, divisions_of(geometry)))
-    if isinstance(geometry, Extrusion):
+    if geometry.grading > 1.0:
         third = 1 - (1 - third) ** geometry.grading
-        if geometry.lip_rows:
-            return _refined(first, second, third, geometry.lip_rows)
+    if isinstance(geometry, Extrusion) and geometry.lip_rows:
+        return _refined(first, second, third, geometry.lip_rows)
     return first, second, third
 
 

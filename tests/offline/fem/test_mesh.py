@@ -183,6 +183,12 @@ def test_a_mesh_may_have_other_ticks_than_those_of_the_divisions(name, element):
     np.testing.assert_allclose(mesh.nodes[mesh.elements[0, [0, 6]]], [first, last], atol=1e-12)
 
 
+def test_a_graded_block_has_thin_layers_at_its_top():
+    mesh = build_mesh(variant("quick", ("grading = 1.0", "grading = 1.5")))
+    heights = np.unique(mesh.nodes[mesh.elements[:, :8], 2].round(9))
+    np.testing.assert_allclose(heights, 8.0 * (1 - np.array([1, 2 / 3, 1 / 3, 0]) ** 1.5))
+
+
 @pytest.mark.parametrize("rows", [1, 3, 6])
 def test_a_refined_lip_has_short_rows_and_thin_layers_at_its_edges_only(rows):
     scene = variant("turbinate-paper", ("lip_rows = 0", f"lip_rows = {rows}"), ("[13, 2", "[16, 3"))
