@@ -196,7 +196,7 @@ def borne(places: Sequence[Levels], found: Sequence[list[Array]], surface: Surfa
     shares = np.ones(len(found))
     for k, rows in enumerate(found):
         held = (row[0] for row in rows if _known(row, None).comparable)
-        shares[k] = max(held, default=LEVELS[0])
+        shares[k] = max(held, default=1.0)  # a mesh so coarse tells nothing
         for row in rows:
             row[0] /= shares[k]
     points = [levels[0][1].position for levels in places]

@@ -114,6 +114,9 @@ def test_where_the_finer_mesh_gives_way_less_is_pressed(monkeypatch):
     nearest = cKDTree([PLACE, elsewhere[0][1].position]).query(problem.surface.vertices)[1]
     np.testing.assert_array_equal(shares, np.where(nearest == 0, share, 1.0))
     assert [row[0] for row in rows] == [0.3 / share, 1.0]
+    # a mesh that is off by as much under any load is too coarse to tell
+    off = [np.array([level, *[2 * GIVEN_WAY] * 5, 0.0]) for level in LEVELS]
+    assert (borne([levels], [off], problem.surface) == 1.0).all()
 
 
 def test_under_the_tip_errors_are_those_beside_a_sphere(monkeypatch):
