@@ -298,7 +298,7 @@ class FullModel:
             u[:] = start.reshape(-1)[self.free]
         iterations, load_steps, reached, step = 0, 0, 0.0, 1.0
         while reached < 1.0:
-            fraction = min(1.0, reached + step)
+            fraction = reached + step
             potential = Potential(self, [load.at(fraction), *tissue])
             if keep:
                 potential.keep(u)

@@ -47,7 +47,7 @@ LEVELS, DEPTHS = (0.3, 1.0), (0.15, 0.8)
 
 LESS = (7 / 8, 3 / 4, 5 / 8, 1 / 2)
 """Shares at which footprints press where the finer mesh gives way at the limit, down to one that it
-bears."""
+bears; if it bears none of them, it is left with the first of ``LEVELS``."""
 
 CLOSE = 1e-4
 """Residual of solutions, relative to the load or the tip's force, which then errs by as little."""
@@ -98,7 +98,7 @@ class Pressed:
         return self._last[1]
 
     def harder(self, level: float, step: Load | TipPosition, near: Array | None = None) -> Seen:
-        """What it says at a level, sought ``near`` or from what the last level's state grows to."""
+        """What it says at a level, sought ``near`` or from the last state, if lower, grown."""
         problem, before, start = self._problem, self._last, near
         if near is None and before is not None and before[0] < level:
             start = level / before[0] * before[1]
