@@ -1,4 +1,4 @@
-"""Many queries from rest on all cores, each answered to the same bits as by itself.
+"""Many queries from rest on all cores, each answered as by itself, but for round-off.
 
 What a thread does is compiled (``reduced.many``) and holds no lock; every thread has working memory
 of its own.

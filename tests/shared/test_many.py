@@ -1,4 +1,4 @@
-"""Many queries on many threads: what each is answered by itself, to the bit."""
+"""Many queries on many threads: what each is answered by itself."""
 
 import numpy as np
 import pytest
@@ -7,9 +7,10 @@ from palpate.offline.reduce.sampling import cone
 from palpate.shared import many
 from palpate.shared.errors import QueryError
 
-NAMES = (
-    "contact_point", "normal", "distance", "force", "converged", "iterations", "in_range",
-    "error_displacement", "error_von_mises", "error_force", "min_jacobian", "contact_displacement",
+PLACED = ("distance", "in_range")
+SOLVED = (
+    "contact_point", "normal", "force", "converged", "iterations", "error_displacement",
+    "error_von_mises", "error_force", "min_jacobian", "contact_displacement",
 )  # fmt: skip
 
 
@@ -28,13 +29,18 @@ def loads(atlas, rng):
 
 
 def assert_same(answers, others):
-    for name in NAMES:
-        one = getattr(answers, name)
-        other = np.array([getattr(answer, name) for answer in others])
-        if name in ("contact_point", "normal"):  # of a tip that does not touch, nobody asks
-            touched = np.array([answer.contact or not answer.tip for answer in others])
-            one, other = one[touched], other[touched]
-        np.testing.assert_array_equal(one, other, err_msg=name)
+    """But for round-off, by which two compilations of a kernel may differ.
+
+    Beyond the range tissue folds, and round-off decides how.  Of a tip that does not touch nobody
+    asks for the contact.
+    """
+    sought = np.array([answer.contact or not answer.tip for answer in others])
+    for name in PLACED + SOLVED:
+        one, other = getattr(answers, name), np.array([getattr(answer, name) for answer in others])
+        kept = np.ones(len(one), bool) if name in PLACED else answers.in_range
+        if name in ("contact_point", "normal"):
+            kept = kept & sought
+        np.testing.assert_allclose(one[kept], other[kept], rtol=1e-9, atol=1e-12, err_msg=name)
 
 
 @pytest.mark.parametrize("threads", [1, 3])
