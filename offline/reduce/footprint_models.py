@@ -35,8 +35,10 @@ from palpate.shared.reduced.workspace import Workspace
 from palpate.shared.scene import Scene
 from palpate.shared.tables import press_models
 
-LOADS = 16
-"""Training loads of the cubature; each gives an equilibrium and a state off equilibrium."""
+LOADS, EQUATIONS, POINTS = 16, 300, 128
+"""Training loads of a cubature of up to so many points, each of which gives an equilibrium and a
+state off equilibrium, and combinations of the reduced internal force there that it is fitted to.
+More points learn from more in proportion."""
 
 EXTREME = 0.5
 """Share of them near the largest pressure, half of those at the largest tilt: where cubature errs
@@ -55,6 +57,7 @@ FAINT = 0.1
 """Weight of the Ritz vectors themselves beside their states."""
 
 RESIDUAL_LOADS = 64
+"""For the usual tolerance; see ``reduce.sampling.fewer``."""
 
 DEFECT_LOADS, DEFECT_DAMPING = 240, 0.1
 """Equilibria that the defect is fitted to, and the damping of the fit: undamped it goes astray at
@@ -67,12 +70,6 @@ at; the damping of both fits."""
 
 CUBATURE_LOADS = 3
 """By which a local model is compared with itself with every quadrature point."""
-
-EQUATIONS = 300
-"""Combinations of the reduced internal force that cubature is fitted to.
-
-This, ``LOADS`` and ``RESIDUAL_LOADS`` are for the usual tolerance; see ``reduce.sampling.fewer``.
-"""
 
 CANDIDATES = 6
 """Points that are drawn for each of those of the cubature to choose from."""
@@ -185,10 +182,10 @@ def trained_patch(problem: FullProblem, region: Region, patch: Patch) -> LocalMo
     models = untrained(problem, states, patch.at, patch.extent, whole, mix)
     galerkin = LocalTrainer(problem, models)
     most = patch.size.cubature_points
-    forces = _training_forces(galerkin, loads)[: len(weights)]
-    equations = max(most, fewer(EQUATIONS, scene.tolerance))
+    more = max(1.0, most / POINTS)
+    forces = _training_forces(galerkin, loads, round(more * LOADS))[: len(weights)]
     candidates, forces = cubature.drawn(forces, CANDIDATES * most, rng)
-    A, b = cubature.compress(forces, equations, rng)
+    A, b = cubature.compress(forces, round(more * EQUATIONS), rng)
     chosen, factors = cubature.nonnegative(A[:, : len(candidates)], b, most)
     points = candidates[chosen]
     models = with_points(models, points, factors * weights[points])
@@ -274,9 +271,9 @@ def _expected(scene: Scene, region: Region, patch: Patch, rng: np.random.Generat
     return np.hstack(parts)
 
 
-def _training_forces(trainer: LocalTrainer, loads: RandomLoads) -> Field:
+def _training_forces(trainer: LocalTrainer, loads: RandomLoads, count: int) -> Field:
     """``cubature.training_forces`` whose errors are those of displacement in the energy norm."""
-    samples = trainer.answers(loads.training, fewer(LOADS, loads.scene.tolerance))
+    samples = trainer.answers(loads.training, count)
     states = [(s.q, np.linalg.cholesky(s.compliance) / np.linalg.norm(s.q), None) for s in samples]
     return cubature.training_forces(
         cubature.by_point(trainer.rows), trainer.law, states, SKETCH, RESPONSES, loads.rng

@@ -22,7 +22,6 @@ from palpate.offline.validate.compare import opened
 from palpate.offline.validate.mesh_part import Levels, Seen, answered, compared
 from palpate.offline.validate.queries import LOADS, TIP, Place, held_out
 from palpate.shared.arrays import Array
-from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.model import ReducedModel
 from palpate.shared.scene import Scene, parse_scene
 
@@ -106,10 +105,10 @@ def _levels(atlas: ReducedModel, x: Array) -> Iterator[tuple[str, Levels]]:
     place = Place.at(atlas, x)
     pressed = [(level, place.press(-place.normal, level)) for level in LEVELS]
     yield "load", answered(atlas, pressed)
-    limit = float(place.limits[TIP_DEPTH])
-    depths = [depth * place.radius for depth in DEPTHS if depth * place.radius <= limit]
+    depths = [depth * place.radius for depth in DEPTHS if depth * place.radius <= place.depth]
     if depths:
-        yield "tip", answered(atlas, [(depth, place.touch(depth / limit)) for depth in depths])
+        steps = [(depth, place.touch(depth / place.depth)) for depth in depths]
+        yield "tip", answered(atlas, steps)
 
 
 def _reduced(atlas: ReducedModel, step: Load | TipPosition) -> tuple[Any, Seen]:

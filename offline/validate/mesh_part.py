@@ -45,6 +45,10 @@ from 15."""
 LEVELS, DEPTHS = (0.3, 1.0), (0.15, 0.8)
 """Shares of the limit at which footprints and tips press there."""
 
+SHALLOW = 0.05
+"""Radii that a tip is deep at least: less deep, its contact is no larger than faces of the finer
+mesh, which knows no better."""
+
 LESS = (7 / 8, 3 / 4, 5 / 8, 1 / 2)
 """Shares at which footprints press where the finer mesh gives way at the limit, down to one that it
 bears; if it bears none of them, it is left with the first of ``LEVELS``."""
@@ -152,7 +156,11 @@ def places(model: ReducedModel, rng: np.random.Generator, tip: bool = False) -> 
     points = centred_points_and_rim(model.surface, count, RIM, rng)
     found = [Place.at(model, point) for point in points]
     if tip:
-        return [answered(model, [(at, place.touch(at)) for at in DEPTHS]) for place in found]
+        least = SHALLOW * model.scene.endoscope.radius
+        inward = [
+            [(at, place.touch(at)) for at in DEPTHS if at * place.depth >= least] for place in found
+        ]
+        return [answered(model, own) for own in inward if own]
     levels = (*LEVELS, *LESS)
     along = [[(at, place.press(-place.normal, at)) for at in levels] for place in found]
     return [answered(model, own) for own in along]

@@ -47,13 +47,18 @@ class Place(NamedTuple):
         """Largest trained pressure (kPa) along a direction."""
         return float(pressure_limit(self.limits, self.normal, direction))
 
+    @property
+    def depth(self) -> float:
+        """Largest trained depth of the tip, mm."""
+        return float(self.limits[TIP_DEPTH])
+
     def press(self, direction: Array, level: float, dt: float = 0.0) -> Load:
         """A footprint pressed to a level: 1 is the limit."""
         return Load(self.position, direction, float(level * self.limit(direction)), dt)
 
     def touch(self, level: float, dt: float = 0.0) -> TipPosition:
         """The rigid tip as deep as a level says; at 0 it does not touch."""
-        depth = level * self.limits[TIP_DEPTH] if level > 0.0 else -LIFTED
+        depth = level * self.depth if level > 0.0 else -LIFTED
         return TipPosition(self.position + (self.radius - depth) * self.normal, dt)
 
 

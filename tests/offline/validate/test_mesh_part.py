@@ -15,14 +15,17 @@ from palpate.offline.fem.shapes import shape_of
 from palpate.offline.scenes import find_scene
 from palpate.offline.validate import mesh_part
 from palpate.offline.validate.mesh_part import (
+    DEPTHS,
     GIVEN_WAY,
     LESS,
     LEVELS,
+    MOST,
     Pressed,
     borne,
     fit,
     mesh_errors,
 )
+from palpate.shared.mechanics.footprint import TIP_DEPTH
 
 PLACE, DOWN = np.array([5.6, 4.7, 8.0]), np.array([0.0, 0.0, -1.0])
 COARSE = Grading(finest=0.5, even=0.5, growth=0.9)
@@ -131,6 +134,19 @@ def test_under_the_tip_errors_are_those_beside_a_sphere(monkeypatch):
     assert (rows[:, 2] > 1.5 * load[2]).all()
     assert (rows[:, [1, 3]] < 0.1).all()
     assert (rows[:, 3] > 0.002).all()
+
+
+def test_tips_are_pressed_no_less_deep_than_finer_meshes_tell_of(atlas, monkeypatch):
+    def pressed():
+        found = mesh_part.places(atlas, np.random.default_rng(5), tip=True)
+        return [[level for level, *_ in levels] for levels in found]
+
+    assert pressed() == [list(DEPTHS)] * MOST
+    deepest = atlas.limits[:, TIP_DEPTH].max() / atlas.scene.endoscope.radius
+    monkeypatch.setattr(mesh_part, "SHALLOW", DEPTHS[0] * deepest * 1.01)
+    assert pressed() == [[DEPTHS[1]]] * MOST
+    monkeypatch.setattr(mesh_part, "SHALLOW", deepest)
+    assert pressed() == []
 
 
 def test_a_sphere_pressed_deeper_and_deeper_is_where_one_pressed_at_once_is():
