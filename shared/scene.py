@@ -170,8 +170,8 @@ their squares, so that the mesh may take nearly all of it, too."""
 class Tolerance(Part):
     """The errors an answer may have, those of mesh and reduction together."""
 
-    displacement: Fraction = Field(0.03, description="relative L2 error over all nodes")
-    von_mises: Fraction = Field(0.12, description="relative L2 error over all unclamped nodes")
+    displacement: Fraction = Field(0.03, description="relative L2 error over the volume")
+    von_mises: Fraction = Field(0.12, description="relative L2 error over the unclamped volume")
     force: Fraction = Field(0.05, description="relative error of the force of a rigid tip")
     tip_displacement: Positive = times(2, "displacement", "error of displacement under a rigid tip")
     tip_von_mises: Positive = times(3, "von_mises", "error of stress under a rigid tip")

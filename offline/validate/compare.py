@@ -6,12 +6,13 @@ reduced model's estimate of them.
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import beta
 from tqdm import tqdm
 
@@ -21,7 +22,7 @@ from palpate.offline.run.tables import write_csv
 from palpate.offline.run.workers import open_artifact, run, worker_pool
 from palpate.offline.validate.queries import LOADS, Kind, held_out
 from palpate.shared.answer import Answer
-from palpate.shared.arrays import Array
+from palpate.shared.arrays import Array, Flags
 from palpate.shared.errors import PalpateError, QueryError
 from palpate.shared.model import ReducedModel
 from palpate.shared.query import stiffness
@@ -56,21 +57,22 @@ class Compared(NamedTuple):
 
     reduced: Array
     full: Array
+    weights: Array  # (k,) of squares in norms: volumes that values stand for, mm^3, or ones
 
     @property
     def error(self) -> float:
         """Relative L2 norm over everything."""
-        return relative(self.reduced, self.full)
+        return relative(self.reduced.T, self.full.T, self.weights)
 
     @property
     def away(self) -> Array:
         """Size of the error (t,) at each moment."""
-        return np.linalg.norm(self.reduced - self.full, axis=1)
+        return np.sqrt((self.reduced - self.full) ** 2 @ self.weights)
 
     @property
     def largest(self) -> Array:
         """Largest norm (t,) until each moment."""
-        return np.asarray(np.maximum.accumulate(np.linalg.norm(self.full, axis=1)))
+        return np.asarray(np.maximum.accumulate(np.sqrt(self.full**2 @ self.weights)))
 
     @property
     def so_far(self) -> Array:
@@ -80,6 +82,10 @@ class Compared(NamedTuple):
         """
         floor = 1e-9 * max(float(self.largest[-1]), 1e-300)
         return np.asarray(np.maximum.accumulate(self.away) / np.maximum(self.largest, floor))
+
+    def at(self, moments: Flags) -> Self:
+        """Only of some moments (t,)."""
+        return self._replace(reduced=self.reduced[moments], full=self.full[moments])
 
 
 @dataclass
@@ -98,7 +104,7 @@ class KnownAnswer:
 class Row(NamedTuple):
     """One query answered by both models.
 
-    Errors in its table are relative L2 norms over all nodes (of stress outside the clamped layer)
+    Errors in its table are relative L2 norms over the volume (of stress outside the clamped layer)
     and all moments.
     """
 
@@ -111,16 +117,13 @@ def compare(
 ) -> Row:
     """Answer a query with the reduced model and compare with full solutions."""
     answers = play(model, query, problem.scene.tissue.young)
-    kept = problem.beyond_clamped_layer
-    fields = {
-        "displacement": ([model.displacement(answer) for answer in answers], full.u),
-        "von_mises": ([model.von_mises(answer)[kept] for answer in answers], full.s[:, kept]),
-        "force": ([answer.force for answer in answers], full.f),
-    }
+    moved, stress = map(model.displacement, answers), map(model.von_mises, answers)
     compared = {
-        name: Compared(*(np.array(own, float).reshape(len(query), -1) for own in fields[name]))
-        for name in kind.quantities
+        "displacement": _compared(moved, full.u, np.repeat(problem.nodal_volumes, 3)),
+        "von_mises": _compared(stress, full.s, problem.counted_volumes),
+        "force": _compared((answer.force for answer in answers), full.f, np.ones(3)),
     }
+    compared = {name: compared[name] for name in kind.quantities}
     errors = np.transpose([quantity.so_far for quantity in compared.values()])
     known = [
         KnownAnswer(
@@ -143,6 +146,12 @@ def compare(
     return Row(table, known)
 
 
+def _compared(reduced: Iterable[NDArray[Any]], full: NDArray[Any], weights: Array) -> Compared:
+    """A quantity by both models, of any shape at each moment."""
+    own = np.array([*reduced], float)
+    return Compared(own.reshape(len(full), -1), full.astype(float).reshape(len(full), -1), weights)
+
+
 def _single(
     model: ReducedModel, answer: Answer, compared: Mapping[str, Compared], full: Reference
 ) -> dict[str, float]:
@@ -154,7 +163,8 @@ def _single(
         shares = {}
     else:
         at, names = answer.contact_point, ("pressure", "departure", "residual")
-        found, exact = (np.percentile(stress[0], 99) for stress in compared["von_mises"])
+        *stresses, counted = compared["von_mises"]
+        found, exact = (np.percentile(stress[0][counted > 0.0], 99) for stress in stresses)
         errors["von_mises_p99"] = float(abs(found - exact) / exact)
         errors["peak_displacement"] = float(np.linalg.norm(full.u[0], axis=1).max())
         shares = {
@@ -193,8 +203,8 @@ def _history(
     if kind.tip:
         apart = moved.away > OTHER_EQUILIBRIUM * moved.largest
         table["apart"] = int(apart.sum())
-        for name, (reduced, full) in compared.items():
-            table[f"together_{name}"] = relative(reduced[~apart], full[~apart])
+        for name, quantity in compared.items():
+            table[f"together_{name}"] = quantity.at(~apart).error
         return table
     exact = moved.full.reshape(len(query), -1, 3)
     under = [problem.under(*pair) for pair in zip(positions, exact, strict=True)]

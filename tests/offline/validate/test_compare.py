@@ -15,7 +15,10 @@ def test_errors_are_relative_and_of_moments_to_the_largest_so_far():
     assert relative(np.ones(3), np.zeros(3)) == 0.0
     exact = np.array([[1.0, 0.0], [4.0, 0.0], [0.0, 0.0]])
     found = exact + np.array([[0.1, 0.0], [0.0, 0.2], [0.4, 0.0]])
-    np.testing.assert_allclose(Compared(found, exact).so_far, [0.1, 0.05, 0.1])
+    compared = Compared(found, exact, np.ones(2))
+    np.testing.assert_allclose(compared.so_far, [0.1, 0.05, 0.1])
+    assert compared.error == pytest.approx(relative(found, exact))
+    np.testing.assert_allclose(Compared(found, exact, np.array([1.0, 4.0])).away, [0.1, 0.4, 0.4])
 
 
 def test_moments_in_different_equilibria_are_told_apart(visco_atlas, visco_problem, rng):
