@@ -125,6 +125,14 @@ def worker_processes(parent):
     return found
 
 
+def assert_same(one, other):
+    """Two artifacts are the same to the last bit, when and how they were made apart."""
+    found, expected = (read_artifact(path, *STORED).arrays for path in (one, other))
+    assert found.keys() == expected.keys()
+    for name, values in expected.items():
+        np.testing.assert_array_equal(found[name], values, err_msg=name, strict=True)
+
+
 def test_a_cluster_whose_worker_is_killed_trains_the_artifact_of_this_machine(
     artifact, tiny, running, tmp_path
 ):
@@ -147,10 +155,7 @@ def test_a_cluster_whose_worker_is_killed_trains_the_artifact_of_this_machine(
     assert "local models: 100%" in log
     alone = [*PALPATE, "train", str(tiny), "--out", str(here), "--workers", "1"]
     subprocess.run(alone, check=True, capture_output=True)
-    found, expected = (read_artifact(path, *STORED).arrays for path in (there, here))
-    assert found.keys() == expected.keys()
-    for name, values in expected.items():
-        np.testing.assert_array_equal(found[name], values, err_msg=name, strict=True)
+    assert_same(there, here)
 
 
 def resumed(pool, tasks, folder, count):
