@@ -15,6 +15,10 @@ from palpate.shared.reduced.points import LANES, Points
 from palpate.shared.reduced.press import PressModels
 from palpate.shared.scene import Scene
 
+AT_ONCE = 16 * LANES
+"""Points whose gradients are found together: all of the cubature, and of all points of a body so
+many as stay in the processor's cache."""
+
 
 def press_models(body: Body, models: LocalModels, scene: Scene) -> PressModels:
     """Everything the compiled query needs for footprints of up to the scene's radius."""
@@ -102,13 +106,18 @@ def _place_points(
     element, q = np.divmod(models.points[own], body.gradients.shape[1])
     points.weights[k, : len(element)] = models.weights[own]
     nodes, corners = _compact(body.elements[element])
-    # (c, 1, J, n) @ (c, i, n, m) -> (c, i, J, m)
-    slopes = np.swapaxes(body.gradients[element, q], 1, 2)[:, None].astype(np.float32)
-    G = np.matmul(slopes, np.swapaxes(rows(nodes)[corners], 1, 2))
-    filled = np.zeros((points.weights.shape[1], 9, G.shape[-1]), np.float32)
-    filled[: len(G)] = G.reshape(len(G), 9, -1)
-    tiles = filled.reshape(-1, LANES, 9, G.shape[-1]).transpose(3, 0, 2, 1)
-    return np.asarray(tiles.reshape(G.shape[-1], -1))
+    moved = rows(nodes)
+    G = np.zeros((moved.shape[2], 9 * points.weights.shape[1]), np.float32)
+    for first in range(0, len(element), AT_ONCE):
+        some = slice(first, first + AT_ONCE)
+        slopes = np.swapaxes(body.gradients[element[some], q[some]], 1, 2).astype(np.float32)
+        # (c, 1, J, n) @ (c, i, n, m) -> (c, i, J, m)
+        found = np.matmul(slopes[:, None], np.swapaxes(moved[corners[some]], 1, 2))
+        filled = np.zeros((-(-len(found) // LANES), LANES, 9, len(G)), np.float32)
+        filled.reshape(-1, 9, len(G))[: len(found)] = found.reshape(-1, 9, len(G))
+        tiles = filled.transpose(3, 0, 2, 1).reshape(len(G), -1)
+        G[:, 9 * first : 9 * first + tiles.shape[1]] = tiles
+    return G
 
 
 def _by_node(modes: NDArray[Any]) -> Field:

@@ -7,12 +7,12 @@ with the artifact's, and its times are scaled by what those take beside it over 
 the whole: points are then comparable although the speed of the machine varies, also when a killed
 run was resumed later.
 
-Errors are relative L2 norms over the moments of a query and all nodes (displacement) or all nodes
-beyond the clamped layer (von Mises stress); a query in which a step has no answer counts as an
-error of 1.  Against the full model on the scene's own mesh that is the error of reduction.  For
-loads there are meshes graded towards each contact too, beside which the error of the mesh comes on
-top, as it does for full models on coarser and finer meshes: of few loads, over the volume, and with
-the near field of the contact in the stress, which is recovered from any method's displacement.
+Errors are relative L2 norms over the moments of a query and the volume, of von Mises stress beyond
+the clamped layer; a query in which a step has no answer counts as an error of 1.  Against the full
+model on the scene's own mesh that is the error of reduction.  For loads there are meshes graded
+towards each contact too, beside which the error of the mesh comes on top, as it does for full
+models on coarser and finer meshes: of few loads, and with the near field of the contact in the
+stress, which is recovered from any method's displacement.
 
 Over histories the artifact is also asked as if there were no past ("artifact, warm"): warm queries
 of the same local models at the same loads.  They are compared with the full model of tissue that

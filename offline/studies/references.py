@@ -43,15 +43,18 @@ class Fields(NamedTuple):
         )
 
     def errors(self, problem: FullProblem, exact: Self) -> tuple[float, float]:
-        """Relative L2 errors over the moments and all nodes, or those beyond the clamped layer."""
-        kept = problem.beyond_clamped_layer
-        u, s = (field.astype(float) for field in exact)
-        return relative(self.displacements, u), relative(self.stresses[:, kept], s[:, kept])
+        """Relative L2 errors over moments and volume, of stress beyond the clamped layer."""
+        volumes = problem.nodal_volumes, problem.counted_volumes
+        moved, stress = (
+            relative(own.swapaxes(0, 1), full.astype(float).swapaxes(0, 1), weights)
+            for own, full, weights in zip(self, exact, volumes, strict=True)
+        )
+        return moved, stress
 
     def total_errors(
         self, problem: FullProblem, load: Load, exact: tuple[Array, Array]
     ) -> tuple[float, float]:
-        """The same of the answer to a load over the volume, beside a graded mesh.
+        """The same of the answer to a load, beside a graded mesh.
 
         Stress is recovered from the displacement, with the near field of the load.
         """
