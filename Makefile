@@ -36,7 +36,8 @@ lint: .venv/dev
 	$(bin)/ruff format --check
 	@# The links in .package must lead mypy to every file.
 	$(bin)/mypy | tee .mypy_said
-	@test $$(sed -n 's/.* in \([0-9]*\) source files/\1/p' .mypy_said) -ge $$(find offline online shared -name '*.py' | wc -l)
+	@checked=$$(sed -n 's/.* in \([0-9]*\) source files/\1/p' .mypy_said); \
+	test $${checked:-0} -ge $$(find offline online shared -name '*.py' | wc -l)
 	@rm .mypy_said
 	$(bin)/lint-imports
 

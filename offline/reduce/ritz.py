@@ -249,12 +249,10 @@ def region(problem: FullProblem, footprints: list[Footprint], modes: int) -> Reg
     """Basis of a region and the Ritz vectors of footprints in it."""
     model = problem.model
     vectors, forces = _ritz(problem, footprints)
-    first = np.arange(vectors.shape[1]) % RITZ_VECTORS < 3
-    apart = -(-len(footprints) // POINTS_IN_BASIS)
-    learnt, their = (
-        np.concatenate([*rows[:, first], *rows[::apart, ~first]]) for rows in (vectors, forces)
-    )
-    basis, energies = _leading(learnt, their, modes)
+    linear = np.arange(vectors.shape[1]) % RITZ_VECTORS < 3
+    learnt = np.tile(linear, (len(footprints), 1))
+    learnt[:: -(-len(footprints) // POINTS_IN_BASIS)] = True
+    basis, energies = _leading(vectors[learnt], forces[learnt], modes)
     amplitude = np.sqrt(energies[: len(basis)] / len(energies))
     far = basis[:, len(model.free) :]
     near = basis[:, : len(model.free)] - far @ model.body.T
