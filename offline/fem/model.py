@@ -45,8 +45,8 @@ NOISE = 1e-16
 """Of the energy, relative to that which deforms the whole body: it is a sum over all points."""
 
 MAX_ITERATIONS = 40
-KEEP_TANGENT = 0.05
-"""A factorisation costs ten corrections here, so a tangent serves while it gains a digit."""
+KEEP_TANGENT = 0.5
+"""A factorisation costs ten corrections here, so a tangent serves while it halves the residual."""
 
 SMALLEST_STEP = 1 / 64
 """Fraction of a load below which a load step is given up."""

@@ -258,7 +258,8 @@ def fit_residual(
     for row, (load, direction, share, _) in zip(rows, known, strict=True):
         residual_features(frame, centre, load.position, direction, share, row)
     states = modes @ np.transpose([q for *_, q in known])
-    residuals = residuals_left(problem, states, [load for load, *_ in known])
+    sizes = [np.linalg.norm(q) for *_, q in known]  # the modes are orthonormal in that energy
+    residuals = residuals_left(problem, states, [load for load, *_ in known]) / sizes
     kept = (residuals > 0) & np.isfinite(residuals)
     logs = np.log(residuals[kept])
     fitted = damped_fit(rows[kept], (logs - logs.mean())[:, None], RESIDUAL_DAMPING)[:, 0]
@@ -267,10 +268,10 @@ def fit_residual(
 
 
 def residuals_left(problem: FullProblem, states: Array, loads: Sequence[Load]) -> Array:
-    """What states (free dofs, k) mm leave of loads in the full model, relative to them, (k,).
+    """What states (free dofs, k) mm leave of loads in the full model, (k,).
 
-    Both are measured as displacements in the energy of the rest state; infinite where the
-    displacement inverts an element.
+    As a displacement, in the root of its energy of the rest state; infinite where the state inverts
+    an element.
     """
     model = problem.model
     left, sound = np.zeros_like(states), np.ones(len(loads), dtype=bool)
@@ -281,5 +282,4 @@ def residuals_left(problem: FullProblem, states: Array, loads: Sequence[Load]) -
             sound[i] = False
         left[: len(model.free), i] -= problem.load_vector(load).ravel()[model.free]
     energies = np.sum(left * model.solve_linear(left), axis=0)
-    own = np.sum(states * (model.rest_stiffness @ states), axis=0)
-    return np.where(sound, np.sqrt(energies / own), np.inf)
+    return np.where(sound, np.sqrt(energies), np.inf)

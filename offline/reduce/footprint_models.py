@@ -35,7 +35,7 @@ from palpate.shared.reduced.workspace import Workspace
 from palpate.shared.scene import Scene
 from palpate.shared.tables import press_models
 
-LOADS, EQUATIONS, POINTS = 16, 300, 128
+LOADS, EQUATIONS, POINTS = 20, 450, 128
 """Training loads of a cubature of up to so many points, each of which gives an equilibrium and a
 state off equilibrium, and combinations of the reduced internal force there that it is fitted to.
 More points learn from more in proportion."""
@@ -189,9 +189,8 @@ def trained_patch(problem: FullProblem, region: Region, patch: Patch) -> LocalMo
     chosen, factors = cubature.nonnegative(A[:, : len(candidates)], b, most)
     points = candidates[chosen]
     models = with_points(models, points, factors * weights[points])
-    defect = _fit_defect(galerkin, LocalTrainer(problem, models), loads)
-    models = replace(models, defect=half(defect))
     trained = LocalTrainer(problem, models)
+    models.defect[:] = half(_fit_defect(galerkin, trained, loads))  # which it knows from now on
     samples = trained.answers(loads.any, GUESS_LOADS)
     directions, change = _fit_tangent(trained, samples[:TANGENT_LOADS])
     modes = states @ models.modes[0]
