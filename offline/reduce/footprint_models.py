@@ -189,8 +189,9 @@ def trained_patch(problem: FullProblem, region: Region, patch: Patch) -> LocalMo
     chosen, factors = cubature.nonnegative(A[:, : len(candidates)], b, most)
     points = candidates[chosen]
     models = with_points(models, points, factors * weights[points])
+    defect = _fit_defect(galerkin, LocalTrainer(problem, models), loads)
+    models = replace(models, defect=half(defect))
     trained = LocalTrainer(problem, models)
-    models.defect[:] = half(_fit_defect(galerkin, trained, loads))  # which it knows from now on
     samples = trained.answers(loads.any, GUESS_LOADS)
     directions, change = _fit_tangent(trained, samples[:TANGENT_LOADS])
     modes = states @ models.modes[0]
