@@ -150,18 +150,16 @@ def _train(untrained: Scene, out: Path | None, force: bool, who: Who) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     folder = training_folder(path)
     teller = Teller(untrained.name, folder)
-    checkpoint = Checkpoint(folder, key, teller)
-    try:
-        trained, mesh_choice = with_mesh(untrained)
-        pool, workers = who(trained, key)
-        with pool:
-            pipeline = Pipeline(trained, pool, checkpoint, started)
-            tqdm.write(outlook(pipeline.problem, workers), file=sys.stderr)
-            pipeline.run(path, mesh_choice)
-        checkpoint.remove()
-    finally:
-        teller.end()
-        checkpoint.leave()
+    with Checkpoint(folder, key, teller) as checkpoint:
+        try:
+            trained, mesh_choice = with_mesh(untrained)
+            pool, workers = who(trained, key)
+            with pool:
+                pipeline = Pipeline(trained, pool, checkpoint, started)
+                tqdm.write(outlook(pipeline.problem, workers), file=sys.stderr)
+                pipeline.run(path, mesh_choice)
+        finally:
+            teller.end()
     return path
 
 

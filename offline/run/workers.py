@@ -220,7 +220,7 @@ class Checkpoint:
 
     The key is from ``content_key``; results of other keys are removed.  ``told`` is called with a
     title, the number of its tasks that are done, and of all.  Raises ``PalpateError`` if another
-    process works there.
+    process works there.  As a context it is removed at the end, and left where that fails.
     """
 
     def __init__(
@@ -236,6 +236,15 @@ class Checkpoint:
                 shutil.rmtree(other)
         for left in self._folder.glob("*.part"):  # by a process that was killed
             left.unlink()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, failure: type[BaseException] | None, *_: object) -> None:
+        if failure is None:
+            self.remove()
+        else:
+            self.leave()
 
     def _path(self, name: str) -> Path:
         return self._folder / f"{name}.pickle"

@@ -100,7 +100,6 @@ def chart(
     if not in_time:  # as many modes as the artifact has unknowns, too
         plan = {**plan, "pod": sorted({*plan["pod"], Shipped(problem, atlas).unknowns})}
     settings = snapshots, queries, seed
-    checkpoint = full.kept_results(artifact, atlas.scene, layout.name, settings)
     given = {
         stage.name: full.random_steps(
             atlas, problem, count, stream(atlas.scene.seed, stage, seed), in_time
@@ -108,31 +107,31 @@ def chart(
         for stage, count in ((Stage.SNAPSHOTS, snapshots), (Stage.UNSEEN, queries))
     }
     follow = {name: [(full.followed, steps) for steps in own] for name, own in given.items()}
-    solved = full.in_parallel(artifact, checkpoint, "full solutions", follow)
-    learnt, asked = (
-        [(steps, found) for steps, found in zip(given[name], own, strict=True) if found]
-        for name, own in solved.items()
-    )
-    if not asked:
-        raise PalpateError(f"{artifact}: the full model could follow none of the histories")
-    loads = [] if scene is None else [steps[0][0].contacts[0] for steps, _ in asked]
-    tasks = {"graded": [(full.graded, scene, load) for load in loads[:GRADED_LOADS]]}
-    finer = full.in_parallel(artifact, checkpoint, "graded meshes", tasks)["graded"]
-    questions = [(*query, fine) for query, fine in zip_longest(asked, finer)]
-    training = Training(problem, full.snapshots(learnt), atlas, seed, in_time)
-    measured: dict[str, Mapping[str, Any]] = {}
-    # in this process: times are those of one core, and methods share what they learn from
-    for name, size in tqdm([(name, size) for name, sizes in plan.items() for size in sizes]):
-        key = f"{name} {size:g}"
-        if key not in checkpoint:
-            checkpoint.store(key, measure(training, questions, name, size))
-        measured[key] = checkpoint.load(key)
-    usual = float(np.median([np.median(found["beside"]) for found in measured.values()]))
-    rows = [_row(key, found, usual) for key, found in measured.items()]
-    report = artifact.parent / atlas.name / "report"
-    write_csv(report / f"{layout.name}.csv", rows)
-    drawing.draw(report / f"{layout.name}.png", rows, atlas.scene, layout)
-    checkpoint.remove()
+    with full.kept_results(artifact, atlas.scene, layout.name, settings) as checkpoint:
+        solved = full.in_parallel(artifact, checkpoint, "full solutions", follow)
+        learnt, asked = (
+            [(steps, found) for steps, found in zip(given[name], own, strict=True) if found]
+            for name, own in solved.items()
+        )
+        if not asked:
+            raise PalpateError(f"{artifact}: the full model could follow none of the histories")
+        loads = [] if scene is None else [steps[0][0].contacts[0] for steps, _ in asked]
+        tasks = {"graded": [(full.graded, scene, load) for load in loads[:GRADED_LOADS]]}
+        finer = full.in_parallel(artifact, checkpoint, "graded meshes", tasks)["graded"]
+        questions = [(*query, fine) for query, fine in zip_longest(asked, finer)]
+        training = Training(problem, full.snapshots(learnt), atlas, seed, in_time)
+        measured: dict[str, Mapping[str, Any]] = {}
+        # in this process: times are those of one core, and methods share what they learn from
+        for name, size in tqdm([(name, size) for name, sizes in plan.items() for size in sizes]):
+            key = f"{name} {size:g}"
+            if key not in checkpoint:
+                checkpoint.store(key, measure(training, questions, name, size))
+            measured[key] = checkpoint.load(key)
+        usual = float(np.median([np.median(found["beside"]) for found in measured.values()]))
+        rows = [_row(key, found, usual) for key, found in measured.items()]
+        report = artifact.parent / atlas.name / "report"
+        write_csv(report / f"{layout.name}.csv", rows)
+        drawing.draw(report / f"{layout.name}.png", rows, atlas.scene, layout)
     return _summary(rows) | {"without_equilibrium": queries - len(asked)}
 
 

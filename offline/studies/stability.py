@@ -123,34 +123,34 @@ def stability(
     given = full.random_steps(atlas, problem, learnt or most, random, in_time)
     learning = {f"snapshots {p:g}": [HardCase(x, p, in_time) for x in given] for p in poissons}
     settings = cases, seed, many, len(given), list(asked), wanted
-    checkpoint = full.kept_results(artifact, atlas.scene, title, settings)
     tasks = {
         kind: [(hard_cases.ask_full_model, case) for case in own]
         for kind, own in (asked | learning).items()
     }
-    solved = full.in_parallel(artifact, checkpoint, "full solutions", tasks)
-    answered = {kind: solved[kind] for kind in asked}
-    answered |= hard_cases.several(answered, cases)
-    questions = {kind: [q for q in own if not q.lost] for kind, own in answered.items()}
-    table: dict[str, dict[str, list[Result]]] = {name: {} for name in wanted}
-    for poisson, solutions in zip(poissons, learning, strict=True):
-        pairs = [(question.case.steps, question.jump) for question in solved[solutions]]
-        own_tissue = full.of_tissue(problem, poisson=poisson)
-        training = Training(own_tissue, full.snapshots(pairs), atlas, in_time=in_time)
-        for name in tqdm(wanted, f"methods, Poisson {poisson:g}"):
-            label = f"answers {name} {poisson:g}"
-            if label not in checkpoint:
+    with full.kept_results(artifact, atlas.scene, title, settings) as checkpoint:
+        solved = full.in_parallel(artifact, checkpoint, "full solutions", tasks)
+        answered = {kind: solved[kind] for kind in asked}
+        answered |= hard_cases.several(answered, cases)
+        questions = {kind: [q for q in own if not q.lost] for kind, own in answered.items()}
+        table: dict[str, dict[str, list[Result]]] = {name: {} for name in wanted}
+        for poisson, solutions in zip(poissons, learning, strict=True):
+            pairs = [(question.case.steps, question.jump) for question in solved[solutions]]
+            own_tissue = full.of_tissue(problem, poisson=poisson)
+            training = Training(own_tissue, full.snapshots(pairs), atlas, in_time=in_time)
+            for name in tqdm(wanted, f"methods, Poisson {poisson:g}"):
+                label = f"answers {name} {poisson:g}"
                 put = {
                     kind: [q for q in every if _applies(name, q.case, poisson, atlas)]
                     for kind, every in questions.items()
                 }
                 put = {kind: own for kind, own in put.items() if own}
-                checkpoint.store(label, _answers(name, rows[name], training, put) if put else {})
-            table[name] |= checkpoint.load(label)
-    noun = "histories (one of those of many steps)" if in_time else "loads"
-    kept = [kind for kind, own in questions.items() if own]
-    outcomes.publish(artifact.parent / atlas.name / "report", title, table, kept, noun)
-    checkpoint.remove()
+                if label not in checkpoint:
+                    found = _answers(name, rows[name], training, put) if put else {}
+                    checkpoint.store(label, found)
+                table[name] |= checkpoint.load(label)
+        noun = "histories (one of those of many steps)" if in_time else "loads"
+        kept = [kind for kind, own in questions.items() if own]
+        outcomes.publish(artifact.parent / atlas.name / "report", title, table, kept, noun)
     missing = {kind: sum(q.exact is None for q in own) for kind, own in answered.items()}
     return outcomes.summaries(table) | {
         "without_equilibrium": {kind: count for kind, count in missing.items() if count}

@@ -53,11 +53,10 @@ def truth(artifact: Path, scene: Scene, places: int, seed: int) -> dict[str, Any
     atlas, _ = opened(artifact)
     points = centred_points_and_rim(atlas.surface, places, RIM, held_out(atlas, seed))
     tasks = {"place": [(at_place, artifact, scene.folder, x) for x in points]}
-    checkpoint = kept_results(artifact, scene, "truth", (places, seed))
-    found = in_parallel(artifact, checkpoint, "references", tasks)["place"]
-    rows = [row for own in found for row in own]
-    write_csv(artifact.parent / artifact.stem / "report" / "truth.csv", rows)
-    checkpoint.remove()
+    with kept_results(artifact, scene, "truth", (places, seed)) as checkpoint:
+        found = in_parallel(artifact, checkpoint, "references", tasks)["place"]
+        rows = [row for own in found for row in own]
+        write_csv(artifact.parent / artifact.stem / "report" / "truth.csv", rows)
     return {
         name: _summary([row for row in rows if row["kind"] == name], kind.quantities)
         for name, kind in KINDS.items()

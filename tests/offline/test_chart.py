@@ -1,7 +1,5 @@
 """The speed-accuracy charts of loads and of histories, at toy size."""
 
-import gc
-
 import numpy as np
 import pytest
 
@@ -38,7 +36,6 @@ def report(artifact):
         patch.setattr(study, "write_csv", kill)
         with pytest.raises(KeyboardInterrupt):
             run(artifact)
-    gc.collect()  # as the end of its process would, it lets go of its folder
     report = run(artifact)
     # no time is measured twice alike
     assert {key: row["time_us"] for key, row in report["points"].items()} == times

@@ -1,6 +1,5 @@
 """The map of failures: the artifact never fails silently, others do, and the study resumes."""
 
-import gc
 from types import SimpleNamespace
 
 import numpy as np
@@ -64,7 +63,6 @@ def report(artifact):
         patch.setattr(outcomes, "publish", kill)
         with pytest.raises(KeyboardInterrupt):
             run(artifact)
-    gc.collect()  # as the end of its process would, it lets go of its folder
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(study, "_answers", lambda *_: pytest.fail("asked again"))
         return run(artifact)
