@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import polar
 from scipy.sparse import block_diag, csr_matrix
 from scipy.spatial import cKDTree
 
@@ -43,11 +44,12 @@ WHOLE = 0.6
 PROBES = 12
 """Footprints of a region that its window is found with."""
 
-SPACING = 2.0
-"""Distance of the footprints whose responses are the modes of the body, in radii."""
+SPACING = 2.3
+"""Distance of the footprints whose responses are the modes of the body, in radii.  On a slab of 64
+mm they miss .1 % of a linear response at 2.5 radii, .4 % at 3, where answers err by 4 % more."""
 
-MISSED = 1e-3
-"""Share of the displacements of footprints that body modes may miss."""
+STEPS = 2**14 - 1
+"""Of a mode's peak, where its load is: one bit more takes a fifth more bytes."""
 
 NOTHING = 1e-7
 """Energy of a body mode outside a window, relative to the whole, that is none."""
@@ -63,22 +65,24 @@ class BodyModes(NamedTuple):
 
 
 def body_modes(problem: FullProblem, points: Array) -> BodyModes:
-    """What loads at points (k, 3) of the surface do: far away others do much the same."""
+    """What loads at points (k, 3) of the surface do: far away others do much the same.
+
+    The orthonormal vectors nearest to these (Loewdin) are as large only where each load is, so that
+    they are stored in half the bytes of the same space's principal modes.
+    """
     model = problem.model
     units = [
         np.einsum("n,ij->nij", problem.unit_load(point)[0], np.eye(3)).reshape(-1, 3)[model.free]
         for point in points
     ]
-    vectors = np.hstack([model.solve_linear(unit) for unit in units])
-    squares, Q = np.linalg.eigh(vectors.T @ vectors)
-    kept = np.cumsum(squares) > MISSED**2 * squares.sum()
-    return stored_modes(problem, vectors @ (Q[:, kept] / np.sqrt(squares[kept])))
+    nearest, _ = polar(np.hstack([model.solve_linear(unit) for unit in units]))
+    return stored_modes(problem, nearest)
 
 
 def stored_modes(problem: FullProblem, kept: Array) -> BodyModes:
     """Modes (free dofs, G) mm of the body as they are stored."""
     model, nodes = problem.model, problem.mesh.nodes
-    steps = (np.abs(kept).max(axis=0) / np.iinfo(np.int16).max).astype(np.float32)
+    steps = (np.abs(kept).max(axis=0) / STEPS).astype(np.float32)
     values = np.zeros((len(steps), nodes.size), np.int16)
     values[:, model.free] = np.rint(kept / steps).T
     stored = (values * steps[:, None])[:, model.free].T.astype(float)
