@@ -57,7 +57,7 @@ def pressed(whole):
 
 @pytest.fixture(scope="module")
 def body(whole):
-    """Return modes as training makes them: of footprints two radii apart."""
+    """Return modes as training makes them, of footprints as far apart."""
     x, y = np.meshgrid(np.arange(1.5, 60.0, SPACING * 1.5), [1.0, 4.0, 7.0])
     return body_modes(whole, np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 6.0)]))
 
