@@ -47,7 +47,7 @@ PROBES = 12
 SPACING = 2.3
 """Distance of the footprints whose responses are the modes of the body, in radii.  Of linear
 responses of slabs, 60 and 64 mm long, they miss .13 % as they are stored, and .11 and .08 % at 2.0,
-where they take a third more bytes."""
+where they take a quarter more bytes."""
 
 NOTHING = 1e-7
 """Energy of a body mode outside a window, relative to the whole, that is none."""
