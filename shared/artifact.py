@@ -28,7 +28,7 @@ from palpate.shared.errors import PalpateError
 from palpate.shared.files import open_regular, write_whole
 
 FORMAT = "palpate-artifact"
-FORMAT_VERSION = 10
+FORMAT_VERSION = 11
 
 MOST_INFLATED = 100
 """Bytes of a dataset over those that it takes in the file."""

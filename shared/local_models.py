@@ -158,7 +158,16 @@ class LocalModels:
         NDArray[np.int16], "body_modes", "body_steps", "G, 3 n", "modes of the body", "", "compress"
     ]
     body_steps: Annotated[Field, "body_steps", "mm", "G", "value of one step of a mode"]
-    far: Annotated[Field, "basis_far", "1", "R, M, G", "body modes in regions'", "", "half"]
+    shares: Annotated[
+        NDArray[np.int16],
+        "basis_far",
+        "basis_far_steps",
+        "R, M, G",
+        "body modes in regions'",
+        "",
+        "compress",
+    ]
+    share_steps: Annotated[Field, "basis_far_steps", "1", "R, M", "value of one step of these"]
     node_from: Annotated[
         Ints, "window_from", "1", "R + 1", "first node of each window", "rising to N"
     ]
@@ -248,6 +257,11 @@ class LocalModels:
         own, row = slice(*self.node_from[region : region + 2]), 3 * self.steps.shape[1]
         basis = self.basis[row * own.start : row * own.stop]
         return self.nodes[own], basis.reshape(self.steps.shape[1], -1)
+
+    @cached_property
+    def far(self) -> Field:
+        """Body modes in those of regions (R, M, G)."""
+        return self.shares * self.share_steps[:, :, None]
 
     @cached_property
     def modes(self) -> Field:

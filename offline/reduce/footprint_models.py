@@ -230,7 +230,8 @@ def untrained(
     return LocalModels(
         body=np.zeros((0, basis.shape[1]), np.int16),
         body_steps=np.zeros(0, np.float32),
-        far=np.zeros((1, len(basis), 0), np.float32),
+        shares=np.zeros((1, len(basis), 0), np.int16),
+        share_steps=np.zeros((1, len(basis)), np.float32),
         node_from=np.array([0, len(nodes)]),
         nodes=nodes,
         basis=basis.ravel(),

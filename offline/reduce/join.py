@@ -35,13 +35,14 @@ def half(values: Array) -> Field:
 
 def bases_of(regions: Sequence[Region], body: NDArray[np.int16], steps: Field) -> dict[str, Any]:
     """Tables of the bases of regions, with modes of the body (G, 3 n) in steps (G,)."""
-    far = np.zeros((len(regions), len(regions[0].steps), len(steps)), np.float32)
-    for row, region in zip(far, regions, strict=True):
-        row[:, : region.far.shape[1]] = region.far  # none where the window is the whole body
+    shares = np.zeros((len(regions), len(regions[0].steps), len(steps)), np.int16)
+    for row, region in zip(shares, regions, strict=True):
+        row[:, : region.shares.shape[1]] = region.shares  # none where the window is the whole body
     return {
         "body": body,
         "body_steps": steps,
-        "far": far,
+        "shares": shares,
+        "share_steps": np.stack([region.share_steps for region in regions]),
         "node_from": np.cumsum([0, *(len(region.nodes) for region in regions)]),
         "nodes": np.concatenate([region.nodes for region in regions]),
         "basis": np.concatenate([region.basis.ravel() for region in regions]),

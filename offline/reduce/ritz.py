@@ -228,19 +228,26 @@ class Region:
     nodes: Numbers  # (n,) of its window, of the whole body
     basis: NDArray[np.int16]  # (M, 3 n) in steps, less what the modes of the body do there
     steps: Field  # (M,) mm
-    far: Field  # (M, G), what the modes of the body do everywhere
+    shares: NDArray[np.int16]  # (M, G) in steps, what the modes of the body do everywhere
+    share_steps: Field  # (M,)
     orthonormal: Field  # (M, M) columns, in the basis: orthonormal in energy at rest
     ritz: Field  # (k, M, 19 or more) in those, of the relaxed tissue last
 
     def truncate(self, modes: int) -> Self:
         """The leading modes; ``orthonormal`` is triangular, so its leading block stays right."""
-        basis, steps, far = self.basis[:modes], self.steps[:modes], self.far[:modes]
-        block, ritz = self.orthonormal[:modes, :modes], self.ritz[:, :modes]
-        return replace(self, basis=basis, steps=steps, far=far, orthonormal=block, ritz=ritz)
+        return replace(
+            self,
+            basis=self.basis[:modes],
+            steps=self.steps[:modes],
+            shares=self.shares[:modes],
+            share_steps=self.share_steps[:modes],
+            orthonormal=self.orthonormal[:modes, :modes],
+            ritz=self.ritz[:, :modes],
+        )
 
     def states(self, model: FullModel) -> Array:
         """Its modes (free dofs + G, M) as states of its model."""
-        far = self.far.T.astype(float)
+        far = (self.shares * self.share_steps[:, None]).T.astype(float)
         near = (self.basis[:, model.free] * self.steps[:, None]).T
         return np.vstack([near + model.body @ far, far])
 
@@ -256,15 +263,18 @@ def region(problem: FullProblem, footprints: list[Footprint], modes: int) -> Reg
     amplitude = np.sqrt(energies[: len(basis)] / len(energies))
     far = basis[:, len(model.free) :]
     near = basis[:, : len(model.free)] - far @ model.body.T
-    largest = np.abs(near).max(axis=1)
-    steps = np.clip(RESOLUTION / amplitude, largest / np.iinfo(np.int16).max, largest / 100)
+    largest, most = np.abs(near).max(axis=1), np.iinfo(np.int16).max
+    steps = np.clip(RESOLUTION / amplitude, largest / most, largest / 100)
+    # no value of a body mode is larger than 1, so that a step of it moves no node by more
+    share_steps = np.maximum(steps, np.abs(far).max(axis=1, initial=0.0) / most)
     stored = np.zeros((len(steps), 3 * len(problem.mesh.nodes)), np.int16)
     stored[:, model.free] = np.round(near / steps[:, None])
     own = Region(
         nodes=problem.nodes,
         basis=stored,
         steps=steps.astype(np.float32),
-        far=far.astype(np.float16, order="C").astype(np.float32),
+        shares=np.rint(far / share_steps[:, None]).astype(np.int16),
+        share_steps=share_steps.astype(np.float32),
         orthonormal=np.empty((0, 0), np.float32),
         ritz=np.empty((0, 0, 0), np.float32),
     )
