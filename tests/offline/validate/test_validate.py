@@ -126,9 +126,10 @@ def test_validation_over_histories_of_the_tip(touched):
 def test_the_pad_that_comes_trained_is_that_of_its_scene_and_as_right_as_it_asks(validate, kind):
     artifact, scene = TRAINED / "pad.h5", find_scene("pad")
     assert read_artifact(artifact).scene == scene.text
-    report, _ = validate(artifact, "--queries", 20, "--seed", 7, *kind)
+    report, _ = validate(artifact, "--queries", 60, "--seed", 7, *kind)
     assert report["unconverged"] == 0
-    assert report["covered"] >= 0.8  # of 20
+    # where 95 % are, one in a thousand such samples has less
+    assert report["covered"] >= 0.85
     asked = scene.tolerance.model_dump()
     for name in ("displacement", "von_mises", "force") if kind else ("displacement", "von_mises"):
         assert report[name]["p95"] < 0.5 * asked[name]  # the rest is the mesh's
