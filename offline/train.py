@@ -41,7 +41,15 @@ from palpate.offline.reduce.footprint_models import train_patch
 from palpate.offline.reduce.join import bases_of, join
 from palpate.offline.reduce.kernels import KERNELS
 from palpate.offline.reduce.layout import PATCHES, RITZ_SPACING, Layout
-from palpate.offline.reduce.load_range import SEARCHES, ask, bearable_shares, load_range, untested
+from palpate.offline.reduce.load_range import (
+    SEARCHES,
+    SHALLOWEST,
+    ask,
+    bearable_shares,
+    load_range,
+    out_of_reach,
+    untested,
+)
 from palpate.offline.reduce.ritz import region
 from palpate.offline.reduce.sampling import fewer, spacing_count, spread_points, triangle_areas
 from palpate.offline.reduce.window import (
@@ -312,6 +320,7 @@ class Pipeline:
         smooth = RBFInterpolator(points, fields, neighbors=16, kernel="linear")
         at_vertices = smooth(self.surface.vertices)
         at_vertices[:, [0, TIP_DEPTH]] = np.exp(at_vertices[:, [0, TIP_DEPTH]])
+        at_vertices[out_of_reach(self.problem), TIP_DEPTH] = SHALLOWEST
         return at_vertices
 
     def _trial(self, limits: Array, size: Size) -> Trial:

@@ -6,10 +6,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from palpate.offline.bodies.base import base_mesh
-from palpate.offline.bodies.mesh import support_edges
+from palpate.offline.bodies.mesh import stored_mesh, support_edges
 from palpate.offline.bodies.refine import refined
 from palpate.offline.fem.body_mesh import BodyMesh, LatticeMesh, NestedMesh
-from palpate.offline.fem.mesh import Ticks
+from palpate.offline.fem.mesh import Ticks, accessible_surface
 from palpate.offline.fem.problem import FullProblem
 from palpate.offline.fem.shapes import shape_of
 from palpate.shared.anatomy import FileBody
@@ -18,9 +18,6 @@ from palpate.shared.scene import Extrusion, Scene
 
 STEPS = 400
 """Of a line through the contact, along which lengths are measured."""
-
-HELD = 0.5
-"""Radii: least edges of tetrahedra where what is held ends, which is a long line."""
 
 CLOSER, GRID = 6, 24
 """Rounds in which a point's parameters are sought, and steps of the grid of each."""
@@ -34,6 +31,7 @@ class Grading(NamedTuple):
     growth: float = 0.9  # of an edge over its distance from there
     coarsest: float = 2.0
     support: float = 0.05  # at the edges of a clamped lip, on whose meshing all hangs
+    held: float = 0.5  # where what is held of a body from a file ends, which is a long line
 
 
 FIT_FOR_FOOTPRINTS = Grading(finest=0.2, even=0.8, growth=0.7, coarsest=1.2)
@@ -48,7 +46,7 @@ fields at the nodes of a scene's own mesh differ by .4 (displacement) and 8 % (v
 
 
 class Graded:
-    """The full model of a scene on a mesh fine at a contact (3,) mm of its surface.
+    """The full model of a scene on a mesh fine where its surface is next to a ``contact`` (3,) mm.
 
     At the edges of a clamped lip, or of what else is held, it is fine too: displacement goes as the
     root of the distance from there.
@@ -66,15 +64,15 @@ class Graded:
 def _graded(scene: Scene, contact: Array, how: Grading) -> BodyMesh:
     if not isinstance(scene.geometry, FileBody):
         return LatticeMesh(scene, _ticks(scene, contact, how))
-    radius = scene.endoscope.radius
-    edges, held = how._replace(support=max(how.support, HELD)), support_edges(scene)
+    radius, held = scene.endoscope.radius, cKDTree(support_edges(scene))
+    place = accessible_surface(stored_mesh(scene)).project(contact)[0]
 
     def wanted(points: Array) -> Array:
-        away = np.linalg.norm(points - contact, axis=1) / radius
-        edge = edges.finest + edges.growth * np.maximum(away - edges.even, 0.0)
-        from_held = np.asarray(cKDTree(held).query(points)[0]) / radius
-        edge = np.minimum(edge, edges.support + edges.growth * from_held)
-        return radius * np.minimum(edge, edges.coarsest)
+        away = np.linalg.norm(points - place, axis=1) / radius
+        edge = how.finest + how.growth * np.maximum(away - how.even, 0.0)
+        from_held = np.asarray(held.query(points)[0]) / radius
+        edge = np.minimum(edge, how.held + how.growth * from_held)
+        return radius * np.minimum(edge, how.coarsest)
 
     return NestedMesh(scene, refined(base_mesh(scene), wanted))
 

@@ -251,14 +251,18 @@ def local_thickness(mesh: Mesh, points: Array, normals: Array) -> Array:
 
     See ``bodies.report.thickness``.
     """
-    kind = face_kind_of(mesh.faces)
-    N, dN = kind.shape(kind.rule(4)[0])
-    X = mesh.nodes[mesh.faces]
-    opposite = np.einsum("qa,fai->fqi", N, X).reshape(-1, 3)
-    tangent = np.einsum("fai,qaj->fqij", X, dN)
-    outward = np.cross(tangent[..., 0], tangent[..., 1]).reshape(-1, 3)
-    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    opposite, outward = points_of(mesh, mesh.faces, face_kind_of(mesh.faces).rule(4)[0])
     return thickness(points, normals, opposite, outward)
+
+
+def points_of(mesh: Mesh, faces: Numbers, at: Array) -> tuple[Array, Array]:
+    """Points (k, 3) mm at coordinates (q, 2) of faces (f, n), and their outward unit normals."""
+    N, dN = face_kind_of(faces).shape(at)
+    X = mesh.nodes[faces]
+    tangents = np.einsum("fai,qaj->fqij", X, dN)
+    outward = np.cross(tangents[..., 0], tangents[..., 1]).reshape(-1, 3)
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    return np.einsum("qa,fai->fqi", N, X).reshape(-1, 3), outward
 
 
 def accessible_surface(mesh: Mesh, scene: Scene | None = None) -> Surface:

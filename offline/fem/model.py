@@ -125,18 +125,28 @@ class FullModel:
         return number[(3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1)]
 
     def _sparsity(self) -> tuple[Numbers, csr_matrix]:
-        """CSR pattern of the free dofs and the slot in it of every element matrix entry."""
-        dofs = self._dofs(self.mesh.elements)
-        rows = np.repeat(dofs, dofs.shape[1], axis=1).ravel()
-        cols = np.tile(dofs, (1, dofs.shape[1])).ravel()
+        """CSR pattern of the free dofs and the slot in it of every element matrix entry.
+
+        All dofs of a node are free or none, so that pairs of nodes are sorted, not of dofs.
+        """
+        free, axes = ~self.mesh.clamped, np.arange(3)
+        count = int(free.sum())
+        nodes = np.where(free, np.cumsum(free) - 1, -1)[self.mesh.elements].astype(np.int64)
+        rows, cols = np.broadcast_arrays(nodes[:, :, None], nodes[:, None])
         used = (rows >= 0) & (cols >= 0)
-        keys, inverse = np.unique(rows[used] * len(self.free) + cols[used], return_inverse=True)
-        slots = np.full(len(rows), -1, dtype=np.int32)
-        slots[used] = inverse
-        n = len(self.free)
-        indptr = np.searchsorted(keys // n, np.arange(n + 1)).astype(np.int32)
-        pattern = csr_matrix((np.zeros(len(keys)), (keys % n).astype(np.int32), indptr), (n, n))
-        return slots.reshape(len(dofs), dofs.shape[1], -1), pattern
+        keys, pair = np.unique(rows[used] * count + cols[used], return_inverse=True)
+        row, col = np.divmod(keys, count)
+        first = np.searchsorted(row, np.arange(count + 1))  # pair of a node
+        starts = 9 * first[:-1, None] + 3 * np.diff(first)[:, None] * axes
+        at = starts[row][:, :, None] + 3 * (np.arange(len(keys)) - first[row])[:, None, None] + axes
+        indices = np.empty(9 * len(keys), np.int32)
+        indices[at] = 3 * col[:, None, None] + axes
+        indptr = np.append(starts, indices.size).astype(np.int32)
+        slots = np.full((*used.shape, 3, 3), -1, dtype=np.int32)
+        slots[used] = at.astype(np.int32)[pair]
+        pattern = csr_matrix((np.zeros(indices.size), indices, indptr), 2 * (3 * count,))
+        size = 3 * nodes.shape[1]
+        return np.swapaxes(slots, 2, 3).reshape(len(nodes), size, size), pattern
 
     def face_slots(self, faces: Numbers) -> Numbers:
         """Slots (f, 3 k, 3 k) in the pattern of the dofs of faces (f, k); -1 is clamped."""

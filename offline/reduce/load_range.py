@@ -23,7 +23,8 @@ Under the rigid tip a free edge can lie on either side of it, and slips off to t
 slides on.  There one position has several answers, and which is the right one hangs on the way that
 the tip came: reduced and full model need not part from the same one at the same step.  The reduced
 model is asked everywhere whether its answers depend on the way, straight in or aslant, and depths
-are lowered likewise; and last, that it has an answer at many random positions.
+are lowered likewise; and last, that it has an answer at many random positions.  Where the tip
+would touch what cannot be touched first, as in a cleft, the range of its depths is next to nothing.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -35,7 +36,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from palpate.offline.fem.mesh import local_thickness
+from palpate.offline.fem.mesh import local_thickness, points_of
 from palpate.offline.fem.model import FullModel, NoEquilibrium
 from palpate.offline.fem.potential import Potential, Projected
 from palpate.offline.fem.problem import FullProblem, Load
@@ -55,6 +56,7 @@ from palpate.offline.validate.queries import Place
 from palpate.shared.answer import Answer
 from palpate.shared.arrays import Array, Flags, Numbers
 from palpate.shared.errors import QueryError
+from palpate.shared.geometry.elements import face_kind_of
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.local_models import Estimators, LocalModels, Mesh
 from palpate.shared.mechanics import newton
@@ -89,6 +91,9 @@ DEEPEST = 0.8
 
 SHALLOWEST = 0.02
 """Millimetres that the range of depths has at least."""
+
+CELLS = 8
+"""Of a face along each axis, at whose corners it is looked at what the tip touches besides."""
 
 SHARES = np.linspace(0.6, 1.1, 11)
 """Of the limit at which each path is solved."""
@@ -274,6 +279,23 @@ def _tip_depth(problem: FullProblem, position: Array, force: float) -> float:
     beta, relief, *_ = problem.tip_at(position, position, position)[0].law
     loss = problem.body.tip.lost * sum(share for share, _ in problem.model.prony)
     return approach(beta, relief, force / (1.0 - loss))
+
+
+def out_of_reach(problem: FullProblem) -> Flags:
+    """Vertices (v,) of the surface that a tip does not reach for what cannot be touched."""
+    mesh, surface, radius = problem.mesh, problem.surface, problem.scene.endoscope.radius
+    faces = mesh.faces[~mesh.accessible]
+    kind = face_kind_of(faces)
+    points, outward = points_of(mesh, faces, kind.cells(*[CELLS] * kind.axes)[0])
+    centres = surface.vertices + radius * surface.normals
+    pairs = cKDTree(centres).sparse_distance_matrix(
+        cKDTree(points), radius - SHALLOWEST, output_type="ndarray"
+    )
+    one, two = pairs["i"], pairs["j"]
+    ahead = np.sum((centres[one] - points[two]) * outward[two], axis=1) > 0.0
+    found = np.zeros(len(centres), dtype=bool)
+    found[one[ahead]] = True
+    return found
 
 
 class Search(NamedTuple):

@@ -10,12 +10,14 @@ import pytest
 
 from palpate.offline.fem.model import NoEquilibrium
 from palpate.offline.fem.problem import FullProblem, Load
+from palpate.offline.fem.sphere import FORCE
 from palpate.offline.reduce.load_range import (
     FAR,
     FIRM,
     FOLDING,
     GIVING_WAY,
     MARGIN,
+    SHALLOWEST,
     SLIPPING_OFF,
     TILTS,
     UNANSWERED,
@@ -26,9 +28,11 @@ from palpate.offline.reduce.load_range import (
     limit_load_share,
     load_range,
     moving_part,
+    out_of_reach,
     path_independent_share,
     pressure_that_moves,
 )
+from palpate.offline.scenes import find_scene
 from palpate.shared.errors import QueryError
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH
@@ -327,3 +331,18 @@ def test_a_way_without_an_answer_tells_nothing():
     edge = Edge(slip=0.5)
     edge.blind = True
     assert path_independent_share(edge, np.array([EDGE + 0.1, 5.0, 0.0])) == 1.0
+
+
+def test_a_tip_does_not_reach_the_end_of_a_cleft():
+    """There a sphere that just touches the surface is far in what cannot be touched."""
+    problem = FullProblem(find_scene("turbinate-mri"))
+    surface, radius = problem.surface, problem.scene.endoscope.radius
+    found = out_of_reach(problem)
+    assert 0.01 < found.mean() < 0.04
+    assert surface.rim_distance()[found].max() < radius
+    at_rest = np.zeros_like(problem.mesh.nodes)
+    centres = surface.vertices + radius * surface.normals
+    deep = np.array([problem.contact.touch(x, at_rest, FORCE)[2] for x in centres])
+    assert (deep[found] > SHALLOWEST / 2).mean() > 0.95
+    assert (deep[~found] < 0.1).mean() > 0.99
+    assert not out_of_reach(FullProblem(find_scene("quick"))).any()

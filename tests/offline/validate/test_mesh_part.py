@@ -81,6 +81,21 @@ def test_elements_are_small_at_the_contact_and_grow_away_from_it():
     assert edges[away > 8.0].min() > 2 * edges[np.argmin(away)]
 
 
+def test_under_a_tip_whose_centre_is_outside_they_are_as_small_on_a_body_from_a_file():
+    scene = find_scene("turbinate-mri")
+    place, normal, _ = FullProblem(scene).surface.project(np.array([16.0, 14.5, 10.0]))
+    radius = scene.endoscope.radius
+    at_surface, at_centre = (
+        Graded(scene, x, mesh_part.TIP_GRADING).problem.mesh
+        for x in (place, place + radius * normal)
+    )
+    corners = at_centre.nodes[at_centre.elements[:, :4]]
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    away = np.linalg.norm(corners.mean(axis=1) - place, axis=1)
+    assert edges[np.argmin(away)] < 0.2 * radius
+    assert at_centre.nodes.size == pytest.approx(at_surface.nodes.size, rel=0.02)
+
+
 def test_errors_fall_with_the_mesh_and_a_finer_reference_says_the_same():
     levels = [(share, Load(PLACE, DOWN, 1.5 * share), None) for share in (0.3, 1.0)]
     coarse, fine = (
