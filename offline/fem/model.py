@@ -129,9 +129,8 @@ class FullModel:
 
         All dofs of a node are free or none, so that pairs of nodes are sorted, not of dofs.
         """
-        free, axes = ~self.mesh.clamped, np.arange(3)
-        count = int(free.sum())
-        nodes = np.where(free, np.cumsum(free) - 1, -1)[self.mesh.elements].astype(np.int64)
+        count, axes = len(self.free) // 3, np.arange(3)
+        nodes = self._dofs(self.mesh.elements)[:, ::3] // 3
         rows, cols = np.broadcast_arrays(nodes[:, :, None], nodes[:, None])
         used = (rows >= 0) & (cols >= 0)
         keys, pair = np.unique(rows[used] * count + cols[used], return_inverse=True)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from palpate.offline.bodies.tetrahedra import edge_lengths
 from palpate.offline.fem.body_mesh import own_mesh
 from palpate.offline.fem.graded import Graded, Grading
 from palpate.offline.fem.mesh import ticks_of
@@ -90,7 +91,7 @@ def test_under_a_tip_whose_centre_is_outside_they_are_as_small_on_a_body_from_a_
         for x in (place, place + radius * normal)
     )
     corners = at_centre.nodes[at_centre.elements[:, :4]]
-    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    edges = edge_lengths(at_centre.nodes, at_centre.elements[:, :4]).max(axis=1)
     away = np.linalg.norm(corners.mean(axis=1) - place, axis=1)
     assert edges[np.argmin(away)] < 0.2 * radius
     assert at_centre.nodes.size == pytest.approx(at_surface.nodes.size, rel=0.02)
