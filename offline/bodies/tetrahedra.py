@@ -76,6 +76,13 @@ def volume(nodes: Array, elements: Numbers) -> float:
     return float(np.sum(found @ weights))
 
 
+def half_thickness(nodes: Array, elements: Numbers) -> float:
+    """That (mm) of a plate of the volume and the surface of straight tetrahedra."""
+    a, b, c = np.moveaxis(nodes[boundary(elements)[0][:, :3]], 1, 0)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0
+    return float(volumes(nodes[elements[:, :4]]).sum() / area)
+
+
 def raised(points: Array, corners: Numbers) -> tuple[Array, Numbers]:
     """Nodes (n, 3) and elements (e, 10) with straight edges of tetrahedra (e, 4)."""
     ends = np.sort(corners[:, EDGES], axis=2).reshape(-1, 2)

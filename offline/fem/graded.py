@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 from palpate.offline.bodies.base import base_mesh
 from palpate.offline.bodies.mesh import stored_mesh, support_edges
 from palpate.offline.bodies.refine import refined
+from palpate.offline.bodies.tetrahedra import half_thickness
 from palpate.offline.fem.body_mesh import BodyMesh, LatticeMesh, NestedMesh
 from palpate.offline.fem.mesh import Ticks, accessible_surface
 from palpate.offline.fem.problem import FullProblem
@@ -29,7 +30,7 @@ class Grading(NamedTuple):
     finest: float = 0.1  # at the contact
     even: float = 0.3  # distance from the contact up to which they stay so
     growth: float = 0.9  # of an edge over its distance from there
-    coarsest: float = 2.0
+    coarsest: float = 2.0  # of a body from a file at least half of how thick it is
     support: float = 0.05  # at the edges of a clamped lip, on whose meshing all hangs
     held: float = 0.5  # where what is held of a body from a file ends, which is a long line
 
@@ -48,8 +49,10 @@ fields at the nodes of a scene's own mesh differ by .4 (displacement) and 8 % (v
 class Graded:
     """The full model of a scene on a mesh fine where its surface is next to a ``contact`` (3,) mm.
 
-    At the edges of a clamped lip, or of what else is held, it is fine too: displacement goes as the
-    root of the distance from there.
+    In a body many radii thick edges grow with the distance from there alone: on ``liver`` (159 000
+    degrees of freedom, 28 radii long) displacement differs by .1 % and von Mises stress by 2 to 4 %
+    from those of edges of 1.4 radii at most (364 000).  At the edges of a clamped lip, or of what
+    else is held, it is fine too: displacement goes as the root of the distance from there.
     """
 
     def __init__(self, scene: Scene, contact: Array, how: Grading) -> None:
@@ -64,7 +67,8 @@ class Graded:
 def _graded(scene: Scene, contact: Array, how: Grading) -> BodyMesh:
     if not isinstance(scene.geometry, FileBody):
         return LatticeMesh(scene, _ticks(scene, contact, how))
-    radius, held = scene.endoscope.radius, cKDTree(support_edges(scene))
+    base, radius, held = base_mesh(scene), scene.endoscope.radius, cKDTree(support_edges(scene))
+    coarsest = max(how.coarsest, half_thickness(base.nodes, base.elements) / radius)
     place = accessible_surface(stored_mesh(scene)).project(contact)[0]
 
     def wanted(points: Array) -> Array:
@@ -72,9 +76,9 @@ def _graded(scene: Scene, contact: Array, how: Grading) -> BodyMesh:
         edge = how.finest + how.growth * np.maximum(away - how.even, 0.0)
         from_held = np.asarray(held.query(points)[0]) / radius
         edge = np.minimum(edge, how.held + how.growth * from_held)
-        return radius * np.minimum(edge, how.coarsest)
+        return radius * np.minimum(edge, coarsest)
 
-    return NestedMesh(scene, refined(base_mesh(scene), wanted))
+    return NestedMesh(scene, refined(base, wanted))
 
 
 def _ticks(scene: Scene, contact: Array, how: Grading) -> Ticks:

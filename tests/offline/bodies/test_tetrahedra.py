@@ -8,6 +8,7 @@ from palpate.offline.bodies.tetrahedra import (
     boundary,
     determinants,
     dihedral_angles,
+    half_thickness,
     lattice,
     least_determinants,
     quality,
@@ -48,6 +49,11 @@ def test_determinants_are_nowhere_less_than_their_bound(by):
         bound = least_determinants(nodes, elements)
         assert (bound <= found.min(axis=1) + 1e-12).all()
         assert (bound >= found.min(axis=1) - 20 * by - 1e-12).all()
+
+
+def test_half_the_thickness_is_a_third_of_the_radius_of_the_ball_inside_a_regular_one():
+    found = half_thickness(*raised(REGULAR, np.array([[0, 1, 2, 3]])))
+    assert found == pytest.approx(np.sqrt(2) / np.sqrt(24) / 3)
 
 
 def test_volumes_are_those_of_the_curved_elements():

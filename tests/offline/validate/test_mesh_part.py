@@ -97,6 +97,16 @@ def test_under_a_tip_whose_centre_is_outside_they_are_as_small_on_a_body_from_a_
     assert at_centre.nodes.size == pytest.approx(at_surface.nodes.size, rel=0.02)
 
 
+@pytest.mark.parametrize(("name", "thick"), [("liver", True), ("turbinate-mri", False)])
+def test_far_from_the_contact_edges_are_longer_in_a_body_many_radii_thick(name, thick):
+    scene = find_scene(name)
+    place = FullProblem(scene).surface.vertices[0]
+    how = Grading(finest=1.0, even=0.5, coarsest=1.4, held=2.0)
+    mesh = Graded(scene, place, how).problem.mesh
+    edges = edge_lengths(mesh.nodes, mesh.elements[:, :4]).max() / scene.endoscope.radius
+    assert (edges > how.coarsest) == thick
+
+
 def test_errors_fall_with_the_mesh_and_a_finer_reference_says_the_same():
     levels = [(share, Load(PLACE, DOWN, 1.5 * share), None) for share in (0.3, 1.0)]
     coarse, fine = (
