@@ -3,13 +3,13 @@
     python -m tests.offline.bodies.shapes FOLDER --count 10
 
 Blobs, bent plates and thick tubes in turn, of which the lower side is held and the upper one can be
-touched. A shape that training refuses is told with its sentence. Results are written to
-``shapes.csv`` in the folder; artifacts that are there already are not made again.
+touched. A shape that training refuses is told with its sentence, as is what it says of the mesh.
+Results are written to ``shapes.csv`` in the folder; artifacts that are there already are not made
+again.
 """
 
 import json
 import subprocess
-import time
 from pathlib import Path
 
 import click
@@ -35,6 +35,7 @@ geometry.file = "body.stl"
 """
 COLUMNS = (
     "shape", "refused", "seconds", "displacement_p95", "von_mises_p95", "covered", "unconverged",
+    "mesh_displacement_p95", "mesh_von_mises_p95", "told",
 )  # fmt: skip
 
 
@@ -88,22 +89,28 @@ def palpate(*words):
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
+def told(*words):
+    """What a command of palpate tells of an artifact."""
+    return json.loads(palpate(*words, "--json").stdout)
+
+
 def study(file, queries):
     """Train and validate one shape: a row of the table."""
     artifact, row = file.with_suffix(".h5"), dict.fromkeys(COLUMNS, "") | {"shape": file.stem}
-    begun = time.perf_counter()
     if not artifact.exists():
         trained = palpate("train", file, "--out", artifact)
         file.with_suffix(".log").write_text(trained.stderr)
         if not artifact.exists():
             *_, said = trained.stderr.strip().splitlines()
             return row | {"refused": said}
-        row["seconds"] = round(time.perf_counter() - begun)
-    told = palpate("validate", artifact, "--queries", queries, "--seed", 1, "--json")
-    found = json.loads(told.stdout)
-    keys = "displacement", "von_mises"
-    row |= {f"{key}_p95": found[key]["p95"] for key in keys}
-    return row | {key: found[key] for key in ("covered", "unconverged")}
+    found = told("validate", artifact, "--queries", queries, "--seed", 1)
+    info = told("info", artifact)
+    mesh, row["seconds"] = info["training"]["mesh_errors"], info["provenance"]["wall_seconds"]
+    for key in ("displacement", "von_mises"):
+        row |= {f"{key}_p95": found[key]["p95"], f"mesh_{key}_p95": mesh[key]["p95"]}
+    log = file.with_suffix(".log").read_text()
+    (chosen,) = (line for line in log.splitlines() if line.startswith("mesh: "))
+    return row | {key: found[key] for key in ("covered", "unconverged")} | {"told": chosen}
 
 
 @click.command()

@@ -35,7 +35,7 @@ def finish(started):
 
 
 def kills(folder, scene, count, rng):
-    """Train with a worker killed after some share of the time that it takes without one."""
+    """Train with a worker killed while it is under way, at moments of the time without."""
     alone, there, rows = folder / "alone.h5", folder / "there.h5", []
     for _ in range(2):  # the first compiles kernels
         finish(training(scene, alone, "--workers", "1"))
@@ -43,15 +43,18 @@ def kills(folder, scene, count, rng):
         begun = time.perf_counter()
         finish(training(scene, there, "--scheduler", running.file))
         whole = time.perf_counter() - begun
-        for share in rng.uniform(size=count):
-            begun = time.perf_counter()
+        while len(rows) < count:
+            after, begun = float(rng.uniform(high=whole)), time.perf_counter()
             started = training(scene, there, "--scheduler", running.file)
-            time.sleep(share * whole)
+            time.sleep(after)
+            under_way = started.poll() is None
             kill_a_worker(running)
             finish(started)
             seconds = time.perf_counter() - begun
             assert_same(there, alone)
-            taken = {"killed_after": share * whole, "seconds": seconds, "without": whole}
+            if not under_way:
+                continue
+            taken = {"killed_after": after, "seconds": seconds, "without": whole}
             rows.append({name: round(value, 1) for name, value in taken.items()})
             write_csv(folder / "kills.csv", rows)
             click.echo(rows[-1])
