@@ -262,6 +262,7 @@ class FullModel:
         keep: bool = False,
         tolerance: float = TOLERANCE,
         max_iterations: int = MAX_ITERATIONS,
+        largest_shift: float = newton.LARGEST_SHIFT,
     ) -> Equilibrium:
         """Equilibrium under a load, in one jump if that converges, else in load steps.
 
@@ -284,6 +285,8 @@ class FullModel:
             See ``TOLERANCE``.
         max_iterations : int
             Of each load step, beyond which it has failed.
+        largest_shift : float
+            Of its tangents, in multiples of the rest stiffness, beyond which it has failed.
 
         Raises
         ------
@@ -313,7 +316,7 @@ class FullModel:
                 potential.keep(u)
             status, made, energy, smallest = newton.newton(
                 potential, u, np.empty((4, len(u))), target, KEEP_TANGENT, max_iterations, keep,
-                noise=noise,
+                noise=noise, largest_shift=largest_shift,
             )  # fmt: skip
             iterations, load_steps = iterations + made, load_steps + 1
             if status == newton.CONVERGED:

@@ -42,6 +42,16 @@ from palpate.shared.scene import Extrusion, Scene, parse_scene
 Tasks = Mapping[str, tuple[Any, ...]]
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
+MEMORY = ":".join(
+    f"glibc.malloc.{name}"
+    for name in ("mmap_threshold=4294967296", "trim_threshold=4294967296", "hugetlb=1")
+)
+"""``GLIBC_TUNABLES`` with which processes use memory again that they have freed, in large pages.
+
+As they are they give large arrays back to the system, which clears the pages of the next ones: a
+local model of ``turbinate-mri`` takes 2.9 instead of 4.3 seconds."""
+
 CODE = ("offline", "shared")
 LIBRARIES = ("numpy", "scipy", "numba", "mkl")
 """What answers depend on to the last bit, beside ``CODE``."""
@@ -164,7 +174,7 @@ def worker_pool(
     A worker is one thread: its parallelism is that of the tasks.  An interrupt from the keyboard is
     left to this process, which stops the workers when they have done their tasks.
     """
-    os.environ.update(dict.fromkeys(THREADS, "1"))
+    os.environ.update(dict.fromkeys(THREADS, "1"), GLIBC_TUNABLES=MEMORY)
     count = count or os.cpu_count() or 1
     pool = ProcessPoolExecutor(
         count,

@@ -23,7 +23,10 @@ SMALLEST_STEP = 1e-6
 SMALLEST_SHIFT, LARGEST_SHIFT = 0.01, 1e4
 
 
-def newton(system, u, work, target, reuse, max_iterations, factorised, round_off=1e-9, noise=0.0):
+def newton(
+    system, u, work, target, reuse, max_iterations, factorised, round_off=1e-9, noise=0.0,
+    largest_shift=LARGEST_SHIFT,
+):  # fmt: skip
     """Find the equilibrium of ``system`` near ``u``, in place.
 
     Parameters
@@ -47,12 +50,15 @@ def newton(system, u, work, target, reuse, max_iterations, factorised, round_off
         difference of large numbers.
     noise : float
         Absolute error of the energy, which does not vanish with the load.
+    largest_shift : float
+        Of the tangent, beyond which the search has failed; 0 ends it at the first tangent that is
+        not positive definite.
 
     Returns
     -------
     status : int
-        ``CONVERGED``, ``STALLED`` (no descent found, or ``u`` inverts an element on entry) or
-        ``EXHAUSTED`` (iterations used up).
+        ``CONVERGED``, ``STALLED`` (no descent found, no tangent positive definite, or ``u`` inverts
+        an element on entry) or ``EXHAUSTED`` (iterations used up).
     iterations : int
         Corrections made.
     energy : float
@@ -74,7 +80,7 @@ def newton(system, u, work, target, reuse, max_iterations, factorised, round_off
             shift = 0.25 * shift if shift > SMALLEST_SHIFT else 0.0
             while not system.factorise(u, shift):
                 shift = max(SMALLEST_SHIFT, 4.0 * shift)
-                if shift > LARGEST_SHIFT:
+                if shift > largest_shift:
                     return STALLED, iterations, energy, smallest
         system.correct(residual, step)
         slope = np.dot(residual, step)

@@ -1,14 +1,18 @@
 """Results on disk: whole ones only, of one process at a time."""
 
+import os
+import platform
+import resource
 import signal
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 
+import numpy as np
 import pytest
 
-from palpate.offline.run.workers import Checkpoint, content_key, read_result
+from palpate.offline.run.workers import Checkpoint, content_key, read_result, worker_pool
 from palpate.offline.scenes import find_scene
 from palpate.shared.errors import PalpateError
 from palpate.shared.scene import SceneError, load_scene
@@ -114,6 +118,21 @@ def test_no_worker_hears_the_keyboard(tmp_path):
         [sys.executable, tmp_path / "handlers.py"], capture_output=True, text=True, check=True
     )
     assert run.stdout.split() == ["3", str(signal.SIG_IGN)]
+
+
+def faults(count):
+    """Pages that the system gave, at no cost of a disk, for as many arrays of 64 MB in turn."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(count):
+        np.ones(8_000_000)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="others know no such setting")
+def test_workers_use_memory_again():
+    with worker_pool(os.getpid, count=1) as pool:
+        pool.submit(faults, 2).result()
+        assert pool.submit(faults, 20).result() < 100
 
 
 def test_a_section_that_cannot_be_read_is_told(tmp_path):

@@ -31,11 +31,11 @@ class System:
         step[:] = -residual / self.diagonal
 
 
-def solve(system, start, target=1e-12, reuse=0.0, max_iterations=50, factorised=False):
+def solve(system, start, target=1e-12, reuse=0.0, max_iterations=50, factorised=False, **options):
     u = np.array(start, dtype=float)
     work = np.empty((4, len(u)))
     status, iterations, _, smallest = newton(
-        system, u, work, target, reuse, max_iterations, factorised
+        system, u, work, target, reuse, max_iterations, factorised, **options
     )
     return u, status, iterations, float(np.linalg.norm(work[0])), smallest
 
@@ -119,6 +119,7 @@ def test_an_indefinite_start_is_shifted_downhill():
     assert u[0] == pytest.approx(1.005, abs=1e-3)
     assert max(system.shifts) > 1.0
     assert system.shifts[-1] == 0.0
+    assert solve(system, [0.0], largest_shift=0.5)[1:3] == (STALLED, 0)
 
 
 def test_shifts_go_on_from_the_last():
