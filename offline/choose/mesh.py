@@ -16,7 +16,7 @@ import numpy as np
 from tqdm import tqdm
 
 from palpate.offline.bodies.regions import RegionsTooSmall
-from palpate.offline.fem.body_mesh import own_mesh
+from palpate.offline.fem.body_mesh import BodyMesh, own_mesh
 from palpate.offline.fem.graded import Graded
 from palpate.offline.fem.mesh import Inverted, build_mesh, in_order
 from palpate.offline.fem.norms import relative
@@ -62,7 +62,7 @@ class Reference(NamedTuple):
     """What a mesh graded towards a place says there."""
 
     place: Array  # (3,) mm
-    mesh: Graded
+    mesh: BodyMesh  # without the full model, whose factorisations take gigabytes in large bodies
     response: Response
 
 
@@ -149,7 +149,7 @@ def _references(scene: Scene, problem: FullProblem) -> list[Reference]:
     found = []
     for x in tqdm(places, "fine meshes to choose by"):
         fine = Graded(scene, x, REFERENCE)
-        found.append(Reference(x, fine, _pressed(fine.problem, x)))
+        found.append(Reference(x, fine.mesh, _pressed(fine.problem, x)))
     return found
 
 

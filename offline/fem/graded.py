@@ -56,12 +56,12 @@ class Graded:
     """
 
     def __init__(self, scene: Scene, contact: Array, how: Grading) -> None:
-        self._mesh = own = _graded(scene, contact, how)
+        self.mesh = own = _graded(scene, contact, how)
         self.problem, self.sites = FullProblem(scene, own.mesh, own.surface), own.sites
 
     def at(self, sites: Array, field: Array) -> Array:
         """A nodal field (n, ...) of this mesh at sites (k, ...) of another, see ``BodyMesh``."""
-        return self._mesh.at(sites, field)
+        return self.mesh.at(sites, field)
 
 
 def _graded(scene: Scene, contact: Array, how: Grading) -> BodyMesh:

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from palpate.offline.fem.problem import FullProblem
-from palpate.offline.run.workers import Checkpoint, OnScene, content_key, run, versions
+from palpate.offline.run.workers import MEMORY, Checkpoint, OnScene, content_key, run, versions
 from palpate.offline.scenes import find_scene
 from palpate.offline.train import train
 from palpate.shared.artifact import read_artifact
@@ -69,6 +69,7 @@ def processes(folder, path=(), workers=2):
         "PYTHONPATH": os.pathsep.join(filter(None, found)),
         # each death of a worker gives its tasks up
         "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0",
+        "GLIBC_TUNABLES": MEMORY,
     }
     file = folder / "scheduler.json"
     options = ["--no-dashboard", "--scheduler-file", str(file)]
