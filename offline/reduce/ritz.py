@@ -38,6 +38,10 @@ SECOND_STEP, THIRD_STEP = 0.01, 0.03
 FILL = 1e-13
 """Energy of what fills up modes, relative to that of the vectors: just above round-off."""
 
+SOFT = 2
+"""Directions of a region that every local model has: those that move the body most for their
+energy, as a body swings that hangs from a lip.  Least energy of what is missed lets them go."""
+
 TANGENTIAL = 0.6
 """Weight of tangential against normal load in the Ritz vectors: about sin 30 degrees and some."""
 
@@ -199,10 +203,11 @@ def whole_numbers(modes: Array, orthonormal: Field) -> tuple[NDArray[np.int16], 
     return whole, np.linalg.inv(R).astype(np.float32)
 
 
-def local_modes(coefficients: Array, size: int) -> Array:
+def local_modes(coefficients: Array, soft: Field, size: int) -> Array:
     """Leading directions (M, size) of vectors given by coefficients (M, k) in an orthonormal basis.
 
-    Where the vectors run out, the leading modes of the basis fill up.
+    Directions ``soft`` (M, s) lead them.  Where the vectors run out, the leading modes of the basis
+    fill up.
 
     Raises
     ------
@@ -216,7 +221,9 @@ def local_modes(coefficients: Array, size: int) -> Array:
         )
     gram = coefficients @ coefficients.T
     filled = np.arange(size)
-    gram[filled, filled] += FILL * np.trace(gram)
+    most = np.trace(gram)
+    gram += most * (soft @ soft.T)
+    gram[filled, filled] += FILL * most
     Q = np.linalg.eigh(gram)[1]
     return np.ascontiguousarray(Q[:, : -size - 1 : -1])
 
@@ -231,6 +238,7 @@ class Region:
     shares: NDArray[np.int16]  # (M, G) in steps, what the modes of the body do everywhere
     share_steps: Field  # (M,)
     orthonormal: Field  # (M, M) columns, in the basis: orthonormal in energy at rest
+    soft: Field  # (M, SOFT) in those, which move the body most for their energy
     ritz: Field  # (k, M, 19 or more) in those, of the relaxed tissue last
 
     def truncate(self, modes: int) -> Self:
@@ -242,6 +250,7 @@ class Region:
             shares=self.shares[:modes],
             share_steps=self.share_steps[:modes],
             orthonormal=self.orthonormal[:modes, :modes],
+            soft=self.soft[:modes],
             ritz=self.ritz[:, :modes],
         )
 
@@ -276,6 +285,7 @@ def region(problem: FullProblem, footprints: list[Footprint], modes: int) -> Reg
         shares=np.rint(far / share_steps[:, None]).astype(np.int16),
         share_steps=share_steps.astype(np.float32),
         orthonormal=np.empty((0, 0), np.float32),
+        soft=np.empty((0, 0), np.float32),
         ritz=np.empty((0, 0, 0), np.float32),
     )
     # rounding costs the modes their orthonormality: give it back by a change of coordinates
@@ -283,9 +293,13 @@ def region(problem: FullProblem, footprints: list[Footprint], modes: int) -> Reg
     L = np.linalg.cholesky(rounded.T @ (model.rest_stiffness @ rounded))
     ritz = np.linalg.solve(L, rounded.T @ forces.reshape(-1, len(rounded)).T)
     ritz = ritz.reshape(len(steps), len(footprints), -1)
+    orthonormal, moved = np.linalg.inv(L).T, rounded[: len(model.free)]
+    volumes = np.repeat(problem.nodal_volumes, 3)[model.free]
+    gram = orthonormal.T @ (moved.T @ (volumes[:, None] * moved)) @ orthonormal
     return replace(
         own,
-        orthonormal=np.linalg.inv(L).T.astype(np.float32),
+        orthonormal=orthonormal.astype(np.float32),
+        soft=np.linalg.eigh(gram)[1][:, : -SOFT - 1 : -1].astype(np.float32),
         ritz=np.moveaxis(ritz, 1, 0).astype(np.float32),
     )
 

@@ -5,10 +5,12 @@ import pytest
 
 from palpate.offline.reduce.ritz import (
     RITZ_VECTORS,
+    SOFT,
     Footprint,
     energy_pod,
     local_modes,
     path_derivatives,
+    region,
     ritz_vectors,
     whole_numbers,
 )
@@ -77,7 +79,21 @@ def test_vectors_with_no_more_to_give_make_fewer_modes(problem, pressed):
 
 def test_more_modes_than_a_region_has_are_refused():
     with pytest.raises(SceneError, match=r"training\.size\.modes: at most 4 here.*not 5"):
-        local_modes(np.eye(4), 5)
+        local_modes(np.eye(4), np.zeros((4, 0)), 5)
+
+
+def test_soft_directions_lead_the_modes_of_a_region(problem, pressed):
+    found = region(problem, [pressed[1]], 12)
+    states = found.states(problem.model) @ found.orthonormal
+    volumes = np.repeat(problem.nodal_volumes, 3)[problem.model.free]
+    moved = np.linalg.eigvalsh(states.T @ (volumes[:, None] * states))
+    own = states @ found.soft
+    np.testing.assert_allclose(
+        own.T @ (volumes[:, None] * own), np.diag(moved[: -SOFT - 1 : -1]), rtol=1e-3, atol=1e-6
+    )
+    modes = local_modes(np.eye(12)[:, 6:], found.soft, 8)
+    missed = found.soft - modes @ (modes.T @ found.soft)
+    assert np.abs(missed).max() < 1e-6
 
 
 def test_modes_in_whole_numbers_stay_orthonormal(rng):
