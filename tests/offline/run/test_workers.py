@@ -1,18 +1,15 @@
 """Results on disk: whole ones only, of one process at a time."""
 
-import os
 import platform
-import resource
 import signal
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 
-import numpy as np
 import pytest
 
-from palpate.offline.run.workers import Checkpoint, content_key, read_result, worker_pool
+from palpate.offline.run.workers import Checkpoint, content_key, read_result
 from palpate.offline.scenes import find_scene
 from palpate.shared.errors import PalpateError
 from palpate.shared.scene import SceneError, load_scene
@@ -120,19 +117,31 @@ def test_no_worker_hears_the_keyboard(tmp_path):
     assert run.stdout.split() == ["3", str(signal.SIG_IGN)]
 
 
+FAULTS = """
+import os, resource
+import numpy as np
+from palpate.offline.run.workers import worker_pool
+
 def faults(count):
-    """Pages that the system gave, at no cost of a disk, for as many arrays of 64 MB in turn."""
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
     for _ in range(count):
         np.ones(8_000_000)
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
+if __name__ == "__main__":
+    with worker_pool(os.getpid, count=1) as pool:
+        print([pool.submit(faults, count).result() for count in (2, 20)][1])
+"""
+
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="others know no such setting")
-def test_workers_use_memory_again():
-    with worker_pool(os.getpid, count=1) as pool:
-        pool.submit(faults, 2).result()
-        assert pool.submit(faults, 20).result() < 100
+def test_workers_use_memory_again(tmp_path):
+    """Pages that the system had to give and clear for 20 arrays of 64 MB in turn, after two."""
+    (tmp_path / "faults.py").write_text(FAULTS)
+    run = subprocess.run(
+        [sys.executable, tmp_path / "faults.py"], capture_output=True, text=True, check=True
+    )
+    assert int(run.stdout) < 100
 
 
 def test_a_section_that_cannot_be_read_is_told(tmp_path):
