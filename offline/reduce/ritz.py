@@ -23,6 +23,7 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.linalg import LinearOperator, eigsh
 
 from palpate.offline.fem.model import FullModel
 from palpate.offline.fem.problem import FullProblem
@@ -42,6 +43,9 @@ SOFT = 2
 """Directions of a region that every local model has: those that move the body most for their
 energy, as a body swings that hangs from a lip.  Least energy of what is missed lets them go: what
 72 modes miss of displacement on ``turbinate-mri`` falls from 1.2 to .7 % (95th percentile)."""
+
+LEAD = 100.0
+"""Energy of each beside that of all vectors together, so that they lead the basis of a region."""
 
 TANGENTIAL = 0.6
 """Weight of tangential against normal load in the Ritz vectors: about sin 30 degrees and some."""
@@ -204,11 +208,11 @@ def whole_numbers(modes: Array, orthonormal: Field) -> tuple[NDArray[np.int16], 
     return whole, np.linalg.inv(R).astype(np.float32)
 
 
-def local_modes(coefficients: Array, soft: Field, size: int) -> Array:
+def local_modes(coefficients: Array, size: int) -> Array:
     """Leading directions (M, size) of vectors given by coefficients (M, k) in an orthonormal basis.
 
-    Directions ``soft`` (M, s) lead them.  Where the vectors run out, the leading modes of the basis
-    fill up.
+    The softest modes, which lead the basis, are among them.  Where the vectors run out, its next
+    modes fill up.
 
     Raises
     ------
@@ -221,10 +225,9 @@ def local_modes(coefficients: Array, soft: Field, size: int) -> Array:
             f"vectors of a region have to give, not {size}"
         )
     gram = coefficients @ coefficients.T
-    filled = np.arange(size)
-    most = np.trace(gram)
-    gram += most * (soft @ soft.T)
+    filled, most = np.arange(size), np.trace(gram)
     gram[filled, filled] += FILL * most
+    gram[filled[:SOFT], filled[:SOFT]] += most
     Q = np.linalg.eigh(gram)[1]
     return np.ascontiguousarray(Q[:, : -size - 1 : -1])
 
@@ -238,8 +241,7 @@ class Region:
     steps: Field  # (M,) mm
     shares: NDArray[np.int16]  # (M, G) in steps, what the modes of the body do everywhere
     share_steps: Field  # (M,)
-    orthonormal: Field  # (M, M) columns, in the basis: orthonormal in energy at rest
-    soft: Field  # (M, SOFT) in those, which move the body most for their energy
+    orthonormal: Field  # (M, M) columns, in the basis: orthonormal in energy, the softest first
     ritz: Field  # (k, M, 19 or more) in those, of the relaxed tissue last
 
     def truncate(self, modes: int) -> Self:
@@ -251,7 +253,6 @@ class Region:
             shares=self.shares[:modes],
             share_steps=self.share_steps[:modes],
             orthonormal=self.orthonormal[:modes, :modes],
-            soft=self.soft[:modes],
             ritz=self.ritz[:, :modes],
         )
 
@@ -269,7 +270,10 @@ def region(problem: FullProblem, footprints: list[Footprint], modes: int) -> Reg
     linear = np.arange(vectors.shape[1]) % RITZ_VECTORS < 3
     learnt = np.tile(linear, (len(footprints), 1))
     learnt[:: -(-len(footprints) // POINTS_IN_BASIS)] = True
-    basis, energies = _leading(vectors[learnt], forces[learnt], modes)
+    soft = _softest(problem, LEAD * np.sum(vectors[learnt] * forces[learnt]))
+    basis, energies = _leading(
+        np.vstack([soft[0], vectors[learnt]]), np.vstack([soft[1], forces[learnt]]), modes
+    )
     amplitude = np.sqrt(energies[: len(basis)] / len(energies))
     far = basis[:, len(model.free) :]
     near = basis[:, : len(model.free)] - far @ model.body.T
@@ -286,7 +290,6 @@ def region(problem: FullProblem, footprints: list[Footprint], modes: int) -> Reg
         shares=np.rint(far / share_steps[:, None]).astype(np.int16),
         share_steps=share_steps.astype(np.float32),
         orthonormal=np.empty((0, 0), np.float32),
-        soft=np.empty((0, 0), np.float32),
         ritz=np.empty((0, 0, 0), np.float32),
     )
     # rounding costs the modes their orthonormality: give it back by a change of coordinates
@@ -294,15 +297,31 @@ def region(problem: FullProblem, footprints: list[Footprint], modes: int) -> Reg
     L = np.linalg.cholesky(rounded.T @ (model.rest_stiffness @ rounded))
     ritz = np.linalg.solve(L, rounded.T @ forces.reshape(-1, len(rounded)).T)
     ritz = ritz.reshape(len(steps), len(footprints), -1)
-    orthonormal, moved = np.linalg.inv(L).T, rounded[: len(model.free)]
-    volumes = np.repeat(problem.nodal_volumes, 3)[model.free]
-    gram = orthonormal.T @ (moved.T @ (volumes[:, None] * moved)) @ orthonormal
     return replace(
         own,
-        orthonormal=orthonormal.astype(np.float32),
-        soft=np.linalg.eigh(gram)[1][:, : -SOFT - 1 : -1].astype(np.float32),
+        orthonormal=np.linalg.inv(L).T.astype(np.float32),
         ritz=np.moveaxis(ritz, 1, 0).astype(np.float32),
     )
+
+
+def _softest(problem: FullProblem, energy: float) -> tuple[Array, Array]:
+    """Vibration modes (SOFT, n) of lowest frequency, of so much energy each, and forces in balance.
+
+    Only what moves in the window counts as mass, if there is one.
+    """
+    model = problem.model
+    root = np.sqrt(np.repeat(problem.nodal_volumes, 3)[model.free])
+    n = len(root)
+
+    def softness(x: Array) -> Array:
+        return np.asarray(root * model.solve_linear(root * x)[:n])
+
+    operator = LinearOperator((n, n), softness, dtype=float)
+    forces = root[:, None] * eigsh(operator, SOFT, which="LM", v0=root, tol=1e-3)[1]
+    modes = model.solve_linear(forces)
+    scale = np.sqrt(energy / np.sum(modes[:n] * forces, axis=0))
+    forces = np.pad(forces, ((0, len(modes) - n), (0, 0)))
+    return (scale * modes).T, (scale * forces).T
 
 
 def _ritz(problem: FullProblem, footprints: Sequence[Footprint]) -> tuple[Array, Array]:
