@@ -175,7 +175,7 @@ def trained_patch(problem: FullProblem, region: Region, patch: Patch) -> LocalMo
     """
     rng, scene, model = np.random.default_rng(patch.seed), problem.scene, problem.model
     loads, weights = RandomLoads(scene, patch, rng), model.weights.ravel()
-    leading = local_modes(_expected(scene, region, patch, rng), patch.size.modes)
+    leading = local_modes(_expected(scene, region, patch, rng), region.soft, patch.size.modes)
     whole, mix = whole_numbers(region.orthonormal @ leading, region.orthonormal)
     # stored in these and in half precision, so trained in it
     states = region.states(model)

@@ -23,7 +23,6 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.linalg import LinearOperator, eigsh
 
 from palpate.offline.fem.model import FullModel
 from palpate.offline.fem.problem import FullProblem
@@ -39,12 +38,10 @@ SECOND_STEP, THIRD_STEP = 0.01, 0.03
 FILL = 1e-13
 """Energy of what fills up modes, relative to that of the vectors: just above round-off."""
 
-SOFT = 2
-"""Vibration modes of lowest frequency that every local model has: they move the body most for their
-energy, as it swings that hangs from a lip, so that least energy of what is missed lets them go."""
-
-LEAD = 100.0
-"""Energy of each of these beside that of all Ritz vectors together: they lead a region's basis."""
+SOFT = 4
+"""Directions of a region that every local model has: those that move the body most for their
+energy, as a body swings that hangs from a lip.  Least energy of what is missed lets them go: what
+72 modes miss of displacement on ``turbinate-mri`` falls from .88 to .67 % in the mean."""
 
 TANGENTIAL = 0.6
 """Weight of tangential against normal load in the Ritz vectors: about sin 30 degrees and some."""
@@ -207,11 +204,11 @@ def whole_numbers(modes: Array, orthonormal: Field) -> tuple[NDArray[np.int16], 
     return whole, np.linalg.inv(R).astype(np.float32)
 
 
-def local_modes(coefficients: Array, size: int) -> Array:
+def local_modes(coefficients: Array, soft: Field, size: int) -> Array:
     """Leading directions (M, size) of vectors given by coefficients (M, k) in an orthonormal basis.
 
-    The softest modes, which lead the basis, are among them.  Where the vectors run out, its next
-    modes fill up.
+    Directions ``soft`` (M, s) lead them.  Where the vectors run out, the leading modes of the basis
+    fill up.
 
     Raises
     ------
@@ -224,9 +221,10 @@ def local_modes(coefficients: Array, size: int) -> Array:
             f"vectors of a region have to give, not {size}"
         )
     gram = coefficients @ coefficients.T
-    filled, most = np.arange(size), np.trace(gram)
+    filled = np.arange(size)
+    most = np.trace(gram)
+    gram += most * (soft @ soft.T)
     gram[filled, filled] += FILL * most
-    gram[filled[:SOFT], filled[:SOFT]] += most
     Q = np.linalg.eigh(gram)[1]
     return np.ascontiguousarray(Q[:, : -size - 1 : -1])
 
@@ -240,7 +238,8 @@ class Region:
     steps: Field  # (M,) mm
     shares: NDArray[np.int16]  # (M, G) in steps, what the modes of the body do everywhere
     share_steps: Field  # (M,)
-    orthonormal: Field  # (M, M) columns, in the basis: orthonormal in energy, the softest first
+    orthonormal: Field  # (M, M) columns, in the basis: orthonormal in energy at rest
+    soft: Field  # (M, SOFT) in those, which move the body most for their energy
     ritz: Field  # (k, M, 19 or more) in those, of the relaxed tissue last
 
     def truncate(self, modes: int) -> Self:
@@ -252,6 +251,7 @@ class Region:
             shares=self.shares[:modes],
             share_steps=self.share_steps[:modes],
             orthonormal=self.orthonormal[:modes, :modes],
+            soft=self.soft[:modes],
             ritz=self.ritz[:, :modes],
         )
 
@@ -269,10 +269,7 @@ def region(problem: FullProblem, footprints: list[Footprint], modes: int) -> Reg
     linear = np.arange(vectors.shape[1]) % RITZ_VECTORS < 3
     learnt = np.tile(linear, (len(footprints), 1))
     learnt[:: -(-len(footprints) // POINTS_IN_BASIS)] = True
-    soft = _softest(problem, LEAD * np.sum(vectors[learnt] * forces[learnt]))
-    basis, energies = _leading(
-        np.vstack([soft[0], vectors[learnt]]), np.vstack([soft[1], forces[learnt]]), modes
-    )
+    basis, energies = _leading(vectors[learnt], forces[learnt], modes)
     amplitude = np.sqrt(energies[: len(basis)] / len(energies))
     far = basis[:, len(model.free) :]
     near = basis[:, : len(model.free)] - far @ model.body.T
@@ -289,6 +286,7 @@ def region(problem: FullProblem, footprints: list[Footprint], modes: int) -> Reg
         shares=np.rint(far / share_steps[:, None]).astype(np.int16),
         share_steps=share_steps.astype(np.float32),
         orthonormal=np.empty((0, 0), np.float32),
+        soft=np.empty((0, 0), np.float32),
         ritz=np.empty((0, 0, 0), np.float32),
     )
     # rounding costs the modes their orthonormality: give it back by a change of coordinates
@@ -296,31 +294,15 @@ def region(problem: FullProblem, footprints: list[Footprint], modes: int) -> Reg
     L = np.linalg.cholesky(rounded.T @ (model.rest_stiffness @ rounded))
     ritz = np.linalg.solve(L, rounded.T @ forces.reshape(-1, len(rounded)).T)
     ritz = ritz.reshape(len(steps), len(footprints), -1)
+    orthonormal, moved = np.linalg.inv(L).T, rounded[: len(model.free)]
+    volumes = np.repeat(problem.nodal_volumes, 3)[model.free]
+    gram = orthonormal.T @ (moved.T @ (volumes[:, None] * moved)) @ orthonormal
     return replace(
         own,
-        orthonormal=np.linalg.inv(L).T.astype(np.float32),
+        orthonormal=orthonormal.astype(np.float32),
+        soft=np.linalg.eigh(gram)[1][:, : -SOFT - 1 : -1].astype(np.float32),
         ritz=np.moveaxis(ritz, 1, 0).astype(np.float32),
     )
-
-
-def _softest(problem: FullProblem, energy: float) -> tuple[Array, Array]:
-    """Vibration modes (SOFT, n) of lowest frequency, of so much energy each, and forces in balance.
-
-    Only what moves in the window counts as mass, if there is one.
-    """
-    model = problem.model
-    root = np.sqrt(np.repeat(problem.nodal_volumes, 3)[model.free])
-    n = len(root)
-
-    def softness(x: Array) -> Array:
-        return np.asarray(root * model.solve_linear(root * x)[:n])
-
-    operator = LinearOperator((n, n), softness, dtype=float)
-    forces = root[:, None] * eigsh(operator, SOFT, which="LM", v0=root, tol=1e-3)[1]
-    modes = model.solve_linear(forces)
-    scale = np.sqrt(energy / np.sum(modes[:n] * forces, axis=0))
-    forces = np.pad(forces, ((0, len(modes) - n), (0, 0)))
-    return (scale * modes).T, (scale * forces).T
 
 
 def _ritz(problem: FullProblem, footprints: Sequence[Footprint]) -> tuple[Array, Array]:
