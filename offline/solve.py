@@ -57,8 +57,8 @@ def solve(
         Young's modulus of the tissue; the scene's if absent.
     full_model : bool
         Solve the full model too and add its answer and the errors of the reduced one against it:
-        relative L2 norms over the volume (displacement), outside the clamped layer (von Mises
-        stress).
+        relative L2 norms over the volume (displacement), outside the clamped layer and regions
+        (von Mises stress).
     vtu : Path, optional
         Where to write mesh and fields; of the full model too if it is solved, and the reduced
         model's deviations from them.

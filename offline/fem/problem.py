@@ -124,14 +124,23 @@ class FullProblem:
     @cached_property
     def nodal_volumes(self) -> Array:
         """Volumes (n,) mm^3 that nodes stand for: those of the elements around, shared out."""
-        elements = self.mesh.elements
-        shares = np.repeat(self.model.volumes / elements.shape[1], elements.shape[1])
-        return np.bincount(elements.ravel(), shares, len(self.mesh.nodes)).astype(float)
+        return self._shared_out(self.model.volumes)
 
     @cached_property
     def counted_volumes(self) -> Array:
-        """The same where stress is compared, 0 in the clamped layer."""
-        return self.nodal_volumes * self.beyond_clamped_layer
+        """Those by which nodal stress is compared: of no region, and beyond the clamped layer.
+
+        A region 200 times as stiff has stress beside which that of all else would not count, and
+        where it is as thin as an element, its nodes have the stress outside, on which they border.
+        """
+        own = self.model.volumes * (self.mesh.region == 0)
+        return self._shared_out(own) * self.beyond_clamped_layer
+
+    def _shared_out(self, volumes: Array) -> Array:
+        """Volumes (e,) mm^3 of elements as shares (n,) of their nodes."""
+        elements = self.mesh.elements
+        shares = np.repeat(volumes / elements.shape[1], elements.shape[1])
+        return np.bincount(elements.ravel(), shares, len(self.mesh.nodes)).astype(float)
 
     def points_in_body(self, points: Numbers) -> Numbers:
         """Numbers in the whole body of quadrature points."""

@@ -104,8 +104,8 @@ class KnownAnswer:
 class Row(NamedTuple):
     """One query answered by both models.
 
-    Errors in its table are relative L2 norms over the volume (of stress outside the clamped layer)
-    and all moments.
+    Errors in its table are relative L2 norms over the volume (of stress outside the clamped layer
+    and regions) and all moments.
     """
 
     table: dict[str, float]

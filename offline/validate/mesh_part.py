@@ -185,7 +185,7 @@ def answered(model: ReducedModel, steps: Sequence[tuple[float, Load | TipPositio
 def mesh_errors(problem: FullProblem, levels: Levels) -> list[Array]:
     """Levels and errors of a scene's mesh at one place; a task for ``run.workers``.
 
-    Relative L2 norms over its volume, of stress outside the clamped layer; the relative error of a
+    Relative L2 norms over its volume, of stress over ``counted_volumes``; the relative error of a
     tip's force, or of the mean displacement under a footprint; those of the largest stress and its
     99th percentile.  Last 1 within a radius of the rim of the surface, else 0.  The first level and
     the next that the finer mesh bears are looked at.

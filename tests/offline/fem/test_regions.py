@@ -34,6 +34,9 @@ young = {young}
 poisson = {poisson}
 {place}
 """
+SLICE = "x = [6.0, 8.0]\nz = [0.0, 6.0]"
+"""A single element thick."""
+
 BOX = "x = [4.0, 8.0]\ny = [4.0, 8.0]\nz = [2.0, 4.0]"
 
 
@@ -73,6 +76,19 @@ def test_a_region_of_the_same_tissue_changes_nothing_but_how_stress_is_carried()
     one, other = (problem.von_mises(u, contact=contact) for problem in (plain, own))
     volumes = plain.counted_volumes
     assert np.sqrt(volumes @ (one - other) ** 2 / (volumes @ one**2)) < 0.005
+
+
+def test_stress_is_compared_of_elements_in_no_region():
+    plain, thin = FullProblem(parse_scene(BLOCK)), FullProblem(scene(place=SLICE))
+    mesh, nodes = thin.mesh, np.arange(len(thin.mesh.nodes))
+    own, other = (np.unique(mesh.elements[mesh.region == number]) for number in (1, 0))
+    inside, outside = np.setdiff1d(nodes, other), np.setdiff1d(nodes, own)
+    assert len(inside) > 0
+    assert not thin.counted_volumes[inside].any()
+    np.testing.assert_allclose(thin.counted_volumes[outside], plain.counted_volumes[outside])
+    shared, counted = np.intersect1d(own, other), plain.counted_volumes > 0.0
+    less = thin.counted_volumes[shared] < plain.counted_volumes[shared]
+    np.testing.assert_array_equal(less, counted[shared])
 
 
 def test_a_stiff_region_hardly_deforms_and_all_scales_with_stiffness():
