@@ -64,7 +64,7 @@ def at_place(scene: Scene, x: Array, how: Grading) -> Iterator[dict[str, Any]]:
     """Rows of all meshes graded towards a point (3,) mm, those of the middle one with orders."""
     at = own_mesh(scene).sites
     seen: dict[int, list[tuple[float, Array, int]]] = {2: [], 3: []}
-    kept = FullProblem(scene).beyond_clamped_layer
+    kept = FullProblem(scene).counted_volumes > 0.0
     for factor in EDGES:
         edges = how._replace(**{key: factor * getattr(how, key) for key in SCALED})
         reference = Graded(scene, x, edges)

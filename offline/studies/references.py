@@ -43,7 +43,7 @@ class Fields(NamedTuple):
         )
 
     def errors(self, problem: FullProblem, exact: Self) -> tuple[float, float]:
-        """Relative L2 errors over moments and volume, of stress beyond the clamped layer."""
+        """Relative L2 errors over moments and volume, of stress over ``counted_volumes``."""
         volumes = problem.nodal_volumes, problem.counted_volumes
         moved, stress = (
             relative(own.swapaxes(0, 1), full.astype(float).swapaxes(0, 1), weights)

@@ -127,7 +127,7 @@ def _errors(
 ) -> Iterator[tuple[str, float]]:
     """Relative errors of what one model says, beside another.
 
-    Volumes (n,) mm^3 of all nodes, of those beyond the clamped layer, of those near the contact.
+    Volumes (n,) mm^3 of all nodes, of those where stress is compared, of those near the contact.
     """
     yield "displacement", relative(one.displacement, other.displacement, volumes)
     yield "von_mises", relative(one.von_mises, other.von_mises, kept)
