@@ -122,9 +122,10 @@ def train(
 def look(scene: str, out: Path | None) -> None:
     """Draw a scene before anything is trained, and say what its body is.
 
-    The body and its mesh, what is held and what can be touched, and the endoscope to scale. SCENE
-    is the name of one that comes along or a TOML file. A body from a file is meshed once, and its
-    mesh stored beside the file. Draws artifacts/NAME/report/look.png if not told where.
+    The body and its mesh, its regions, what is held and what can be touched, and the endoscope to
+    scale. SCENE is the name of one that comes along or a TOML file. A body from a file is meshed
+    once, and its mesh stored beside the file. Draws artifacts/NAME/report/look.png if not told
+    where.
 
     Needs PyVista: pip install 'palpate[pictures]'.
     """

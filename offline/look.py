@@ -3,7 +3,8 @@
 Needs the extra ``pictures`` (PyVista).
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from palpate.offline.choose.mesh import as_fine, candidates
 from palpate.offline.doubts import doubts
 from palpate.offline.fem.mesh import build_mesh, mesh_quality
 from palpate.offline.info import labelled
-from palpate.offline.pictures import INK, SHINE, STEEL, new_plotter, require_pyvista, save
+from palpate.offline.pictures import INK, SHINE, STEEL, body, new_plotter, require_pyvista, save
 from palpate.offline.scenes import opened_scene
 from palpate.shared.anatomy import FileBody
 from palpate.shared.arrays import Array, Flags
@@ -24,7 +25,8 @@ from palpate.shared.local_models import Mesh
 from palpate.shared.scene import Scene, SceneError
 
 SIZE = (1600, 900)
-HELD, TOUCHED, FREE = "#b4463c", "#4c8fc7", "#d9d4cc"
+HELD, TOUCHED, FREE, REGION = "#b4463c", "#4c8fc7", "#d9d4cc", "#e0a030"
+THROUGH = 0.3  # opacity of a body with regions, seen from the other side
 FACE_TYPES = {4: 9, 6: 22, 8: 23}  # VTK's quadrilateral and quadratic ones, by nodes per face
 SUBDIVISIONS = 2  # of a quadratic face
 FROM = np.array([0.6, -0.7, 0.4])  # whence a body is seen that is touched nowhere
@@ -88,9 +90,18 @@ def _said(scene: Scene, mesh: Mesh) -> Mapping[str, str]:
         "held": f"{scene.support.in_words()}; {_area(mesh, _held(mesh)):.3g} mm²",
         "touchable": f"{scene.surface.in_words()}; {_area(mesh, mesh.accessible):.3g} mm²",
     }
+    if scene.tissue.region:
+        said["regions"] = "; ".join(_said_of_regions(scene, mesh))
     if not isinstance(scene.geometry, FileBody):
         return said | {"volume": f"{mesh_quality(mesh)['volume_mm3']:.4g} mm³"}
     return said | in_words(report(scene))
+
+
+def _said_of_regions(scene: Scene, mesh: Mesh) -> Iterator[str]:
+    for number, region in enumerate(scene.tissue.region, 1):
+        part = replace(mesh, elements=mesh.elements[mesh.region == number])
+        volume = mesh_quality(part)["volume_mm3"]
+        yield f"{region.name} ({region.in_words()}) {len(part.elements)} elements, {volume:.3g} mm³"
 
 
 def _area(mesh: Mesh, chosen: Flags) -> float:
@@ -110,29 +121,35 @@ def _draw(scene: Scene, mesh: Mesh, out: Path) -> None:
     plotter = new_plotter((1, 2), SIZE)
     parts = {TOUCHED: mesh.accessible, HELD: held & ~mesh.accessible}
     parts[FREE] = ~(mesh.accessible | held)
-    radius = scene.endoscope.radius
-    names = {"blue: can be touched": TOUCHED, "red: held": HELD, "grey: free": FREE}
-    for view, (way, title) in enumerate(
-        [(towards, "From where it is touched"), (-towards, "From the other side")]
-    ):
+    inner = mesh.elements[mesh.region > 0]
+    for view, (way, words) in enumerate(zip((towards, -towards), _legends(scene), strict=True)):
         plotter.subplot(0, view)
+        opacity = THROUGH if view and len(inner) else 1.0
         for colour, chosen in parts.items():
             if chosen.any():
-                plotter.add_mesh(_faces(mesh, chosen), color=colour, **SHINE)
+                plotter.add_mesh(_faces(mesh, chosen), color=colour, opacity=opacity, **SHINE)
+        if opacity < 1.0:
+            plotter.add_mesh(body(mesh.nodes, inner, centres[at], {})[1], color=REGION, **SHINE)
         plotter.add_mesh(_edges(mesh), color=INK, line_width=1, opacity=0.35)
-        for part in _endoscope(centres[at], normals[at], radius):
+        for part in _endoscope(centres[at], normals[at], scene.endoscope.radius):
             plotter.add_mesh(part, color=STEEL, opacity=0.75, smooth_shading=True)
-        words = "\n".join(names) if view == 0 else f"steel: the endoscope, radius {radius:g} mm"
-        plotter.add_text(
-            f"{scene.name}. {title}\n{words}", position=TITLE, viewport=True, font_size=11,
-            color=INK,
-        )  # fmt: skip
+        plotter.add_text(words, position=TITLE, viewport=True, font_size=11, color=INK)
         plotter.show_bounds(
             xtitle="x, mm", ytitle="y, mm", ztitle="z, mm", color=INK, font_size=10, fmt="%.3g",
             bounds=np.column_stack([low, high]).ravel(), location="outer",
         )  # fmt: skip
         _turn(plotter, way, mesh.nodes)
     save(plotter, out)
+
+
+def _legends(scene: Scene) -> tuple[str, str]:
+    """What is written above either view."""
+    inner = ", ".join(region.name for region in scene.tissue.region)
+    radius = f"steel: the endoscope, radius {scene.endoscope.radius:g} mm"
+    return (
+        f"{scene.name}. From where it is touched\nblue: can be touched\nred: held\ngrey: free",
+        f"{scene.name}. From the other side\n{radius}" + (f"\namber: {inner}" if inner else ""),
+    )
 
 
 def _faces(mesh: Mesh, chosen: Flags) -> Any:

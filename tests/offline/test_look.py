@@ -2,6 +2,7 @@
 
 import sys
 
+import numpy as np
 import pytest
 
 from palpate.offline.scenes import FOLDER
@@ -35,6 +36,27 @@ def test_a_body_from_a_file_is_drawn_with_its_report(run, tmp_path, monkeypatch)
     for word in ("elements tet10", "the mesh is within 0.0", "angles of 1", "mm²"):
         assert word in result.output
     assert drawn(tmp_path / "artifacts" / "turbinate-mri" / "report" / "look.png")
+
+
+def test_a_region_is_drawn_through_the_body_and_told(run, tmp_path):
+    pytest.importorskip("pyvista")
+    text = (FOLDER / "quick.toml").read_text()
+    region = '\n[[tissue.region]]\nname = "bone"\nyoung = 90.0\npoisson = 0.3\nz = [0, 3]\n'
+    pictures = []
+    for name, own in (("without", text), ("with", text + region)):
+        (tmp_path / "own.toml").write_text(own)
+        pictures.append(tmp_path / f"{name}.png")
+        result = run("look", tmp_path / "own.toml", "--out", pictures[-1])
+        assert result.exit_code == 0, result.output
+    assert "bone (z 0 to 3 mm) 16 elements, 267 mm³" in result.output
+    assert amber(pictures[1]) > 1000 > amber(pictures[0])
+
+
+def amber(picture):
+    """Number of pixels of a picture that are more yellow than any other part of a body is."""
+    imread = pytest.importorskip("matplotlib.pyplot").imread
+    red, green, blue = np.moveaxis(imread(picture)[..., :3], -1, 0)
+    return np.count_nonzero((red - blue > 0.3) & (green - blue > 0.15))
 
 
 def test_a_body_that_is_large_for_its_endoscope_is_asked_about(run, tmp_path):
