@@ -5,6 +5,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from palpate.shared.part import Length, Part, in_radii, optional
+from palpate.shared.place import Place
 
 Unit = Annotated[Literal["mm", "cm", "m"], Field(description="of lengths in the file: mm, cm or m")]
 
@@ -25,6 +26,17 @@ Deviation = Annotated[
 Edge = Annotated[Length, in_radii(2.0, "longest edges of the mesh before it is refined, mm")]
 
 
+class Finer(Place):
+    """Part of the boundary with shorter edges than elsewhere."""
+
+    finest: Length = Field(description="longest edges there, mm")
+
+    @classmethod
+    def places(cls) -> tuple[str, ...]:
+        """Keys that say where."""
+        return tuple(Place.model_fields)
+
+
 class _OfFile(Part):
     sides: ClassVar = ()
     element: ClassVar = "tet10"
@@ -32,6 +44,7 @@ class _OfFile(Part):
     finest: Length | None = optional(
         CHOSEN, "longest edges of elements where it can be touched and where what is held ends, mm"
     )
+    finer: Finer | None = optional("nowhere", "where edges have to be shorter than that")
 
 
 class SurfaceBody(_OfFile):

@@ -77,7 +77,7 @@ def stored_at(scene: Scene) -> Path:
     geometry, path = body_file(scene)
     sha = hashlib.sha256(path.read_bytes())
     keys = geometry.model_dump(mode="json") | {"edition": EDITION}
-    del keys["file"], keys["finest"]
+    del keys["file"], keys["finest"], keys["finer"]
     if scene.tissue.region:
         keys["regions"] = regions.places_of(scene)
     sha.update(json.dumps(keys, sort_keys=True).encode())

@@ -3,26 +3,52 @@
 import numpy as np
 
 from palpate.offline.bodies.base import Base, base_mesh, body_file
-from palpate.offline.bodies.places import Boundary, boundary_of_corners, support_and_surface
+from palpate.offline.bodies.places import (
+    Boundary,
+    boundary_of_corners,
+    faces_at,
+    support_and_surface,
+)
 from palpate.offline.bodies.refine import Refined, growing, refined, spread_over
 from palpate.offline.bodies.regions import refuse_touched, regions_at
 from palpate.offline.bodies.tetrahedra import boundary
 from palpate.shared.arrays import Array, Flags, Numbers
 from palpate.shared.local_models import Mesh
-from palpate.shared.scene import Scene
+from palpate.shared.scene import Scene, SceneError
 
 GROWTH = 0.7
 """Of an edge over its distance from the surface that can be touched and the ends of the support."""
 
 
 def refined_body(scene: Scene) -> Refined:
-    """The body of a scene, its elements as fine as ``geometry.finest`` says; else as stored."""
-    base, finest = base_mesh(scene), body_file(scene)[0].finest
-    if finest is None:
+    """The body of a scene, its elements as fine as ``geometry.finest`` and ``finer`` say.
+
+    Raises
+    ------
+    SceneError
+        If ``geometry.finer`` is where nothing can be touched and nothing held ends.
+    """
+    base, geometry = base_mesh(scene), body_file(scene)[0]
+    if geometry.finest is None:
         return refined(base, _as_it_is)
-    touched = support_and_surface(scene, boundary_of(base))[1]
-    fine = np.concatenate([spread_over(base, touched, finest), support_edges(scene)])
-    return refined(base, growing(fine, finest, GROWTH, np.inf))
+    faces = boundary_of(base)
+    places = [(geometry.finest, np.ones(len(faces.centres), dtype=bool))]
+    if (finer := geometry.finer) is not None:
+        places.append((finer.finest, faces_at(scene, "geometry.finer", finer, faces)))
+    wanted = [growing(_points(scene, *place), place[0], GROWTH, np.inf) for place in places]
+    return refined(base, lambda at: np.min([edge_length_at(at) for edge_length_at in wanted], 0))
+
+
+def _points(scene: Scene, edge: float, where: Flags) -> Array:
+    """Points (k, 3) mm on some faces of the base mesh where edges have to be as short (mm)."""
+    base = base_mesh(scene)
+    touched = support_and_surface(scene, boundary_of(base))[1] & where
+    ends = support_edges(scene, where)
+    if not len(ends) and not touched.any():
+        raise SceneError(
+            "geometry.finer: nothing there can be touched, and nothing held ends there"
+        )
+    return np.concatenate([spread_over(base, touched, edge), ends]) if touched.any() else ends
 
 
 def stored_mesh(scene: Scene) -> Mesh:
@@ -57,12 +83,13 @@ def bare_mesh(scene: Scene) -> Mesh:
     return _mesh(refined(base, _as_it_is), *boundary_of(base).nowhere())
 
 
-def support_edges(scene: Scene) -> Array:
-    """Points (k, 3) mm where what is held ends: nodes of the base mesh."""
+def support_edges(scene: Scene, where: Flags | None = None) -> Array:
+    """Points (k, 3) mm where what is held ends: nodes of the base mesh, on faces (f,) ``where``."""
     base = base_mesh(scene)
     held = support_and_surface(scene, boundary_of(base))[0]
     faces = boundary(base.elements)[0]
-    return base.nodes[np.intersect1d(faces[held], faces[~held])]
+    where = np.ones_like(held) if where is None else where
+    return base.nodes[np.intersect1d(faces[held & where], faces[~held & where])]
 
 
 def boundary_of(base: Base) -> Boundary:

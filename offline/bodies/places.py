@@ -45,7 +45,7 @@ def support_and_surface(scene: Scene, faces: Boundary) -> tuple[Flags, Flags]:
         If one of them is nowhere, or the support holds all that could be touched.
     """
     support, accessible = (
-        _found(scene, name, patch, faces)
+        faces_at(scene, name, patch, faces)
         for name, patch in (("support", scene.support), ("surface", scene.surface))
     )
     if not (accessible & ~support).any():
@@ -53,14 +53,15 @@ def support_and_surface(scene: Scene, faces: Boundary) -> tuple[Flags, Flags]:
     return support, accessible & ~support
 
 
-def _found(scene: Scene, name: str, patch: Patch, faces: Boundary) -> Flags:
-    chosen = _holds(scene, name, patch, faces)
+def faces_at(scene: Scene, name: str, place: Place, faces: Boundary) -> Flags:
+    """Flags (f,) of the faces at a place that errors call ``name``; raise `SceneError` if none."""
+    chosen = _holds(scene, name, place, faces)
     if not chosen.any():
-        parts = dict(_keys(scene, name, patch, faces))
+        parts = dict(_keys(scene, name, place, faces))
         each = ", ".join(f"{np.sum(own)} by {key}" for key, own in parts.items())
         raise SceneError(
             f"{name}: no face of the body is there; of {len(faces.centres)} faces {each}; their "
-            f"centres have {box_of(faces.centres)}{_where(patch, faces)}"
+            f"centres have {box_of(faces.centres)}{_where(place, faces)}"
         )
     return chosen
 
@@ -71,39 +72,46 @@ def box_of(points: Array) -> str:
     return ", ".join(f"{axis} {low:z.1f} to {high:.1f}" for axis, low, high in ends) + " mm"
 
 
-def _where(patch: Patch, faces: Boundary) -> str:
+def _where(place: Place, faces: Boundary) -> str:
     """How far a picked point is from the body."""
-    if patch.near is None:
+    if place.near is None:
         return ""
-    away = faces.centres - patch.near
+    away = faces.centres - place.near
     gap = np.linalg.norm(away, axis=1)
     nearest = int(np.argmin(gap))
     inside = "inside" if away[nearest] @ faces.normals[nearest] > 0 else "outside"
     return f"; near lies {inside} the body, {gap[nearest]:.3g} mm from the nearest"
 
 
-def _holds(scene: Scene, name: str, patch: Patch, faces: Boundary) -> Flags:
+def _holds(scene: Scene, name: str, place: Place, faces: Boundary) -> Flags:
     every = np.ones(len(faces.centres), dtype=bool)
-    for _, own in _keys(scene, name, patch, faces):
+    for _, own in _keys(scene, name, place, faces):
         every &= own
     return every
 
 
-def _keys(scene: Scene, name: str, patch: Patch, faces: Boundary) -> Iterator[tuple[str, Flags]]:
+def _keys(scene: Scene, name: str, place: Place, faces: Boundary) -> Iterator[tuple[str, Flags]]:
     """Each key of a table, and the faces for which it holds."""
-    centres = faces.centres
-    if patch.side is not None:
-        yield "side", faces.sides[patch.side]
-    yield from ranges(patch, centres)
+    if isinstance(place, Patch) and place.side is not None:
+        yield "side", faces.sides[place.side]
+    yield from ranges(place, faces.centres)
+    if place.near is not None:
+        yield "near", near(place, faces.centres)
+    if place.set is not None:
+        yield "set", _named(name, place.set, faces.sets)
+    if isinstance(place, Patch):
+        yield from _keys_of_patch(scene, name, place, faces)
+
+
+def _keys_of_patch(
+    scene: Scene, name: str, patch: Patch, faces: Boundary
+) -> Iterator[tuple[str, Flags]]:
+    """What only a patch has, but for its side."""
     if patch.normal is not None and patch.within is not None:
         cosine = faces.normals @ patch.normal / np.linalg.norm(patch.normal)
         yield "normal", cosine >= np.cos(np.radians(patch.within))
-    if patch.near is not None and patch.radius is not None:
-        yield "near", near(patch, centres)
     if patch.close_to is not None and patch.distance is not None:
-        yield "close_to", _gaps(scene, name, patch.close_to, centres) <= patch.distance
-    if patch.set is not None:
-        yield "set", _named(name, patch.set, faces.sets)
+        yield "close_to", _gaps(scene, name, patch.close_to, faces.centres) <= patch.distance
     if patch.any is not None:
         yield "any", np.any([_holds(scene, name, own, faces) for own in patch.any], axis=0)
     if patch.without is not None:
