@@ -23,6 +23,8 @@ GROWTH = 0.7
 def refined_body(scene: Scene) -> Refined:
     """The body of a scene, its elements as fine as ``geometry.finest`` and ``finer`` say.
 
+    As stored where the former is not given.
+
     Raises
     ------
     SceneError
