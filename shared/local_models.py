@@ -19,7 +19,7 @@ from palpate.shared.arrays import Array, Field, Flags, Ints, Numbers
 from palpate.shared.artifact import values_of
 from palpate.shared.geometry.edges import sharp_points
 from palpate.shared.geometry.elements import kind_of
-from palpate.shared.geometry.quadrature import surface_quadrature, volume_quadrature
+from palpate.shared.geometry.quadrature import LOAD_SPACING, surface_quadrature, volume_quadrature
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, SurfaceQuadrature
 from palpate.shared.mechanics.laws import law_at_points, law_of
@@ -101,7 +101,7 @@ class Body(Mesh):
 
     def contact_fields(self, surface: Surface) -> Array:
         """What the law of a tip needs to know of the body at vertices, (v, CONTACT_FIELDS)."""
-        other = surface_quadrature(self.nodes, self.faces[~self.accessible])
+        other = self._points_on(self.faces[~self.accessible])
         beyond = np.hstack([other.points, other.normals])
         bent = surface.curvature(CURVED_WITHIN * self.tip.radius, beyond)
         points, sharpness = sharp_points(self.nodes, self.faces, self.clamped)
@@ -115,7 +115,10 @@ class Body(Mesh):
     @cached_property
     def boundary(self) -> SurfaceQuadrature:
         """Integration points of the whole boundary."""
-        return surface_quadrature(self.nodes, self.faces)
+        return self._points_on(self.faces)
+
+    def _points_on(self, faces: Numbers) -> SurfaceQuadrature:
+        return surface_quadrature(self.nodes, faces, LOAD_SPACING * self.tip.radius)
 
 
 @dataclass(frozen=True)
