@@ -19,7 +19,12 @@ from palpate.shared.arrays import Array, Field, Flags, Ints, Numbers
 from palpate.shared.artifact import values_of
 from palpate.shared.geometry.edges import sharp_points
 from palpate.shared.geometry.elements import kind_of
-from palpate.shared.geometry.quadrature import LOAD_SPACING, surface_quadrature, volume_quadrature
+from palpate.shared.geometry.quadrature import (
+    LOAD_SPACING,
+    WIDER,
+    surface_quadrature,
+    volume_quadrature,
+)
 from palpate.shared.geometry.surface import Surface
 from palpate.shared.mechanics.footprint import LIMIT_FIELDS, SurfaceQuadrature
 from palpate.shared.mechanics.laws import law_at_points, law_of
@@ -118,7 +123,7 @@ class Body(Mesh):
         return self._points_on(self.faces)
 
     def _points_on(self, faces: Numbers) -> SurfaceQuadrature:
-        return surface_quadrature(self.nodes, faces, LOAD_SPACING * self.tip.radius)
+        return surface_quadrature(self.nodes, faces, max(LOAD_SPACING, WIDER * self.tip.radius))
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ from palpate.offline.studies.chart import play
 from palpate.offline.studies.references import Fields
 from palpate.offline.studies.relaxation import Phases, load_steps
 from palpate.shared.arrays import Array, Flags
-from palpate.shared.geometry.quadrature import LOAD_SPACING, surface_quadrature
+from palpate.shared.geometry.quadrature import surface_quadrature
 from palpate.shared.scene import Block
 
 Claims = dict[str, dict[str, Any]]
@@ -131,9 +131,9 @@ def figures(scene: str, report: Path) -> dict[str, Any]:
 
 def covered(problem: FullProblem) -> Example:
     """Pressure all over the flat top of a block."""
-    mesh, spacing = problem.mesh, LOAD_SPACING * problem.scene.endoscope.radius
+    mesh = problem.mesh
     pressure = CUBE_PRESSURE * (1.0 - sum(share for share, _ in problem.model.prony))
-    top = surface_quadrature(mesh.nodes, mesh.faces[mesh.accessible], spacing)
+    top = surface_quadrature(mesh.nodes, mesh.faces[mesh.accessible])
     areas = np.zeros(len(mesh.nodes))
     np.add.at(areas, top.nodes, top.areas[:, None] * top.shape)
     load = -pressure * areas[:, None] * top.normals[0]

@@ -18,7 +18,7 @@ def turbinate():
     return mesh, accessible_surface(mesh)
 
 
-def loads(turbinate, path, spacing=LOAD_SPACING * RADIUS):
+def loads(turbinate, path, spacing=LOAD_SPACING):
     """Nodal weights (steps, nodes) along a path of positions."""
     mesh, surface = turbinate
     quadrature = surface_quadrature(mesh.nodes, mesh.faces, spacing)

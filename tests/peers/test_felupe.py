@@ -155,7 +155,7 @@ def pressed(model, position, pressure, tilt):
     mesh = model.mesh
     x, normal, _ = accessible_surface(mesh).project(np.asarray(position))
     nodal = np.empty(len(mesh.nodes))
-    footprint(surface_quadrature(mesh.nodes, mesh.faces, 0.4), x, normal, 2.0, nodal)
+    footprint(surface_quadrature(mesh.nodes, mesh.faces), x, normal, 2.0, nodal)
     direction = -np.cos(tilt) * normal + np.sin(tilt) * np.array([0.0, 1.0, 0.0])
     return pressure * np.outer(nodal, direction)
 

@@ -69,7 +69,7 @@ def pressed(mesh, pressure, radius=2.0):
     """Load of a footprint in the middle of a block's top, straight down."""
     top, nodal = mesh.nodes.max(axis=0) * [0.5, 0.5, 1.0], np.empty(len(mesh.nodes))
     up = np.array([0.0, 0.0, 1.0])
-    footprint(surface_quadrature(mesh.nodes, mesh.faces, 0.4), top, up, radius, nodal)
+    footprint(surface_quadrature(mesh.nodes, mesh.faces), top, up, radius, nodal)
     return np.outer(-pressure * nodal, up)
 
 

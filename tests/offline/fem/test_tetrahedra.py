@@ -97,7 +97,7 @@ def test_a_ball_has_its_volume_its_surface_and_its_diameter():
     quality = mesh_quality(mesh)
     assert quality["volume_mm3"] == pytest.approx(4 / 3 * np.pi, rel=4e-3)
     assert quality["jacobian_ratio_min"] > 0.0
-    whole = surface_quadrature(mesh.nodes, mesh.faces, 0.4)
+    whole = surface_quadrature(mesh.nodes, mesh.faces)
     assert whole.areas.sum() == pytest.approx(4 * np.pi, rel=4e-3)
     assert np.abs(whole.areas @ whole.normals).max() < 1e-3
     assert np.sum(whole.points * whole.normals, axis=1).min() > 0.97
@@ -141,7 +141,7 @@ def test_the_load_on_a_flat_face_has_the_force_and_the_moment_of_the_disc():
     nodal = np.empty(len(mesh.nodes))
     for aside in ([0.0, 0.0, 0.0], [0.31, -0.17, 0.0], [-0.9, 0.4, 0.0]):
         x = np.array([5.0, 5.0, 8.0]) + aside
-        area = footprint(surface_quadrature(mesh.nodes, mesh.faces, 0.4), x, UP, 2.0, nodal)
+        area = footprint(surface_quadrature(mesh.nodes, mesh.faces), x, UP, 2.0, nodal)
         assert area == pytest.approx(nodal.sum())
         assert area == pytest.approx(8 / 15 * np.pi * 4.0, rel=4e-3)
         np.testing.assert_allclose(nodal @ mesh.nodes / area, x, atol=4e-3 * 2.0)
