@@ -34,23 +34,33 @@ def refined_body(scene: Scene) -> Refined:
     if geometry.finest is None:
         return refined(base, _as_it_is)
     faces = boundary_of(base)
+    held, touched = support_and_surface(scene, faces)
     places = [(geometry.finest, np.ones(len(faces.centres), dtype=bool))]
     if (finer := geometry.finer) is not None:
         places.append((finer.finest, faces_at(scene, "geometry.finer", finer, faces)))
-    wanted = [growing(_points(scene, *place), place[0], GROWTH, np.inf) for place in places]
+    wanted = [
+        growing(_points(base, held & at, touched & at, ~held & at, edge), edge, GROWTH, np.inf)
+        for edge, at in places
+    ]
     return refined(base, lambda at: np.min([edge_length_at(at) for edge_length_at in wanted], 0))
 
 
-def _points(scene: Scene, edge: float, where: Flags) -> Array:
-    """Points (k, 3) mm on some faces of the base mesh where edges have to be as short (mm)."""
-    base = base_mesh(scene)
-    touched = support_and_surface(scene, boundary_of(base))[1] & where
-    ends = support_edges(scene, where)
-    if not len(ends) and not touched.any():
+def _points(base: Base, held: Flags, touched: Flags, others: Flags, edge: float) -> Array:
+    """Points (k, 3) mm of a place where edges have to be as short (mm), of its faces (f,)."""
+    ends = _shared_nodes(base, held, others)
+    if touched.any():
+        return np.concatenate([spread_over(base, touched, edge), ends])
+    if not len(ends):
         raise SceneError(
             "geometry.finer: nothing there can be touched, and nothing held ends there"
         )
-    return np.concatenate([spread_over(base, touched, edge), ends]) if touched.any() else ends
+    return ends
+
+
+def _shared_nodes(base: Base, some: Flags, others: Flags) -> Array:
+    """Nodes (k, 3) mm where some faces (f,) border on others."""
+    faces = boundary(base.elements)[0]
+    return base.nodes[np.intersect1d(faces[some], faces[others])]
 
 
 def stored_mesh(scene: Scene) -> Mesh:
@@ -85,13 +95,11 @@ def bare_mesh(scene: Scene) -> Mesh:
     return _mesh(refined(base, _as_it_is), *boundary_of(base).nowhere())
 
 
-def support_edges(scene: Scene, where: Flags | None = None) -> Array:
-    """Points (k, 3) mm where what is held ends: nodes of the base mesh, on faces (f,) ``where``."""
+def support_edges(scene: Scene) -> Array:
+    """Points (k, 3) mm where what is held ends: nodes of the base mesh."""
     base = base_mesh(scene)
     held = support_and_surface(scene, boundary_of(base))[0]
-    faces = boundary(base.elements)[0]
-    where = np.ones_like(held) if where is None else where
-    return base.nodes[np.intersect1d(faces[held & where], faces[~held & where])]
+    return _shared_nodes(base, held, ~held)
 
 
 def boundary_of(base: Base) -> Boundary:
