@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from palpate.shared.arrays import Field, Ints, Numbers
 from palpate.shared.local_models import Body, LocalModels
@@ -23,13 +24,13 @@ many as stay in the processor's cache."""
 def press_models(body: Body, models: LocalModels, scene: Scene) -> PressModels:
     """Everything the compiled query needs for footprints of up to the scene's radius."""
     surface, reach = body.boundary, models.extent + scene.endoscope.radius
-    points = _no_points(body, models)
+    points, tree = _no_points(body, models), cKDTree(surface.points)
     found = {}
     for k, rows in _modes_at(body, models, models.modes):
         G = _place_points(body, models, k, rows, points)
         points.steps[k] = np.maximum(np.abs(G).max(axis=1), 1e-30) / np.iinfo(np.int16).max
         points.gradients[k] = np.rint(G / points.steps[k, :, None])
-        near = np.flatnonzero(np.sum((surface.points - models.centres[k]) ** 2, 1) < reach**2)
+        near = np.sort(tree.query_ball_point(models.centres[k], reach))
         nodes, corners = _compact(surface.nodes[near])
         found[k] = near, rows(nodes), corners
     near, modes, corners = _by_model(found)
@@ -65,7 +66,8 @@ def _modes_at(
         far = models.body.reshape(-1, len(body.nodes), 3)[:, nodes]
         # one row of memory to a node, so that gathering nodes reads rows
         basis = _by_node(near.reshape(len(steps), len(nodes), 3)) * steps
-        basis += _by_node(far) @ (models.body_steps[:, None] * models.far[region].T)
+        share = models.body_steps[:, None] * models.far[region].T
+        basis += (_by_node(far).reshape(3 * len(nodes), -1) @ share).reshape(basis.shape)
         for k in np.flatnonzero(models.region == region):
             yield int(k), partial(_rows, basis, place, modes[k])
 
