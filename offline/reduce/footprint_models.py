@@ -56,6 +56,11 @@ STATES = 24
 FAINT = 0.1
 """Weight of the Ritz vectors themselves beside their states."""
 
+BETWEEN = 150
+"""Random loads anywhere on a patch whose linear responses modes are made for, too.  Without them 76
+modes miss of what is between the footprints of ``turbinate-mri``, where it is stiffest, .6 to 1.0 %
+of displacement at 95 of 100 loads, with them .4 to .7; all 400 of the region miss .3 to .6."""
+
 RESIDUAL_LOADS = 64
 """For the usual tolerance; see ``reduce.sampling.fewer``."""
 
@@ -175,10 +180,12 @@ def trained_patch(problem: FullProblem, region: Region, patch: Patch) -> LocalMo
     """
     rng, scene, model = np.random.default_rng(patch.seed), problem.scene, problem.model
     loads, weights = RandomLoads(scene, patch, rng), model.weights.ravel()
-    leading = local_modes(_expected(scene, region, patch, rng), region.soft, patch.size.modes)
+    states = region.states(model)
+    expected = _expected(scene, region, patch, rng)
+    between = region.orthonormal.T @ _between(problem, patch, loads, states)
+    leading = local_modes(np.hstack([expected, between]), region.soft, patch.size.modes)
     whole, mix = whole_numbers(region.orthonormal @ leading, region.orthonormal)
     # stored in these and in half precision, so trained in it
-    states = region.states(model)
     models = untrained(problem, states, patch.at, patch.extent, whole, mix)
     galerkin = LocalTrainer(problem, models)
     most = patch.size.cubature_points
@@ -270,6 +277,17 @@ def _expected(scene: Scene, region: Region, patch: Patch, rng: np.random.Generat
             one, two, three = pressed.series(vectors[:, first : first + RITZ_VECTORS], loads)
             parts.append((one + two + three).T / np.sqrt(STATES))
     return np.hstack(parts)
+
+
+def _between(problem: FullProblem, patch: Patch, loads: RandomLoads, states: Array) -> Array:
+    """Work (M, BETWEEN) of random loads on ``states`` (dofs, M), as heavy as the footprints."""
+    free, work = problem.model.free, []
+    for i in range(BETWEEN):
+        load = loads.limit(border=i % 2 == 0)
+        forces = np.sqrt(loads.rng.random()) * problem.load_vector(load).ravel()[free]
+        pressed = np.flatnonzero(forces)
+        work.append(forces[pressed] @ states[pressed])
+    return np.sqrt(len(patch.footprints) / BETWEEN) * np.transpose(work)
 
 
 def _training_forces(trainer: LocalTrainer, loads: RandomLoads, count: int) -> Field:
