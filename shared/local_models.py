@@ -122,6 +122,11 @@ class Body(Mesh):
         """Integration points of the whole boundary."""
         return self._points_on(self.faces)
 
+    @cached_property
+    def boundary_tree(self) -> cKDTree:
+        """Finds these points near another."""
+        return cKDTree(self.boundary.points)
+
     def _points_on(self, faces: Numbers) -> SurfaceQuadrature:
         return surface_quadrature(self.nodes, faces, max(LOAD_SPACING, WIDER * self.tip.radius))
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from palpate.shared.arrays import Field, Ints, Numbers
 from palpate.shared.local_models import Body, LocalModels
@@ -24,13 +23,13 @@ many as stay in the processor's cache."""
 def press_models(body: Body, models: LocalModels, scene: Scene) -> PressModels:
     """Everything the compiled query needs for footprints of up to the scene's radius."""
     surface, reach = body.boundary, models.extent + scene.endoscope.radius
-    points, tree = _no_points(body, models), cKDTree(surface.points)
+    points = _no_points(body, models)
     found = {}
     for k, rows in _modes_at(body, models, models.modes):
         G = _place_points(body, models, k, rows, points)
         points.steps[k] = np.maximum(np.abs(G).max(axis=1), 1e-30) / np.iinfo(np.int16).max
         points.gradients[k] = np.rint(G / points.steps[k, :, None])
-        near = np.sort(tree.query_ball_point(models.centres[k], reach))
+        near = np.sort(body.boundary_tree.query_ball_point(models.centres[k], reach))
         nodes, corners = _compact(surface.nodes[near])
         found[k] = near, rows(nodes), corners
     near, modes, corners = _by_model(found)

@@ -106,9 +106,9 @@ class RandomLoads:
         limit = pressure_limit(patch.ranges[i], patch.normals[i], direction)
         return Load(patch.contacts[i], direction, float(limit))
 
-    def any(self) -> Load:
+    def any(self, border: bool = False) -> Load:
         """Denser towards large pressures."""
-        load = self.limit()
+        load = self.limit(border)
         return replace(load, pressure=load.pressure * np.sqrt(self.rng.random()))
 
     def training(self) -> Load:
@@ -283,8 +283,7 @@ def _between(problem: FullProblem, patch: Patch, loads: RandomLoads, states: Arr
     """Work (M, BETWEEN) of random loads on ``states`` (dofs, M), as heavy as the footprints."""
     free, work = problem.model.free, []
     for i in range(BETWEEN):
-        load = loads.limit(border=i % 2 == 0)
-        forces = np.sqrt(loads.rng.random()) * problem.load_vector(load).ravel()[free]
+        forces = problem.load_vector(loads.any(border=i % 2 == 0)).ravel()[free]
         pressed = np.flatnonzero(forces)
         work.append(forces[pressed] @ states[pressed])
     return np.sqrt(len(patch.footprints) / BETWEEN) * np.transpose(work)
