@@ -113,7 +113,8 @@ def picture(
     plotter = new_plotter((1, 2), SIZE)
     plotter.subplot(0, 0)
     plotter.add_mesh(pressed, **paint, **SHINE)
-    plotter.add_mesh(edges, color=FAINT, line_width=1.5, opacity=0.5)
+    if edges.n_points:  # a smooth body has none
+        plotter.add_mesh(edges, color=FAINT, line_width=1.5, opacity=0.5)
     plotter.add_mesh(rim, color=INK)
     for part in endoscope:
         plotter.add_mesh(part, color=STEEL, opacity=0.6, smooth_shading=True)

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from palpate.offline import pictures
 from palpate.offline.pictures import _across, _tip_centre
 
 from .conftest import drawn
@@ -20,6 +21,14 @@ def test_picture(run, artifact, tmp_path, direction):
     result = run("picture", artifact, *CONTACT, *direction, "--out", out)
     assert result.exit_code == 0, result.output
     assert drawn(out)
+
+
+def test_a_smooth_body_is_drawn_without_its_edges(run, artifact, tmp_path, monkeypatch):
+    pytest.importorskip("pyvista")
+    monkeypatch.setattr(pictures, "SHARP", 179.0)  # degrees; none of a block's edges is
+    result = run("picture", artifact, *CONTACT, "--out", tmp_path / "pressed.png")
+    assert result.exit_code == 0, result.output
+    assert drawn(tmp_path / "pressed.png")
 
 
 @pytest.mark.parametrize(
