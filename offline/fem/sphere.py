@@ -173,7 +173,7 @@ def _with_smooth_neighbours(nodes: Array, faces: Numbers, accessible: Flags, rea
     As far as ``reach`` (mm).
     """
     edges = shared_edges(nodes, faces)
-    joined = edges.faces[edges.turn < SMOOTH]
+    joined = edges.faces[np.abs(edges.turn) < SMOOTH]
     away, _ = cKDTree(nodes[np.unique(faces[accessible])]).query(
         nodes[faces[:, : face_kind_of(faces).corners]]
     )

@@ -22,7 +22,7 @@ class Edges(NamedTuple):
 
     faces: Ints  # (p, 2)
     nodes: Numbers  # (p, 2 or 3), ends and then the middle, as one of the faces has them
-    turn: Array  # (p,) rad, largest angle of the normals
+    turn: Array  # (p,) rad, largest angle of the normals; negative where the faces form a valley
 
 
 def shared_edges(nodes: Array, faces: Numbers) -> Edges:
@@ -43,16 +43,20 @@ def shared_edges(nodes: Array, faces: Numbers) -> Edges:
     )
     order = np.argsort(number.ravel(), kind="stable")
     pairs = order[sides[number.ravel()[order]] == 2].reshape(-1, 2)
-    cosine = np.sum(ends[pairs[:, 0]] * ends[pairs[:, 1]], axis=-1).min(axis=1)
-    return Edges(pairs // count, edges[pairs[:, 0]], np.arccos(np.clip(cosine, -1.0, 1.0)))
+    own, other = ends[pairs[:, 0]], ends[pairs[:, 1]]
+    turn = np.arccos(np.clip(np.sum(own * other, axis=-1).min(axis=1), -1.0, 1.0))
+    along = nodes[edges[pairs[:, 0], 1]] - nodes[edges[pairs[:, 0], 0]]
+    valley = np.sum(np.cross(own, other).sum(axis=1) * along, axis=1) < 0.0
+    return Edges(pairs // count, edges[pairs[:, 0]], np.where(valley, -turn, turn))
 
 
 def sharp_points(nodes: Array, faces: Numbers, clamped: Flags) -> tuple[Array, Array]:
     """Points (k, 3) mm close together along sharp edges, and how sharp: 1 is a right angle, (k,).
 
-    Of edges that are free to move: nodes (n,) may be clamped.  Sharpness is the share of the image
-    of a contact there (``mechanics.tip``) that spheres integrated at edges have: .6 at 75 degrees,
-    .36 at 60 and .27 at 48 are nearly squares of the angle, .1 to .2 at 20 to 35 are more.
+    Of edges that are free to move: nodes (n,) may be clamped.  Valleys are none: beyond them there
+    is more tissue and not less.  Sharpness is the share of the image of a contact there
+    (``mechanics.tip``) that spheres integrated at edges have: .6 at 75 degrees, .36 at 60 and .27
+    at 48 are nearly squares of the angle, .1 to .2 at 20 to 35 are more.
     """
     edges = shared_edges(nodes, faces)
     sharp = (edges.turn > BLUNT) & ~clamped[edges.nodes].any(axis=1)

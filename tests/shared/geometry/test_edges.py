@@ -49,3 +49,10 @@ def test_an_edge_turns_by_the_angle_of_its_faces(degrees, nodes):
 def test_a_clamped_edge_is_none():
     at, faces = roof(90.0, 8)
     assert len(sharp_points(at, faces, at[:, 1] < 0.0)[0]) == 0
+
+
+@pytest.mark.parametrize("nodes", [4, 8, 6])
+def test_a_valley_turns_the_other_way_and_is_no_edge(nodes):
+    at, faces = roof(-40.0, nodes)
+    assert shared_edges(at, faces).turn.min() == pytest.approx(np.radians(-40.0), abs=1e-6)
+    assert len(sharp_points(at, faces, np.zeros(len(at), bool))[0]) == 0
