@@ -45,9 +45,10 @@ def shared_edges(nodes: Array, faces: Numbers) -> Edges:
     pairs = order[sides[number.ravel()[order]] == 2].reshape(-1, 2)
     own, other = ends[pairs[:, 0]], ends[pairs[:, 1]]
     turn = np.arccos(np.clip(np.sum(own * other, axis=-1).min(axis=1), -1.0, 1.0))
-    along = nodes[edges[pairs[:, 0], 1]] - nodes[edges[pairs[:, 0], 0]]
+    shared = edges[pairs[:, 0]]
+    along = nodes[shared[:, 1]] - nodes[shared[:, 0]]
     valley = np.sum(np.cross(own, other).sum(axis=1) * along, axis=1) < 0.0
-    return Edges(pairs // count, edges[pairs[:, 0]], np.where(valley, -turn, turn))
+    return Edges(pairs // count, shared, np.where(valley, -turn, turn))
 
 
 def sharp_points(nodes: Array, faces: Numbers, clamped: Flags) -> tuple[Array, Array]:
