@@ -109,10 +109,10 @@ class Body(Mesh):
         other = self._points_on(self.faces[~self.accessible])
         beyond = np.hstack([other.points, other.normals])
         bent = surface.curvature(CURVED_WITHIN * self.tip.radius, beyond)
-        points, sharpness = sharp_points(self.nodes, self.faces, self.clamped)
+        points, sharpness = sharp_points(self.nodes, self.faces, self.clamped, self.accessible)
         away = np.full(len(bent), NO_EDGE)
-        for share in np.unique(sharpness.round(1)):
-            tree = cKDTree(points[sharpness.round(1) == share])
+        for share in np.unique(sharpness.round(2)):
+            tree = cKDTree(points[sharpness.round(2) == share])
             image = self.tip.image_distance(tree.query(surface.vertices)[0], share)
             away = np.minimum(away, image)
         return np.column_stack([bent, away, surface.gradient(away)])

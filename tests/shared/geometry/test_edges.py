@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from palpate.shared.geometry.edges import FAINTEST, shared_edges, sharp_points
+from palpate.shared.geometry.edges import AT_THE_RIM, BLUNTER, shared_edges, sharp_points
 
 
 def roof(degrees, nodes):
@@ -27,6 +27,13 @@ def roof(degrees, nodes):
     return at, np.array(faces, np.int32)
 
 
+def sharp(at, faces, clamped=None, accessible=None):
+    """Of edges without clamped nodes between accessible faces, unless told."""
+    clamped = np.zeros(len(at), bool) if clamped is None else clamped
+    accessible = np.ones(len(faces), bool) if accessible is None else accessible
+    return sharp_points(at, faces, clamped, accessible)
+
+
 @pytest.mark.parametrize("nodes", [4, 8, 6])
 @pytest.mark.parametrize("degrees", [0.0, 10.0, 40.0, 90.0])
 def test_an_edge_turns_by_the_angle_of_its_faces(degrees, nodes):
@@ -38,21 +45,32 @@ def test_an_edge_turns_by_the_angle_of_its_faces(degrees, nodes):
     np.testing.assert_allclose(edges.turn, [inner[ends] for ends in found], atol=1e-6)
     for both, ends in zip(edges.faces, edges.nodes, strict=True):
         assert (np.isin(faces[both], ends).sum(axis=1) == len(ends)).all()
-    points, sharpness = sharp_points(at, faces, np.zeros(len(at), bool))
-    assert len(points) == (0 if degrees < 15.0 else 9)
-    if len(points):
-        np.testing.assert_allclose(points[:, [0, 2]], 0.0, atol=1e-12)
-        np.testing.assert_allclose(np.sort(points[:, 1]), np.linspace(-1.0, 1.0, 9), atol=1e-12)
-        np.testing.assert_allclose(sharpness, max((degrees / 90.0) ** 2, FAINTEST))
+    left = at[faces, 0].mean(axis=1) < 0.0
+    for accessible, part in ((np.ones(len(faces), bool), 1.0), (left, AT_THE_RIM)):
+        points, sharpness = sharp(at, faces, accessible=accessible)
+        assert len(points) == (0 if degrees < 15.0 else 9)
+        if len(points):
+            np.testing.assert_allclose(points[:, [0, 2]], 0.0, atol=1e-12)
+            np.testing.assert_allclose(np.sort(points[:, 1]), np.linspace(-1.0, 1.0, 9), atol=1e-12)
+            blunt = BLUNTER * part * np.radians(degrees)
+            np.testing.assert_allclose(sharpness, min(max((degrees / 90.0) ** 2, blunt), 1.0))
 
 
 def test_a_clamped_edge_is_none():
     at, faces = roof(90.0, 8)
-    assert len(sharp_points(at, faces, at[:, 1] < 0.0)[0]) == 0
+    assert len(sharp(at, faces, clamped=at[:, 1] < 0.0)[0]) == 0
 
 
 @pytest.mark.parametrize("nodes", [4, 8, 6])
 def test_a_valley_turns_the_other_way_and_is_no_edge(nodes):
     at, faces = roof(-40.0, nodes)
     assert shared_edges(at, faces).turn.min() == pytest.approx(np.radians(-40.0), abs=1e-6)
-    assert len(sharp_points(at, faces, np.zeros(len(at), bool))[0]) == 0
+    assert len(sharp(at, faces)[0]) == 0
+
+
+def test_the_sharper_end_of_an_edge_tells_whether_it_is_a_valley():
+    """A ridge of 20 degrees at one end and a valley of 40 at the other."""
+    at = np.array([[-1, 0, 0], [0, 0, 0], [0, 1, 0], [-1, 1, 0], [1, 0, 0], [1, 1, 0]], float)
+    at[4:, 2] = np.tan(np.radians([-20.0, 40.0]))
+    faces = np.array([[0, 1, 2, 3], [1, 4, 5, 2]], np.int32)
+    assert shared_edges(at, faces).turn == pytest.approx([-np.radians(40.0)], abs=0.05)
