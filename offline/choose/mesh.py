@@ -3,7 +3,7 @@
 Meshes of ever smaller elements, about as long as wide, are pressed at the same places as meshes
 graded towards each of these, in all that the scene asks: displacement, von Mises stress, and under
 a tip the compliance of its footprint, beyond which its force does not err.  By a small load: linear
-elasticity costs one factorisation a mesh, and the errors of larger loads are much the same.
+elasticity costs one factorisation a mesh, and the errors of larger loads are those with a margin.
 """
 
 import itertools
@@ -42,6 +42,12 @@ MOST_PLACES = 12
 
 REFERENCE = mesh_part.GRADING._replace(coarsest=1.0, growth=0.6)
 """Of references: in linear elasticity they may be finer."""
+
+MARGIN = 1.4
+"""Errors to be expected over those found: footprints across an edge of the body, near which few of
+these places are, and loads that tissue hardly bears err by more, and references themselves by 5 %
+of stress.  What training finds later, with larger loads, is .8 to 1.2 times as much of displacement
+and 1.2 to 2.3 times as much of stress (four bodies from surfaces)."""
 
 SLIGHT = 1e-4
 """Pressure over Young's modulus."""
@@ -154,7 +160,7 @@ def _references(scene: Scene, problem: FullProblem) -> list[Reference]:
 
 
 def _errors(problem: FullProblem, references: list[Reference]) -> Errors:
-    """95th percentiles of a mesh's errors; without a tip none of force."""
+    """A mesh's errors to be expected, by their 95th percentiles; without a tip none of force."""
     at, found = own_mesh(problem.scene).sites, []
     for place, fine, exact in references:
         own = _pressed(problem, place)
@@ -163,7 +169,7 @@ def _errors(problem: FullProblem, references: list[Reference]) -> Errors:
         moved = relative(own.displacement, u, problem.nodal_volumes)
         off = moved, relative(own.von_mises, stress, problem.counted_volumes), force
         found.append(off)
-    return Errors(*np.percentile(found, 95, axis=0).tolist())
+    return Errors(*(MARGIN * np.percentile(found, 95, axis=0)).tolist())
 
 
 def _pressed(problem: FullProblem, place: Array) -> Response:
