@@ -46,9 +46,6 @@ energy, as a body swings that hangs from a lip.  Least energy of what is missed 
 TANGENTIAL = 0.6
 """Weight of tangential against normal load in the Ritz vectors: about sin 30 degrees and some."""
 
-POINTS_IN_BASIS = 50
-"""Footprints all of whose Ritz vectors make up a basis; of further ones only the linear do."""
-
 ABREAST = 8
 """Footprints whose linear responses are found together: more gain no more."""
 
@@ -265,11 +262,9 @@ class Region:
 def region(problem: FullProblem, footprints: list[Footprint], modes: int) -> Region:
     """Basis of a region and the Ritz vectors of footprints in it."""
     model = problem.model
-    vectors, forces = _ritz(problem, footprints)
-    linear = np.arange(vectors.shape[1]) % RITZ_VECTORS < 3
-    learnt = np.tile(linear, (len(footprints), 1))
-    learnt[:: -(-len(footprints) // POINTS_IN_BASIS)] = True
-    basis, energies = _leading(vectors[learnt], forces[learnt], modes)
+    states = len(model.free) + model.body.shape[1]
+    vectors, forces = (part.reshape(-1, states) for part in _ritz(problem, footprints))
+    basis, energies = _leading(vectors, forces, modes)
     amplitude = np.sqrt(energies[: len(basis)] / len(energies))
     far = basis[:, len(model.free) :]
     near = basis[:, : len(model.free)] - far @ model.body.T
@@ -292,7 +287,7 @@ def region(problem: FullProblem, footprints: list[Footprint], modes: int) -> Reg
     # rounding costs the modes their orthonormality: give it back by a change of coordinates
     rounded = own.states(model)
     L = np.linalg.cholesky(rounded.T @ (model.rest_stiffness @ rounded))
-    ritz = np.linalg.solve(L, rounded.T @ forces.reshape(-1, len(rounded)).T)
+    ritz = np.linalg.solve(L, rounded.T @ forces.T)
     ritz = ritz.reshape(len(steps), len(footprints), -1)
     orthonormal, moved = np.linalg.inv(L).T, rounded[: len(model.free)]
     volumes = np.repeat(problem.nodal_volumes, 3)[model.free]
