@@ -88,22 +88,10 @@ class SphereLoad:
         assembly.scatter_faces(touching.stiffness[: len(faces)], slots, data)
 
     def reaction(self, potential: Potential, displacement: Array) -> Reaction:
-        """See ``DeadLoad``.
-
-        With ``own`` the second derivative of the potential in the tip's position and ``coupling``
-        minus the mixed one, the tangent is ``coupling^T K^-1 coupling - own``.
-        """
-        free, touching = potential.free, self.contact.touching
-        potential.factorise(displacement[free], 0.0)
-        faces, _, deepest = self.contact.touch(self.position, displacement, STIFFNESS)
-        K = touching.stiffness[: len(faces)].copy()
-        for i, j in ((1, 0), (2, 0), (2, 1)):
-            K[:, i, j] = K[:, j, i]
-        coupling = np.zeros((len(displacement) // 3, 3, 3))
-        np.add.at(coupling, faces, np.einsum("fijab->faij", K))
-        coupling = coupling.reshape(-1, 3)[free]
+        """See ``DeadLoad``; its derivative, which takes one more factorisation, is not found."""
+        faces, _, deepest = self.contact.touch(self.position, displacement, FORCE)
         return Reaction(
-            force=-touching.force[: len(faces)].sum(axis=(0, 1)),
-            tangent=coupling.T @ potential.solve(coupling) - touching.own,
+            force=-self.contact.touching.force[: len(faces)].sum(axis=(0, 1)),
+            tangent=np.full((3, 3), np.nan),
             penetration=deepest,
         )

@@ -93,7 +93,6 @@ class Touching(NamedTuple):
     face: Annotated[Numbers, "f"]  # places in the list of faces looked at
     force: Annotated[Array, "f, k, 3"]  # mN, on their nodes
     stiffness: Annotated[Array, "f, 3, 3, k, k"]  # mN/mm, second derivative in the nodes' places
-    own: Annotated[Array, "3, 3"]  # mN/mm, in the place of the tip
     touched: Annotated[Ints, "1"]  # number of faces
     deepest: Annotated[Array, "1"]  # mm, largest penetration
     around: Annotated[Array, "k, 3"]  # scratch: nodes of a face from the tip's centre, mm
@@ -279,7 +278,6 @@ def touch(tip, surface, near, x, moved, touching, wanted):
     count, energy, deepest = 0, 0.0, 0.0
     at, ends, corner = touching.around, touching.ends, touching.ends[3]
     corners, reach = surface.corners, surface.reach
-    touching.own[:] = 0.0
     for place in range(len(near)):
         face = near[place]
         if not _within_reach(tip, surface, face, x, moved, at):
@@ -341,15 +339,13 @@ def _touch_block(tip, surface, face, block, touching, place, new, wanted):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _stiffen(touching, place, n, along, across):
-    """Add a point's second derivative to the upper blocks of its face's, and to the tip's own."""
+    """Add a point's second derivative to the upper blocks of its face's."""
     row = touching.row
     for i in range(3):
-        for j in range(3):
+        for j in range(i, 3):
             h = (along - across) * n[i] * n[j] + (across if i == j else 0.0)
-            touching.own[i, j] += h
-            if i <= j:
-                K = touching.stiffness[place, i, j]
-                for a in range(len(row)):
-                    value = h * row[a]
-                    for b in range(len(row)):
-                        K[a, b] += value * row[b]
+            K = touching.stiffness[place, i, j]
+            for a in range(len(row)):
+                value = h * row[a]
+                for b in range(len(row)):
+                    K[a, b] += value * row[b]

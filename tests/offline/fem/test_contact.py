@@ -48,14 +48,13 @@ def test_a_sphere_off_the_block_moves_nothing_whatever_it_did_before(block):
 
 
 @pytest.mark.parametrize("in_time", [False, True])
-def test_force_and_tangent_are_derivatives_in_the_tips_position(block, in_time):
-    """Of the stored energy and of the force; in time over a step, after a past."""
+def test_the_force_is_the_derivative_of_the_energy_in_the_tips_position(block, in_time):
+    """Of what is stored; in time over a step, after a past."""
     course = [(0.5, 0.0, 0.05), (0.5, 0.3, 0.1), (0.3, 0.3, 0.02)]
     how = {"past": follow(block, course)[-1].past, "dt": 0.02} if in_time else {}
     place = 0.6, (0.3, -0.2)
     found = touch(block, *place, **how)
-    assert found.force[2] > 0 > found.tangent[2, 2]
-    np.testing.assert_allclose(found.tangent, found.tangent.T, atol=1e-6 * abs(found.tangent).max())
+    assert found.force[2] > 0
     h = 1e-4
     for axis, step in enumerate(np.eye(3)):
         ahead, behind = (
@@ -63,9 +62,6 @@ def test_force_and_tangent_are_derivatives_in_the_tips_position(block, in_time):
         )
         slope = (ahead.energy - behind.energy) / (2 * h)
         assert -found.force[axis] == pytest.approx(slope, abs=1e-4 * found.force[2])
-        tangent = (ahead.force - behind.force) / (2 * h)
-        error = np.abs(found.tangent[:, axis] - tangent).max()
-        assert error <= 1e-3 * np.abs(found.tangent).max()
 
 
 def test_the_way_in_does_not_matter_and_penetration_is_small(block):

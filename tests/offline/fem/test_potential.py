@@ -108,7 +108,6 @@ def test_a_load_comes_little_by_little(model, load):
 def test_the_tool_feels_what_holds_the_body(model, load):
     found = model.solve(load)
     np.testing.assert_allclose(found.force, support_force(model, found.displacement), atol=1e-8)
-    assert found.tangent.any() == isinstance(load, SphereLoad)
 
 
 def test_what_is_clamped_is_held_where_it_is_said_to_be(model, dead_load):
