@@ -25,6 +25,9 @@ MOVEMENTS = 4
 FASTEST_STEP = 0.01
 """Shortest time step of a movement, s."""
 
+DRAWS = 10
+"""Times that positions of the tip are drawn, as many as are wanted, until enough are in range."""
+
 LIFTED = 0.05
 """Millimetres between the surface at rest and a tip that does not press."""
 
@@ -51,6 +54,11 @@ class Place(NamedTuple):
     def depth(self) -> float:
         """Largest trained depth of the tip, mm."""
         return float(self.limits[TIP_DEPTH])
+
+    def depth_of(self, tip: TipPosition) -> float:
+        """How deep (mm) a tip is in the surface at rest, to which this is the nearest place."""
+        out = tip.position - self.position
+        return self.radius - float(np.copysign(np.linalg.norm(out), out @ self.normal))
 
     def press(self, direction: Array, level: float, dt: float = 0.0) -> Load:
         """A footprint pressed to a level: 1 is the limit."""
@@ -82,10 +90,19 @@ def random_positions(
     """Positions of the tip over the whole surface and range of depths.
 
     Contact points are uniform over the area, one in four on the rim of the surface; depths are
-    denser towards the limit.
+    denser towards the limit.  A tip that is deeper than that in another side of a cleft is left
+    out, unless hardly any is not.
     """
-    points = random_points_and_rim(model.surface, count, rng)
-    return [Place.at(model, point).touch(np.sqrt(rng.random())) for point in points]
+    within, beyond = list[TipPosition](), list[TipPosition]()
+    for _ in range(DRAWS):
+        for point in random_points_and_rim(model.surface, count, rng):
+            step = Place.at(model, point).touch(np.sqrt(rng.random()))
+            nearest = Place.at(model, step.position)
+            kept = within if nearest.depth_of(step) <= nearest.depth else beyond
+            kept.append(step)
+        if len(within) >= count:
+            break
+    return [*within, *beyond][:count]
 
 
 def random_histories(
