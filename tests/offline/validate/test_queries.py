@@ -1,11 +1,20 @@
 """Random queries: within range, on the surface, and like a tool that moves."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from palpate.offline.fem.problem import FullProblem
+from palpate.offline.scenes import find_scene
 from palpate.offline.validate.compare import play
-from palpate.offline.validate.queries import held_out_loads, random_histories
-from palpate.shared.mechanics.footprint import pressure_limit
+from palpate.offline.validate.queries import (
+    Place,
+    held_out_loads,
+    random_histories,
+    random_positions,
+)
+from palpate.shared.mechanics.footprint import LIMIT_FIELDS, TIP_DEPTH, pressure_limit
 
 
 def test_loads_reach_the_ends_and_the_full_tilt(visco_atlas):
@@ -14,6 +23,23 @@ def test_loads_reach_the_ends_and_the_full_tilt(visco_atlas):
     assert (np.ptp(x[:, :2], axis=0) > 9.9).all()
     tilt = [np.degrees(np.arccos(-load.direction[2])) for load in loads]
     assert max(tilt) == pytest.approx(30.0)
+
+
+def test_positions_of_the_tip_are_in_range_in_a_cleft_too(rng):
+    """Where one side of it is touched a little, the other can be touched deep."""
+    problem, most = FullProblem(find_scene("turbinate-mri")), 0.3
+    limits = np.ones((len(problem.surface.vertices), LIMIT_FIELDS))
+    limits[:, TIP_DEPTH] = most
+    model = SimpleNamespace(surface=problem.surface, limits=limits, scene=problem.scene)
+
+    def depths(steps):
+        return np.array([Place.at(model, step.position).depth_of(step) for step in steps])
+
+    anywhere = [Place.at(model, x).touch(1.0) for x in problem.surface.vertices]
+    found = depths(random_positions(model, 200, rng))
+    assert depths(anywhere).max() > 1.5 * most
+    assert len(found) == 200
+    assert 0.9 * most < found.max() <= most
 
 
 def test_histories_stay_in_range_and_on_the_surface(visco_atlas):
