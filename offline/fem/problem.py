@@ -269,9 +269,7 @@ class FullProblem:
 
     def _depth(self, centre: Array) -> float:
         """How deep (mm) a tip is in the surface at rest."""
-        foot, normal, _ = self.surface.project(centre)
-        out = centre - foot
-        return self.body.tip.radius - float(np.copysign(np.linalg.norm(out), out @ normal))
+        return self.body.tip.radius - self.surface.height(centre)
 
     def _begin(
         self, centre: Array, displacement: Array | None, last: Array | None

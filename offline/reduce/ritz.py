@@ -262,8 +262,7 @@ class Region:
 def region(problem: FullProblem, footprints: list[Footprint], modes: int) -> Region:
     """Basis of a region and the Ritz vectors of footprints in it."""
     model = problem.model
-    states = len(model.free) + model.body.shape[1]
-    vectors, forces = (part.reshape(-1, states) for part in _ritz(problem, footprints))
+    vectors, forces = (part.reshape(-1, part.shape[-1]) for part in _ritz(problem, footprints))
     basis, energies = _leading(vectors, forces, modes)
     amplitude = np.sqrt(energies[: len(basis)] / len(energies))
     far = basis[:, len(model.free) :]

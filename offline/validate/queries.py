@@ -55,11 +55,6 @@ class Place(NamedTuple):
         """Largest trained depth of the tip, mm."""
         return float(self.limits[TIP_DEPTH])
 
-    def depth_of(self, tip: TipPosition) -> float:
-        """How deep (mm) a tip is in the surface at rest, to which this is the nearest place."""
-        out = tip.position - self.position
-        return self.radius - float(np.copysign(np.linalg.norm(out), out @ self.normal))
-
     def press(self, direction: Array, level: float, dt: float = 0.0) -> Load:
         """A footprint pressed to a level: 1 is the limit."""
         return Load(self.position, direction, float(level * self.limit(direction)), dt)
@@ -98,7 +93,8 @@ def random_positions(
         for point in random_points_and_rim(model.surface, count, rng):
             step = Place.at(model, point).touch(np.sqrt(rng.random()))
             nearest = Place.at(model, step.position)
-            kept = within if nearest.depth_of(step) <= nearest.depth else beyond
+            depth = nearest.radius - model.surface.height(step.position)
+            kept = within if depth <= nearest.depth else beyond
             kept.append(step)
         if len(within) >= count:
             break

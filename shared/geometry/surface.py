@@ -181,6 +181,12 @@ class Surface:
         """Nearest surface point (mm), its outward unit normal and the distance (mm)."""
         return self.locate(position, np.empty((len(self.vertices), 0)))[:3]
 
+    def height(self, position: Array) -> float:
+        """Distance (mm) of a point above the surface; negative below."""
+        foot, normal, _ = self.project(position)
+        out = position - foot
+        return float(np.copysign(np.linalg.norm(out), out @ normal))
+
     def locate(self, position: Array, values: Array) -> tuple[Array, Array, float, Array]:
         """As ``project``, and the values (k,) there of fields given at the vertices, (v, k)."""
         x, normal, at = np.empty(3), np.empty(3), np.empty(values.shape[1])

@@ -33,7 +33,8 @@ def test_positions_of_the_tip_are_in_range_in_a_cleft_too(rng):
     model = SimpleNamespace(surface=problem.surface, limits=limits, scene=problem.scene)
 
     def depths(steps):
-        return np.array([Place.at(model, step.position).depth_of(step) for step in steps])
+        heights = [model.surface.height(step.position) for step in steps]
+        return model.scene.endoscope.radius - np.array(heights)
 
     anywhere = [Place.at(model, x).touch(1.0) for x in problem.surface.vertices]
     found = depths(random_positions(model, 200, rng))
