@@ -205,7 +205,8 @@ def anticipate(solver, k, pressure):
     Beyond the range of pressures what is fitted stays what it is at its end.
     """
     models, outcome, scratch = solver.models, solver.outcome, solver.scratch
-    inside = min(pressure, outcome.limit[0]) / models.pressures[k]
+    largest = pressure_limit(outcome.limits, outcome.upward, outcome.direction)
+    inside = min(pressure, largest) / models.pressures[k]
     for i in range(3):
         scratch.scaled_load[i] = outcome.direction[i] * inside
     frame, centre = models.frames[k], models.centres[:, k]

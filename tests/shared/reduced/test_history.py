@@ -156,8 +156,8 @@ def test_at_once_tissue_answers_as_without_time(tool, atlas):
     sudden, elastic = tool(0.8, past=REST), tool(0.8)
     assert elastic.past is None
     assert off(tool.response(sudden), tool.response(elastic)) <= 5e-3
-    # loads in time have no cubature defect taken off them
-    displacement, von_mises = (1e-3, 1e-3) if tool.limit_name == "depth" else (0.01, 0.02)
+    # in time no cubature defect is taken off: neither of loads nor of the tip
+    displacement, von_mises = (4e-3, 3e-3) if tool.limit_name == "depth" else (0.01, 0.02)
     assert off(atlas.displacement(sudden), atlas.displacement(elastic)) <= displacement
     assert off(atlas.von_mises(sudden), atlas.von_mises(elastic)) <= von_mises
     if tool.limit_name == "depth":

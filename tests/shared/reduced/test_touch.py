@@ -9,6 +9,7 @@ import pytest
 from palpate.offline.fem.problem import TipPosition
 from palpate.shared.errors import QueryError
 from palpate.shared.geometry.surface import Surface
+from palpate.shared.mechanics.footprint import TIP_DEPTH
 from palpate.shared.model import ReducedModel
 
 
@@ -141,6 +142,19 @@ def test_what_is_outside_the_range_is_flagged(atlas):
     assert deep.error_displacement == deep.error_von_mises == deep.error_force == np.inf
     beside = np.add(above(atlas, 1.9, (1.0, 0.5)), [0.5, 0, 0])
     assert "position" in atlas.touch(beside).out_of_range
+
+
+def test_what_a_tip_feels_does_not_depend_on_the_range_of_its_depth(atlas):
+    """The cubature's defect is known up to the largest pressure, however deep the tip may go."""
+    limits = atlas.limits.copy()
+    limits[:, TIP_DEPTH] *= 0.1
+    known = atlas.body, atlas.surface, limits, atlas.models, atlas.estimators
+    narrow = ReducedModel("narrow", atlas.scene, {}, *known)
+    position = above(atlas, 0.9 * atlas.touch(above(atlas, 0.3)).depth_limit)
+    wide, other = atlas.touch(position), narrow.touch(position)
+    assert wide.in_range
+    assert not other.in_range
+    np.testing.assert_array_equal(other.force, wide.force)
 
 
 def test_a_tip_that_would_go_on_over_the_rim_is_out_of_range(atlas):
