@@ -26,6 +26,7 @@ from palpate.shared.mechanics.tip import (
     LIFTED,
     LONGEST,
     TURNED,
+    VANISHED,
     bend,
     dented,
     held,
@@ -240,7 +241,7 @@ class FullProblem:
             if past is not None:
                 dent = dented(past.dent, weights, load.law, float(np.linalg.norm(found.force)))
                 found = replace(found, past=replace(found.past, dent=dent))
-            if found.place is None:
+            if found.place is None or np.linalg.norm(found.force) < VANISHED * largest:
                 if last is not None and not (past is not None and made > LIFTED):  # too far
                     place, normal = (last[0] + x) / 2, last[1]
                     continue

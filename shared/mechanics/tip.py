@@ -90,6 +90,10 @@ LIFTED = 8
 """Rounds after which a tip that loses contact on the way to its place has none, on tissue with a
 past: what that takes off the force changes with the place, too."""
 
+VANISHED = 1e-3
+"""Share of the largest force so far below which a step has gone too far: the energy, largest at the
+place sought, is stationary where contact just begins, too."""
+
 LEAST_KEPT = 0.1
 """Share of a force that a step to the next place must leave for its prediction to be believed."""
 
@@ -387,20 +391,23 @@ def next_place(g, H, wall, least, moved):
     """Write Newton's step (2,) mm of the place along the two tangents; return its length.
 
     ``wall`` (2,) points out of the surface where the place lies on its rim, and is zero elsewhere:
-    where the energy, largest at the place sought, grows that way a step goes along the rim.  It is
-    zeroed where it does not bar; a step out of the surface all the same, as where the energy curves
-    upwards, is turned round and made at least ``least`` mm long, or the next would lead back.
+    where the energy, largest at the place sought, grows that way or by a step that leads there, a
+    step goes along the rim.  It is zeroed where it does not bar; a step out of the surface all the
+    same, as where the energy curves upwards, is turned round and made at least ``least`` mm long,
+    or the next would lead back.
     """
     a, b, c = H[0, 0], 0.5 * (H[0, 1] + H[1, 0]), H[1, 1]
     det = a * c - b * b
     moved[0] = -(c * g[0] - b * g[1]) / det
     moved[1] = -(a * g[1] - b * g[0]) / det
-    if g[0] * wall[0] + g[1] * wall[1] > 0.0:
+    rises = g[0] * moved[0] + g[1] * moved[1] > 0.0
+    leaves = moved[0] * wall[0] + moved[1] * wall[1] > 0.0
+    if g[0] * wall[0] + g[1] * wall[1] > 0.0 or (leaves and rises):
         x, y = -wall[1], wall[0]
         along = -(g[0] * x + g[1] * y) / (a * x * x + 2.0 * b * x * y + c * y * y)
         moved[0], moved[1] = along * x, along * y
     else:
-        if moved[0] * wall[0] + moved[1] * wall[1] > 0.0:
+        if leaves:
             moved *= -max(1.0, least / math.sqrt(moved[0] ** 2 + moved[1] ** 2))
         wall[:] = 0.0
     return math.sqrt(moved[0] ** 2 + moved[1] ** 2)

@@ -29,6 +29,7 @@ from palpate.shared.mechanics.tip import (
     LIFTED,
     LONGEST,
     TURNED,
+    VANISHED,
     follow,
     meet_wall,
     next_place,
@@ -54,8 +55,8 @@ the surface is cut its curves by as much."""
 
 RAMPS = 1, 8, 16, 32, 64
 """Steps of the way in that are tried, one after the other: a jump, then from where the tip does not
-touch.  Of 100 000 positions in range on the turbinate 15 have no answer without the last, 6 have
-none with it."""
+touch.  Of 20 000 positions in range on the turbinate of the MRI 4 have no answer without the last,
+2 have none with it."""
 
 LEAST_FACING = 0.1
 """Cosine between force and surface normal below which a place is none."""
@@ -169,6 +170,7 @@ def _settle(solver, x):
     cold = solver.warm.tip.known[0] == 0.0
     sure = not cold
     tip.wall[:] = 0.0
+    largest = 0.0
     for made in range(MOST_ROUNDS):
         if made > 0 and not _choose(solver):
             outcome.status[0] = ELSEWHERE
@@ -176,7 +178,9 @@ def _settle(solver, x):
         press_at_place(solver, x, cold and sure)
         if outcome.status[0] != newton.CONVERGED:
             break
-        if outcome.touched[0] == 0.0:
+        force = math.sqrt(np.dot(outcome.force, outcome.force))
+        largest = max(largest, force)
+        if force <= VANISHED * largest:
             if made > 0 and not (solver.past.in_time and made > LIFTED):
                 _go_back(solver)
                 continue

@@ -298,3 +298,15 @@ def test_a_wall_bars_where_the_energy_grows_beyond_it(bend):
     turned = -1.0 if bend > 0.0 else 1.0  # away from the wall at any rate
     np.testing.assert_allclose(moved, turned * np.array([0.4 / bend, -0.2]))
     assert not wall.any()
+
+
+def test_a_step_that_rises_and_leaves_goes_along_the_wall():
+    """Though the energy falls straight out of the surface: Newton's step is not straight."""
+    g, H, moved = np.array([-0.1, 1.0]), np.array([[-1.0, 0.9], [0.9, -2.0]]), np.empty(2)
+    wall = np.array([1.0, 0.0])
+    tip.next_place(g, H, np.zeros(2), 0.0, moved)
+    assert moved @ wall > 0.0
+    assert moved @ g > 0.0
+    tip.next_place(g, H, wall, 0.0, moved)
+    np.testing.assert_allclose(moved, [0.0, 0.5])
+    assert wall.any()

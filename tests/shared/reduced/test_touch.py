@@ -186,3 +186,16 @@ def test_the_lightest_touch_has_the_force_of_hertz(atlas, depth):
     answer = atlas.touch(above(atlas, depth))
     assert answer.converged
     assert answer.force[2] == pytest.approx(hertz, rel=0.01 + np.sqrt(depth) / 3)
+
+
+def test_no_answer_is_where_contact_just_begins(atlas):
+    """There the energy is stationary, too; a contact far stiffer than the body leads to it."""
+    tip = atlas.body.tip._replace(modulus=20.0 * atlas.body.tip.modulus)
+    body = replace(atlas.body, tip=tip)
+    known = body, atlas.surface, atlas.limits, atlas.models, atlas.estimators
+    stiff = ReducedModel("stiff", atlas.scene, {}, *known)
+    at = [(x, y) for x in np.linspace(0.925, 0.975, 11) for y in np.linspace(0.75, 0.95, 5)]
+    answers = [stiff.touch(above(stiff, 1.4, place)) for place in at]
+    forces = [np.linalg.norm(answer.force) for answer in answers if answer.converged]
+    assert len(forces) > len(at) / 2
+    assert min(forces) > 0.1 * max(forces)
