@@ -90,7 +90,7 @@ LIFTED = 8
 """Rounds after which a tip that loses contact on the way to its place has none, on tissue with a
 past: what that takes off the force changes with the place, too."""
 
-VANISHED = 1e-3
+VANISHED = 1e-2
 """Share of the largest force so far below which a step has gone too far: the energy, largest at the
 place sought, is stationary where contact just begins, too."""
 
