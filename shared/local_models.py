@@ -109,7 +109,7 @@ class Body(Mesh):
         other = self._points_on(self.faces[~self.accessible])
         beyond = np.hstack([other.points, other.normals])
         bent = surface.curvature(CURVED_WITHIN * self.tip.radius, beyond)
-        points, sharpness = sharp_points(self.nodes, self.faces, self.clamped, self.accessible)
+        points, sharpness = sharp_points(self.nodes, self.faces, self.clamped)
         away = np.full(len(bent), NO_EDGE)
         for share in np.unique(sharpness.round(2)):
             tree = cKDTree(points[sharpness.round(2) == share])

@@ -14,6 +14,7 @@ from palpate.offline.bodies.places import Boundary, boundary_of_corners, support
 from palpate.offline.bodies.regions import refuse_touched, regions_at
 from palpate.offline.bodies.report import thickness
 from palpate.offline.fem.shapes import shape_of
+from palpate.offline.fem.smooth import smoothed
 from palpate.shared.anatomy import FileBody
 from palpate.shared.arrays import Array, Ints, Numbers
 from palpate.shared.geometry.elements import HEX8, HEX20, Face, Kind, face_kind_of, kind_of
@@ -270,10 +271,12 @@ def accessible_surface(mesh: Mesh, scene: Scene | None = None) -> Surface:
 
     That of the body of a scene on whose own mesh it lies, if given: faces of 2 mm differ from it by
     7 um and .7 degrees, which a tip that is .1 mm deep feels as a tenth of its force, and what
-    hangs from a lip as a push aside.  That of a body from a file is of its stored mesh's faces.
+    hangs from a lip as a push aside.  That of a body from a file is of its stored mesh's faces,
+    smoothed.
     """
     if scene is not None and isinstance(scene.geometry, FileBody):
-        mesh, scene = stored_mesh(scene), None
+        stored = stored_mesh(scene)
+        return smoothed(accessible_surface(stored), stored, scene.endoscope.radius)
     faces = mesh.faces[mesh.accessible]
     kind = face_kind_of(faces)
     grid, cells = kind.cells(*_counts(kind, mesh.nodes[faces]))

@@ -7,17 +7,8 @@ import numpy as np
 from palpate.shared.arrays import Array, Flags, Ints, Numbers
 from palpate.shared.geometry.elements import face_kind_of
 
-BLUNT = np.radians(15.0)
+BLUNT = np.radians(45.0)
 """Angle of normals up to which faces are parts of one smooth surface."""
-
-BLUNTER = 0.8
-"""Share of the image of a contact that blunt edges have for each radian: spheres integrated on 14
-ridges of ``turbinate-mri`` of 16 to 29 degrees then have forces within 5, 4 and 3 % (root mean
-square) at depths of .05, .1 and .2 radii of the tip; 10, 7 and 6 % with the same share of each."""
-
-AT_THE_RIM = 0.3
-"""Part of that where one of the faces is not accessible: there the tip comes along the normal of
-the other, on which half of the contact loses nothing."""
 
 ALONG = np.linspace(0.0, 1.0, 9)
 """Where points of an edge lie, over its length."""
@@ -58,23 +49,19 @@ def shared_edges(nodes: Array, faces: Numbers) -> Edges:
     return Edges(pairs // count, shared, turn[np.arange(len(turn)), sharper])
 
 
-def sharp_points(
-    nodes: Array, faces: Numbers, clamped: Flags, accessible: Flags
-) -> tuple[Array, Array]:
+def sharp_points(nodes: Array, faces: Numbers, clamped: Flags) -> tuple[Array, Array]:
     """Points (k, 3) mm close together along sharp edges, and how sharp: 1 is a right angle, (k,).
 
-    Of edges that are free to move: nodes (n,) may be clamped; faces (f,) are accessible or not.
+    Of edges that are free to move: nodes (n,) may be clamped.
     Valleys are none: beyond them there is more tissue and not less.  Sharpness is the share of the
     image of a contact there (``mechanics.tip``) that spheres integrated at edges have: .6 at 75
-    degrees, .36 at 60 and .27 at 48 are nearly squares of the angle, blunt ones have more.
+    degrees, .36 at 60 and .27 at 48 are nearly squares of the angle.
     """
     edges = shared_edges(nodes, faces)
     sharp = (edges.turn > BLUNT) & ~clamped[edges.nodes].any(axis=1)
-    turn, rim = edges.turn[sharp], ~accessible[edges.faces[sharp]].all(axis=1)
-    ends, t = nodes[edges.nodes[sharp]], ALONG
+    turn, ends, t = edges.turn[sharp], nodes[edges.nodes[sharp]], ALONG
     N = np.array([1.0 - t, t])
     if ends.shape[1] == 3:
         N = np.array([(1.0 - t) * (1.0 - 2.0 * t), t * (2.0 * t - 1.0), 4.0 * t * (1.0 - t)])
-    blunt = BLUNTER * turn * np.where(rim, AT_THE_RIM, 1.0)
-    sharpness = np.clip((turn / (np.pi / 2)) ** 2, blunt, 1.0)
+    sharpness = np.minimum((turn / (np.pi / 2)) ** 2, 1.0)
     return np.einsum("ka,pki->pai", N, ends).reshape(-1, 3), np.repeat(sharpness, len(t))

@@ -63,7 +63,7 @@ FACING = 0.7
 """Cosine between the normals of two points of one smooth side of a body."""
 
 BLOCK = 4096
-"""Vertices whose neighbours are held in memory at once."""
+"""Vertices of a block, see ``blocks``."""
 
 
 class SurfaceIndex(NamedTuple):
@@ -206,20 +206,14 @@ class Surface:
         """
         known = np.vstack([np.hstack([self.vertices, self.normals]), beyond])
         tree = cKDTree(known[:, :3])
-        blocks = range(0, len(self.vertices), BLOCK)
-        return np.vstack(
-            [self._curvature(slice(i, i + BLOCK), known, tree, radius) for i in blocks]
-        )
+        parts = [self._curvature(own, known, tree, radius) for own in blocks(len(self.vertices))]
+        return np.vstack(parts)
 
     def _curvature(self, own: slice, known: Array, tree: Any, radius: float) -> Array:
         """The same at some of the vertices, by points with normals (p, 6) in a tree."""
         vertices, normals = self.vertices[own], self.normals[own]
-        pairs = cKDTree(vertices).sparse_distance_matrix(tree, radius, output_type="ndarray")
-        one, two = pairs["i"], pairs["j"]
-        facing = np.sum(normals[one] * known[two, 3:], axis=1) > FACING
-        one, two = one[facing], two[facing]
+        one, two, frames = neighbours(self, own, tree, known[:, 3:], radius)
         away, turned = known[two, :3] - vertices[one], known[two, 3:] - normals[one]
-        frames = tangent_frames(normals)
         s = np.einsum("nai,ni->na", frames[one], away)
         t = np.einsum("nai,ni->na", frames[one], turned)
         # least squares of t = [[a, b], [b, c]] s
@@ -253,6 +247,26 @@ class Surface:
     def rim_distance(self) -> Array:
         """Distance (v,) mm of the vertices from the nearest on the rim."""
         return np.asarray(cKDTree(self.vertices[self.rim()]).query(self.vertices)[0])
+
+
+def blocks(count: int) -> list[slice]:
+    """Parts of so many vertices, whose neighbours are held in memory at once."""
+    return [slice(i, i + BLOCK) for i in range(0, count, BLOCK)]
+
+
+def neighbours(
+    surface: Surface, own: slice, tree: Any, normals: Array, radius: float, least: float = FACING
+) -> tuple[Ints, Ints, Array]:
+    """Pairs of some vertices and points of a tree, with normals (p, 3), that face the same way.
+
+    No further apart than a radius (mm), with a cosine of ``least`` between their normals; then the
+    vertices' tangents (v, 2, 3).
+    """
+    vertices, out = surface.vertices[own], surface.normals[own]
+    pairs = cKDTree(vertices).sparse_distance_matrix(tree, radius, output_type="ndarray")
+    one, two = pairs["i"], pairs["j"]
+    facing = np.sum(out[one] * normals[two], axis=1) > least
+    return one[facing], two[facing], tangent_frames(out)
 
 
 def tangent_frames(normals: Array) -> Array:

@@ -61,7 +61,7 @@ FLATTEST = 0.2
 """Least sum of the tip's and the surface's curvature, in units of the tip's: in a hollow that is as
 round as the tip, contact is not local."""
 
-CURVED_WITHIN = 0.5
+CURVED_WITHIN = 0.3
 """Distance, in radii of the tip, over which the surface's curvature is taken."""
 
 EDGE = 0.19
