@@ -58,8 +58,8 @@ def test_a_clamped_edge_is_none():
 
 @pytest.mark.parametrize("nodes", [4, 8, 6])
 def test_a_valley_turns_the_other_way_and_is_no_edge(nodes):
-    at, faces = roof(-40.0, nodes)
-    assert shared_edges(at, faces).turn.min() == pytest.approx(np.radians(-40.0), abs=1e-6)
+    at, faces = roof(-60.0, nodes)
+    assert shared_edges(at, faces).turn.min() == pytest.approx(np.radians(-60.0), abs=1e-6)
     assert len(sharp(at, faces)[0]) == 0
 
 
