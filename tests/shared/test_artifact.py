@@ -1,7 +1,7 @@
 import os
 import time
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import h5py
 import numpy as np
@@ -28,6 +28,13 @@ class Things:
     basis: Annotated[NDArray[np.int16], "basis", "1", "9, 25 n", "steps", "", "compress"]
     clamped: Annotated[Flags, "clamped", "1", "2", "nodes held fixed"]
     extent: Annotated[float, "extent", "mm", "", "reach of a local model", "> 0"]
+
+
+@dataclass
+class Noise:
+    """A compressed dataset of several chunks."""
+
+    noise: Annotated[NDArray[Any], "noise", "1", "a, b, c", "noise", "", "compress"]
 
 
 SCENE = 'name = "x"\n' * 20
@@ -65,6 +72,23 @@ def test_what_is_written_is_read(path):
     for key, dataset in DATASETS.items():
         assert artifact.arrays[key].dtype == dataset.values.dtype
         np.testing.assert_array_equal(artifact.arrays[key], dataset.values)
+
+
+@pytest.mark.parametrize("kind", [np.int8, np.int16, np.float32])
+def test_what_is_compressed_in_many_chunks_is_what_hdf5_reads(tmp_path, rng, kind):
+    path, values = tmp_path / "x.h5", np.zeros((9, 700, 251), kind)
+    values[3:6] = rng.integers(-9, 9, (3, 700, 251))
+    values[6:] = rng.normal(scale=40.0, size=(3, 700, 251))
+    noise = Dataset(values, "1", "of three kinds", compress=True)
+    write_artifact(path, SCENE, DOCUMENTS, {"noise": noise})
+    with h5py.File(path) as file:
+        stored = file["noise"]
+        assert stored.id.get_num_chunks() > 2
+        assert any(np.remainder(values.shape, stored.chunks))  # the last ones reach beyond
+        np.testing.assert_array_equal(stored[()], values)
+    read = read_artifact(path, Noise).arrays["noise"]
+    assert read.dtype == kind
+    np.testing.assert_array_equal(read, values)
 
 
 def test_any_hdf5_tool_can_read_it_and_its_seal_is_a_line_of_text(path):
