@@ -1,7 +1,7 @@
 """The tables that compiled queries read, from what training found out about a scene."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -23,16 +23,20 @@ many as stay in the processor's cache."""
 def press_models(body: Body, models: LocalModels, scene: Scene) -> PressModels:
     """Everything the compiled query needs for footprints of up to the scene's radius."""
     surface, reach = body.boundary, models.extent + scene.endoscope.radius
-    points = _no_points(body, models)
+    near = body.boundary_tree.query_ball_point(models.centres, reach, return_sorted=True)
+    points = _without_gradients(body, models)
+    wanted = [
+        np.union1d(surface.nodes[faces], body.elements[_points_of(body, models, k)[0]])
+        for k, faces in enumerate(near)
+    ]
     found = {}
-    for k, rows in _modes_at(body, models, models.modes):
-        G = _place_points(body, models, k, rows, points)
+    for k, rows in _modes_at(body, models, wanted):
+        G = _gradients(body, models, k, rows, points.gradients.shape[2])
         points.steps[k] = np.maximum(np.abs(G).max(axis=1), 1e-30) / np.iinfo(np.int16).max
         points.gradients[k] = np.rint(G / points.steps[k, :, None])
-        near = np.sort(body.boundary_tree.query_ball_point(models.centres[k], reach))
-        nodes, corners = _compact(surface.nodes[near])
-        found[k] = near, rows(nodes), corners
-    near, modes, corners = _by_model(found)
+        nodes, own = _compact(surface.nodes[near[k]])
+        found[k] = rows(nodes), own
+    modes, corners = zip(*(found[k] for k in sorted(found)), strict=True)
     faces = SurfaceQuadrature(*(part[np.concatenate(near)] for part in surface))
     return PressModels(
         centres=np.ascontiguousarray(models.centres.T),
@@ -55,25 +59,26 @@ def press_models(body: Body, models: LocalModels, scene: Scene) -> PressModels:
 
 
 def _modes_at(
-    body: Body, models: LocalModels, modes: Field
+    body: Body, models: LocalModels, wanted: Sequence[Numbers]
 ) -> Iterator[tuple[int, Callable[[Any], Field]]]:
-    """Every local model with what gives its modes (k, 3, m) at nodes (k,), region by region."""
+    """Every local model with what gives its modes (k, 3, m) at nodes (k,), region by region.
+
+    Nodes are among those ``wanted`` of the model, a small share of its window.
+    """
     place = np.zeros(len(body.nodes), int)
     for region, steps in enumerate(models.steps):
-        nodes, near = models.window(region)
+        own = np.flatnonzero(models.region == region).tolist()
+        window, near = models.window(region)
+        used = np.flatnonzero(np.isin(window, np.concatenate([wanted[k] for k in own])))
+        nodes = window[used]
         place[nodes] = np.arange(len(nodes))
         far = models.body.reshape(-1, len(body.nodes), 3)[:, nodes]
         # one row of memory to a node, so that gathering nodes reads rows
-        basis = _by_node(near.reshape(len(steps), len(nodes), 3)) * steps
+        basis = _by_node(near.reshape(len(steps), len(window), 3)[:, used]) * steps
         share = models.body_steps[:, None] * models.far[region].T
         basis += (_by_node(far).reshape(3 * len(nodes), -1) @ share).reshape(basis.shape)
-        for k in np.flatnonzero(models.region == region):
-            yield int(k), partial(_rows, basis, place, modes[k])
-
-
-def _by_model(found: Mapping[int, tuple[Any, ...]]) -> Any:
-    """From what was found of each local model to lists in the order of their numbers."""
-    return zip(*(found[k] for k in sorted(found)), strict=True)
+        for k in own:
+            yield k, partial(_rows, basis, place, models.modes[k])
 
 
 def _compact(numbers: Numbers) -> tuple[Numbers, Numbers]:
@@ -82,33 +87,35 @@ def _compact(numbers: Numbers) -> tuple[Numbers, Numbers]:
     return nodes, own.reshape(numbers.shape).astype(np.int32)
 
 
-def _no_points(body: Body, models: LocalModels) -> Points:
-    """Room for the points of all models: of their tissue, but without gradients and weights."""
+def _points_of(body: Body, models: LocalModels, k: int) -> tuple[Ints, Ints]:
+    """Element of each point of model k, and its number there."""
+    own = slice(models.point_from[k], models.point_from[k + 1])
+    return np.divmod(models.points[own], body.gradients.shape[1])
+
+
+def _without_gradients(body: Body, models: LocalModels) -> Points:
+    """The points of all models, with room for the gradients of their modes there."""
     counts, modes = np.diff(models.point_from), models.modes.shape[2]
-    points = np.zeros((len(counts), -(-int(counts.max()) // LANES) * LANES), int)
-    points[np.arange(points.shape[1]) < counts[:, None]] = models.points
+    width = -(-int(counts.max()) // LANES) * LANES
+    points, weights = np.zeros((len(counts), width), int), np.zeros((len(counts), width))
+    used = np.arange(width) < counts[:, None]
+    points[used], weights[used] = models.points, models.weights
     return Points(
-        np.zeros((len(counts), modes, 9 * points.shape[1]), np.int16),
+        np.zeros((len(counts), modes, 9 * width), np.int16),
         np.ones((len(counts), modes), np.float32),
-        np.zeros(points.shape),
+        weights,
         body.point_law.at(np.divmod(points, body.gradients.shape[1])),
     )
 
 
-def _place_points(
-    body: Body,
-    models: LocalModels,
-    k: int,
-    rows: Callable[[Any], Field],
-    points: Points,
+def _gradients(
+    body: Body, models: LocalModels, k: int, rows: Callable[[Any], Field], width: int
 ) -> Field:
-    """Fill in the weights of model k; return the gradients (m, 9 c) of its modes in tiles."""
-    own = slice(models.point_from[k], models.point_from[k + 1])
-    element, q = np.divmod(models.points[own], body.gradients.shape[1])
-    points.weights[k, : len(element)] = models.weights[own]
+    """Gradients (m, width) of the modes of model k at its points, in tiles."""
+    element, q = _points_of(body, models, k)
     nodes, corners = _compact(body.elements[element])
     moved = rows(nodes)
-    G = np.zeros((moved.shape[2], 9 * points.weights.shape[1]), np.float32)
+    G = np.zeros((moved.shape[2], width), np.float32)
     for first in range(0, len(element), AT_ONCE):
         some = slice(first, first + AT_ONCE)
         slopes = np.swapaxes(body.gradients[element[some], q[some]], 1, 2).astype(np.float32)
