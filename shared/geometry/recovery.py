@@ -299,7 +299,7 @@ def fitted(at: Array, counts: Array) -> Array:
     share = counts / counts.sum(axis=1, keepdims=True)
     centre = np.einsum("km,kmi->ki", share, at)[:, None]
     away = at - centre
-    spread, axes = np.linalg.eigh(np.einsum("km,kmi,kmj->kij", share, away, away))
+    spread, axes = np.linalg.eigh((share[..., None] * away).swapaxes(1, 2) @ away)
     least = np.maximum(spread, 1e-12 * spread.max(axis=1, keepdims=True) + np.finfo(float).tiny)
     axes = axes / np.sqrt(least)[:, None]
     P, p = _powers(away @ axes), _powers(-centre @ axes)[:, 0]
@@ -308,7 +308,7 @@ def fitted(at: Array, counts: Array) -> Array:
         A = P[left, :, :terms]
         weighted = share[left, :, None] * A
         inverse = np.linalg.pinv(weighted.swapaxes(1, 2) @ A, rcond=1e-9, hermitian=True)
-        found = np.einsum("kmt,ktu,ku->km", weighted, inverse, p[left, :terms])
+        found = (weighted @ (inverse @ p[left, :terms, None]))[..., 0]
         missed = np.abs(np.einsum("km,kmt->kt", found, A) - p[left, :terms]).max(axis=1)
         good = (missed < 1e-6) & (np.abs(found).sum(axis=1) < STEEPEST)
         weights[left[good]] = found[good]
