@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -61,6 +62,12 @@ def tasks(tmp_path_factory):
     sys.path.remove(str(folder))
 
 
+def exported():
+    """Return what the README lets a cluster have in its environment."""
+    lines = re.findall(r"^export (.*)$", (ROOT / "offline" / "README.md").read_text(), re.M)
+    return dict(pair.split("=", 1) for line in lines for pair in line.split())
+
+
 @contextmanager
 def processes(folder, path=(), workers=2):
     """Run a scheduler and workers of two processes; yield them and the scheduler's file."""
@@ -69,8 +76,9 @@ def processes(folder, path=(), workers=2):
         "PYTHONPATH": os.pathsep.join(filter(None, found)),
         # each death of a worker gives its tasks up
         "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0",
-        "GLIBC_TUNABLES": MEMORY,
     }
+    environment |= exported()
+    assert environment["GLIBC_TUNABLES"] == MEMORY
     file = folder / "scheduler.json"
     options = ["--no-dashboard", "--scheduler-file", str(file)]
     commands = [
