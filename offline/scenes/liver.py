@@ -1,7 +1,9 @@
 """A liver of our own making, of the size and about the form of one: ``liver.stl``.
 
 Two lobes, hollowed out below, are a level of a sum of Gaussians; smaller ones at random places make
-it uneven.  ``python -m palpate.offline.scenes.liver`` writes the file anew (needs PyVista).
+it uneven.  What lies deeper than five millimetres is in ``liver_parenchyma.stl``: what is above
+stands for the capsule and the tissue that it holds.  ``python -m palpate.offline.scenes.liver``
+writes both files anew (needs PyVista).
 """
 
 from pathlib import Path
@@ -24,6 +26,9 @@ LOBES = [
 BUMPS, BUMP, UNEVEN = 24, 14.0, 0.08
 LEVEL = 0.42
 
+CAPSULE = 5.0
+"""Millimetres of tissue that the capsule stiffens."""
+
 
 def level(points: Array) -> Array:
     """The sum of Gaussians at points (n, 3) mm."""
@@ -38,16 +43,19 @@ def level(points: Array) -> Array:
     return found
 
 
-def write(path: Path) -> None:
-    """Write the surface as binary STL."""
+def write(folder: Path) -> None:
+    """Write both surfaces as binary STL."""
     pv = require("pyvista")
     low, high = np.array([-120.0, -80.0, -90.0]), np.array([120.0, 90.0, 90.0])
     counts = np.rint((high - low) / STEP).astype(int) + 1
     grid = pv.ImageData(dimensions=counts, spacing=(STEP,) * 3, origin=low)
     grid["level"] = level(np.array(grid.points))
-    surface = grid.contour([LEVEL], scalars="level", method="flying_edges")
-    surface.extract_largest().clean().save(path)
+    body = grid.contour([LEVEL], scalars="level", method="flying_edges").extract_largest().clean()
+    body.save(folder / "liver.stl")
+    gap = grid.compute_implicit_distance(body)
+    inner = gap.contour([-CAPSULE], scalars="implicit_distance", method="flying_edges")
+    inner.extract_largest().clean().save(folder / "liver_parenchyma.stl")
 
 
 if __name__ == "__main__":
-    write(Path(__file__).with_name("liver.stl"))
+    write(Path(__file__).parent)

@@ -10,7 +10,7 @@ from palpate.offline.bodies.tetrahedra import boundary, quality
 from palpate.offline.fem.mesh import build_mesh
 from palpate.offline.run.workers import content_key
 from palpate.offline.scenes import FOLDER, find_scene
-from palpate.offline.scenes.liver import LEVEL, level
+from palpate.offline.scenes.liver import CAPSULE, LEVEL, level
 from palpate.shared.scene import SceneError
 
 from .conftest import ball, scene_of
@@ -142,8 +142,15 @@ def test_the_liver_is_what_its_generator_draws():
     assert np.ptp(points, axis=0).max() == pytest.approx(146, abs=1)
     mesh = build_mesh(find_scene("liver"))
     assert mesh.nodes[mesh.clamped][:, 1].mean() < mesh.nodes[mesh.faces[mesh.accessible], 1].mean()
-    tumour = mesh.nodes[mesh.elements[mesh.region == 1, :4]] - [26.0, 24.0, 15.0]
+    corners = mesh.nodes[mesh.elements[:, :4]]
+    tumour = corners[mesh.region == 2] - [26.0, 24.0, 15.0]
     assert np.linalg.norm(tumour, axis=2).max() < 10.0 + 0.75
+    closed = surface.repaired(
+        FOLDER / "liver.stl", surface.read_surface(FOLDER / "liver.stl", "mm")
+    )
+    inner = np.unique(corners[mesh.region == 1].reshape(-1, 3), axis=0)
+    _, depth = surface.nearest(surface.index_of(closed.points, closed.triangles), inner[::5])
+    assert depth.min() == pytest.approx(CAPSULE, abs=0.3)
 
 
 def test_results_depend_on_the_mesh_and_on_surfaces_that_places_name(scene):
