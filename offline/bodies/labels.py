@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from palpate.offline.bodies.files import first_line, refuse_size, require
 from palpate.shared.anatomy import LabelBody
 from palpate.shared.arrays import Array, Ints
+from palpate.shared.errors import PalpateError
 from palpate.shared.scene import SceneError
 
 KINDS = ".nii", ".nii.gz", ".nrrd"
@@ -63,7 +64,7 @@ def read_image(path: Path) -> Image:
     reader = _nrrd if path.suffix == ".nrrd" else _nifti
     try:
         labels, affine = reader(path)
-    except SceneError:
+    except PalpateError:
         raise
     except Exception as error:  # of the library's readers, whatever they trip over
         raise SceneError(

@@ -39,8 +39,9 @@ class Repaired(NamedTuple):
 
 def read_surface(path: Path, unit: Unit) -> Any:
     """Triangles of a file in mm, as a mesh of trimesh; raise `SceneError` if there are none."""
+    trimesh = require("trimesh")
     try:
-        mesh = require("trimesh").load(path, force="mesh", process=False)
+        mesh = trimesh.load(path, force="mesh", process=False)
         points, triangles = np.array(mesh.vertices, float), np.array(mesh.faces, np.int64)
     except Exception as error:  # of the library's readers, whatever they trip over
         raise SceneError(

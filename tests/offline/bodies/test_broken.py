@@ -11,6 +11,7 @@ import pytest
 from palpate.offline.bodies import files, labels, mesh_file, surface
 from palpate.offline.fem.mesh import build_mesh
 from palpate.shared.anatomy import LabelBody
+from palpate.shared.errors import PalpateError
 from palpate.shared.scene import SceneError
 
 from .conftest import ball, bricks, scene_of
@@ -339,3 +340,18 @@ def test_damaged_files_are_refused_or_read_and_never_end_otherwise(tmp_path):
                 said.append(str(error))
         assert said
         assert all(path.name in text and "\n" not in text for text in said)
+
+
+@pytest.mark.parametrize("library", ["trimesh", "meshio", "nibabel", "nrrd"])
+def test_a_library_that_is_not_installed_is_named_and_no_file_blamed(
+    tmp_path, monkeypatch, library
+):
+    paths = written(tmp_path)
+    monkeypatch.setitem(sys.modules, library, None)
+    said = set()
+    for path in paths:
+        try:
+            read(path)
+        except PalpateError as error:
+            said.add(str(error))
+    assert said == {f"bodies from files need {library}: pip install 'palpate[anatomy]'"}
