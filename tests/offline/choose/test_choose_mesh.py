@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from palpate.offline.choose.mesh import as_fine, candidates, with_mesh
+from palpate.offline.choose.mesh import LARGE_LOADS, as_fine, candidates, with_mesh
 from palpate.offline.fem.mesh import Inverted, build_mesh
 from palpate.offline.scenes import find_scene
 from palpate.shared.scene import SceneError, parse_scene
@@ -80,6 +80,13 @@ def test_a_tighter_tolerance_of_anything_takes_a_finer_mesh(quantity, tight):
 def test_where_no_mesh_is_fine_enough_it_says_in_what():
     _, document = with_mesh(unmeshed(**LOOSE | {"von_mises": 0.01}))
     assert "no mesh tried, of up to 12111 DOFs, does so in von_mises: " in document["why"]
+
+
+def test_it_says_how_much_stress_may_err_with_the_largest_loads():
+    _, document = with_mesh(unmeshed(**LOOSE))
+    (trial,) = document["tried"]
+    most = LARGE_LOADS * trial["errors"]["von_mises"]
+    assert f"of stress (with the largest loads up to {most:.0%})" in document["why"]
 
 
 @pytest.mark.parametrize("geometry", [None, '[geometry]\nkind = "block"\nsize = [10, 10, 8]\n'])
