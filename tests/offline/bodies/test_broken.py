@@ -284,8 +284,6 @@ def test_a_scene_without_a_folder_is_told_so():
 
 
 def test_a_missing_library_is_named(tmp_path, monkeypatch):
-    from palpate.shared.errors import PalpateError
-
     ball().export(tmp_path / "b.stl")
     monkeypatch.setitem(sys.modules, "trimesh", None)
     with pytest.raises(PalpateError, match=r"need trimesh: pip install 'palpate\[anatomy\]'"):
